@@ -1,0 +1,183 @@
+//! Stages `sort` and `bin`: splats in depth order, and for every tile the list of splats that touch it.
+//!
+//! A tile is 16×16 pixels: sixteen blocks of 4×4 pixels, one lane each. A pair carries a bit per block that the ellipse at
+//! α = 1/255 touches, computed for all sixteen blocks at once, so the rasterizer never visits the corners of a box.
+//! Splats are sorted by depth once; pairs are emitted in that order and distributed by a counting sort, which keeps it.
+
+use rayon::prelude::*;
+
+use super::project::{Projected, at};
+use super::simd::{Isa, Lanes};
+use crate::kernel;
+
+/// Side of a tile in pixels.
+pub(crate) const TILE: usize = 16;
+
+/// A splat in a tile.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub(crate) struct Pair {
+    /// Place of the splat in depth order.
+    pub(crate) rank: u32,
+    /// The 4×4 blocks that it touches.
+    pub(crate) blocks: u16,
+}
+
+/// For each tile, its splats front to back.
+#[derive(Debug, Default)]
+pub(crate) struct Bins {
+    pub(crate) tiles_x: usize,
+    pub(crate) tiles_y: usize,
+    /// `pairs[start[t] .. start[t + 1]]` belong to tile `t` (row-major).
+    pub(crate) start: Vec<u32>,
+    pub(crate) pairs: Vec<Pair>,
+    /// `emitted[r] .. emitted[r + 1]` are the emission numbers of the splat of rank `r`.
+    pub(crate) emitted: Vec<u32>,
+    /// Where the pair with this emission number came to lie in `pairs`.
+    pub(crate) place: Vec<u32>,
+}
+
+/// Indices of the seen splats by depth, nearest first; ties keep index order. Positive floats sort as their bits.
+pub(crate) fn sort_by_depth(projected: &[Projected], seen: &[u16], order: &mut Vec<u32>, scratch: &mut SortScratch) {
+    const BITS: u32 = 11;
+    const BUCKETS: usize = 1 << BITS;
+    let SortScratch { keys, other } = scratch;
+    keys.clear();
+    for (word, &bits) in seen.iter().enumerate() {
+        let mut bits = bits;
+        while bits != 0 {
+            let i = word * 16 + bits.trailing_zeros() as usize;
+            bits &= bits - 1;
+            keys.push((projected[i].0[at::Z].to_bits(), i as u32));
+        }
+    }
+    other.clear();
+    other.resize(keys.len(), (0, 0));
+    let mut counts = [[0u32; BUCKETS]; 3];
+    for (key, _) in keys.iter() {
+        for (pass, counts) in counts.iter_mut().enumerate() {
+            counts[(key >> (BITS * pass as u32)) as usize & (BUCKETS - 1)] += 1;
+        }
+    }
+    for (pass, counts) in counts.iter_mut().enumerate() {
+        let mut sum = 0;
+        for count in counts.iter_mut() {
+            sum += std::mem::replace(count, sum);
+        }
+        for &(key, i) in keys.iter() {
+            let to = &mut counts[(key >> (BITS * pass as u32)) as usize & (BUCKETS - 1)];
+            other[*to as usize] = (key, i);
+            *to += 1;
+        }
+        std::mem::swap(keys, other);
+    }
+    order.clear();
+    order.extend(keys.iter().map(|&(_, i)| i));
+}
+
+/// Buffers of [`sort_by_depth`].
+#[derive(Debug, Default)]
+pub(crate) struct SortScratch {
+    keys: Vec<(u32, u32)>,
+    other: Vec<(u32, u32)>,
+}
+
+/// Fills `bins` with the tiles of `width × height` pixels; `ranked` are the records in depth order.
+pub(crate) fn bin(isa: Isa, ranked: &[Projected], width: usize, height: usize, bins: &mut Bins) {
+    const CHUNK: usize = 2048;
+    bins.tiles_x = width.div_ceil(TILE);
+    bins.tiles_y = height.div_ceil(TILE);
+    let tiles = bins.tiles_x * bins.tiles_y;
+    let limit = (bins.tiles_x, bins.tiles_y);
+    let emissions: Vec<Emission> = (ranked.par_chunks(CHUNK).enumerate())
+        .map(|(chunk, records)| {
+            let mut out = Emission::default();
+            emit(isa, records, (chunk * CHUNK) as u32, limit, &mut out);
+            out
+        })
+        .collect();
+
+    bins.start.clear();
+    bins.start.resize(tiles + 1, 0);
+    bins.emitted.clear();
+    bins.emitted.push(0);
+    let mut total = 0;
+    for emission in &emissions {
+        for &(tile, _) in &emission.pairs {
+            bins.start[tile as usize + 1] += 1;
+        }
+        for &count in &emission.counts {
+            total += count;
+            bins.emitted.push(total);
+        }
+    }
+    for t in 0..tiles {
+        bins.start[t + 1] += bins.start[t];
+    }
+    let mut next = bins.start.clone();
+    bins.pairs.resize(total as usize, Pair::default());
+    bins.place.clear();
+    for &(tile, pair) in emissions.iter().flat_map(|emission| &emission.pairs) {
+        let to = &mut next[tile as usize];
+        bins.pairs[*to as usize] = pair;
+        bins.place.push(*to);
+        *to += 1;
+    }
+}
+
+/// The pairs of some splats, in depth order, and the number of pairs of each.
+#[derive(Default)]
+struct Emission {
+    pairs: Vec<(u32, Pair)>,
+    counts: Vec<u32>,
+}
+
+kernel!(fn emit(records: &[Projected], first_rank: u32, tiles: (usize, usize), out: &mut Emission) = emit_lanes);
+
+#[inline(always)]
+fn emit_lanes<L: Lanes>(records: &[Projected], first_rank: u32, tiles: (usize, usize), out: &mut Emission) {
+    // Left and top pixel centres of the sixteen blocks of a tile.
+    let (mut block_x, mut block_y) = ([0.5; 16], [0.5; 16]);
+    for b in 0..16 {
+        block_x[b] += (b % 4 * 4) as f32;
+        block_y[b] += (b / 4 * 4) as f32;
+    }
+    let (block_x, block_y) = (L::load(&block_x), L::load(&block_y));
+    let three = L::splat(3.0);
+    for (n, Projected(r)) in records.iter().enumerate() {
+        let before = out.pairs.len();
+        let span = |centre: f32, half: f32, tiles: usize| {
+            // The cast saturates, so huge and negative extents end at the image's border.
+            let first = ((centre - half - 0.5) / TILE as f32).max(0.0) as usize;
+            let last = ((centre + half - 0.5) / TILE as f32).max(0.0) as usize;
+            first..(last + 1).min(tiles)
+        };
+        let columns = span(r[at::X], r[at::HALF_WIDTH], tiles.0);
+        let rows = span(r[at::Y], r[at::HALF_HEIGHT], tiles.1);
+        let (a, b, c) = (L::splat(r[at::A]), L::splat(r[at::B]), L::splat(r[at::C]));
+        let b_over_2c = L::splat(-0.5 * r[at::B] / r[at::C]);
+        let b_over_2a = L::splat(-0.5 * r[at::B] / r[at::A]);
+        // The exponent must reach log2(α_min); a little slack, as the rasterizer tests each pixel anyway.
+        let floor = L::splat(crate::ALPHA_MIN.log2() - r[at::LOG2_OPACITY] - 1e-3);
+        for row in rows {
+            let y0 = block_y + L::splat((row * TILE) as f32 - r[at::Y]);
+            let y1 = y0 + three;
+            let y_near = y0.max(L::zero().min(y1));
+            for column in columns.clone() {
+                let x0 = block_x + L::splat((column * TILE) as f32 - r[at::X]);
+                let x1 = x0 + three;
+                let x_near = x0.max(L::zero().min(x1));
+                // The largest exponent over a block lies on the vertical or horizontal line nearest to the mean.
+                let y = (b_over_2c * x_near).max(y0).min(y1);
+                let on_vertical = (a * x_near + b * y) * x_near + c * y * y;
+                let x = (b_over_2a * y_near).max(x0).min(x1);
+                let on_horizontal = (a * x + b * y_near) * x + c * y_near * y_near;
+                let blocks = floor.le(on_vertical.max(on_horizontal));
+                if blocks != 0 {
+                    let tile = (row * tiles.0 + column) as u32;
+                    out.pairs.push((tile, Pair { rank: first_rank + n as u32, blocks }));
+                }
+            }
+        }
+        out.counts.push((out.pairs.len() - before) as u32);
+    }
+}

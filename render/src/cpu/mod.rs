@@ -1,0 +1,283 @@
+//! The CPU backend: SIMD chosen at run time, rayon over chunks of splats and bands of tiles.
+//!
+//! Data flow of a view, one array a stage:
+//! ```text
+//! splats ─project→ records ─sort→ order ─bin→ pairs per tile ─rasterize→ frame
+//! upstream ─rasterize_backward→ moments per pair ─reduce→ moments per splat ─project_backward→ gradients
+//! ```
+//! Every reduction runs in the order of the data, not of the threads, so results do not depend on their number.
+
+mod bin;
+mod project;
+mod project_backward;
+mod rasterize;
+mod sh;
+pub mod simd;
+
+use rayon::prelude::*;
+use scene::{Camera, Splats};
+
+use crate::{Frame, Gradients, Options, Upstream};
+use bin::{Bins, SortScratch, TILE};
+use project::{Projected, View};
+use project_backward::Sink;
+use rasterize::{BackwardBand, Band, Moments, TileInput};
+pub use simd::Isa;
+
+/// Splats per parallel chunk; a multiple of the lanes.
+const CHUNK: usize = 1024;
+
+/// A renderer with its buffers, which it keeps from view to view.
+#[derive(Debug)]
+pub struct Renderer {
+    isa: Isa,
+    records: Vec<Projected>,
+    seen: Vec<u16>,
+    order: Vec<u32>,
+    sort: SortScratch,
+    ranked: Vec<Projected>,
+    bins: Bins,
+    /// Pairs visited before each tile was finished.
+    visited: Vec<u32>,
+    moments: Vec<Moments>,
+    /// Rank of each splat in depth order; only those of seen splats mean anything.
+    rank: Vec<u32>,
+    sums: Vec<Moments>,
+    gradients: Gradients,
+    frame: Frame,
+    /// What the last `forward` drew, for `backward`.
+    drawn: Option<(View, Options, usize)>,
+}
+
+impl Default for Renderer {
+    fn default() -> Self {
+        Self::new(Isa::detect())
+    }
+}
+
+impl Renderer {
+    /// A renderer on this instruction set.
+    pub fn new(isa: Isa) -> Self {
+        Self {
+            isa,
+            records: Vec::new(),
+            seen: Vec::new(),
+            order: Vec::new(),
+            sort: SortScratch::default(),
+            ranked: Vec::new(),
+            bins: Bins::default(),
+            visited: Vec::new(),
+            moments: Vec::new(),
+            rank: Vec::new(),
+            sums: Vec::new(),
+            gradients: Gradients::default(),
+            frame: Frame::default(),
+            drawn: None,
+        }
+    }
+
+    /// "cpu-avx512", "cpu-avx2" or "cpu-portable".
+    pub fn name(&self) -> String {
+        format!("cpu-{}", self.isa.name())
+    }
+
+    /// Draws the trainable splats and, with them, a frozen context.
+    pub fn forward(&mut self, splats: &Splats, context: Option<&Splats>, camera: &Camera, options: &Options) -> &Frame {
+        let options = Options { sh_degree: options.sh_degree.min(splats.sh_degree()), ..*options };
+        let view = View::new(camera);
+        self.drawn = Some((view, options, splats.len()));
+        self.project(splats, context, &view, &options);
+        bin::sort_by_depth(&self.records, &self.seen, &mut self.order, &mut self.sort);
+        self.ranked.clear();
+        self.ranked.extend(self.order.iter().map(|&i| self.records[i as usize]));
+        let (width, height) = (camera.pinhole.width as usize, camera.pinhole.height as usize);
+        bin::bin(self.isa, &self.ranked, width, height, &mut self.bins);
+        self.rasterize(width, height, &options);
+        &self.frame
+    }
+
+    /// The last frame drawn.
+    pub fn frame(&self) -> &Frame {
+        &self.frame
+    }
+
+    /// Gradients of the trainable splats of the last [`forward`](Self::forward), whose splats must be passed again
+    /// unchanged.
+    ///
+    /// # Panics
+    /// Without a forward pass before, or with another number of splats: both are errors of the caller.
+    pub fn backward(&mut self, splats: &Splats, upstream: &Upstream) -> &mut Gradients {
+        let (view, options, count) = self.drawn.expect("backward follows forward");
+        assert_eq!(count, splats.len(), "backward needs the splats that forward drew");
+        self.rasterize_backward(upstream);
+        self.reduce(count);
+        self.project_backward(splats, &view, &options);
+        &mut self.gradients
+    }
+
+    /// Pairs of splat and tile in the last view: what the rasterizer's time is proportional to.
+    pub fn pairs(&self) -> usize {
+        self.bins.pairs.len()
+    }
+
+    fn project(&mut self, splats: &Splats, context: Option<&Splats>, view: &View, options: &Options) {
+        // Context records start at a whole group of lanes.
+        let first_context = splats.len().next_multiple_of(simd::LANES);
+        let total = first_context + context.map_or(0, Splats::len);
+        self.records.resize(total, Projected::default());
+        self.seen.clear();
+        self.seen.resize(total.div_ceil(simd::LANES), 0);
+        let (own_records, context_records) = self.records.split_at_mut(first_context.min(total));
+        let (own_seen, context_seen) = self.seen.split_at_mut(first_context / simd::LANES);
+        let isa = self.isa;
+        let draw = |splats: &Splats, options: &Options, own: f32, records: &mut [Projected], seen: &mut [u16]| {
+            records.par_chunks_mut(CHUNK).zip(seen.par_chunks_mut(CHUNK / simd::LANES)).enumerate().for_each(
+                |(chunk, (records, seen))| {
+                    project::project(isa, splats, chunk * CHUNK, view, options, own, records, seen);
+                },
+            );
+        };
+        draw(splats, options, 1.0, &mut own_records[..splats.len()], own_seen);
+        if let Some(context) = context {
+            let options = Options { sh_degree: options.sh_degree.min(context.sh_degree()), ..*options };
+            draw(context, &options, 0.0, context_records, context_seen);
+        }
+    }
+
+    fn rasterize(&mut self, width: usize, height: usize, options: &Options) {
+        let area = width * height;
+        let frame = &mut self.frame;
+        (frame.width, frame.height) = (width, height);
+        frame.colour.resize(3 * area, 0.0);
+        frame.transmittance.resize(area, 0.0);
+        let extra = if options.extras { area } else { 0 };
+        frame.depth.resize(extra, 0.0);
+        frame.own.resize(extra, 0.0);
+
+        let rows = TILE * width;
+        let mut colour = frame.colour.chunks_mut(area.max(1)).map(|plane| plane.chunks_mut(rows));
+        let mut next_colour = || colour.next().expect("three colour planes");
+        let (red, green, blue) = (next_colour(), next_colour(), next_colour());
+        let mut depth = frame.depth.chunks_mut(rows);
+        let mut own = frame.own.chunks_mut(rows);
+        self.visited.resize(self.bins.tiles_x * self.bins.tiles_y, 0);
+        let bands: Vec<_> = (red.zip(green).zip(blue).zip(frame.transmittance.chunks_mut(rows)))
+            .map(|(((red, green), blue), transmittance)| Band {
+                colour: [red, green, blue],
+                transmittance,
+                depth: depth.next().unwrap_or_default(),
+                own: own.next().unwrap_or_default(),
+            })
+            .collect();
+        let (bins, ranked, isa) = (&self.bins, &self.ranked, self.isa);
+        bands.into_par_iter().zip(self.visited.par_chunks_mut(bins.tiles_x)).enumerate().for_each(
+            |(row, (mut band, visited))| {
+                for (column, visited) in visited.iter_mut().enumerate() {
+                    let tile = row * bins.tiles_x + column;
+                    let pairs = &bins.pairs[bins.start[tile] as usize..bins.start[tile + 1] as usize];
+                    let input = TileInput { ranked, pairs, x: column * TILE, y: row * TILE, width, height };
+                    *visited = rasterize::rasterize(isa, &input, &options.background, options.extras, &mut band);
+                }
+            },
+        );
+    }
+
+    fn rasterize_backward(&mut self, upstream: &Upstream) {
+        self.moments.resize(self.bins.pairs.len(), Moments::default());
+        let (bins, ranked, isa, frame) = (&self.bins, &self.ranked, self.isa, &self.frame);
+        // The pairs of a band of tiles lie together, so bands write disjoint slices.
+        let mut rest = self.moments.as_mut_slice();
+        let mut bands = Vec::with_capacity(bins.tiles_y);
+        for row in 0..bins.tiles_y {
+            let len = bins.start[(row + 1) * bins.tiles_x] - bins.start[row * bins.tiles_x];
+            let (band, after) = rest.split_at_mut(len as usize);
+            bands.push(band);
+            rest = after;
+        }
+        let visited = &self.visited;
+        bands.into_par_iter().enumerate().for_each(|(row, mut moments)| {
+            let band = BackwardBand::new(frame, upstream, row);
+            for column in 0..bins.tiles_x {
+                let tile = row * bins.tiles_x + column;
+                let pairs = &bins.pairs[bins.start[tile] as usize..bins.start[tile + 1] as usize];
+                let (out, after) = std::mem::take(&mut moments).split_at_mut(pairs.len());
+                moments = after;
+                let (visited_out, unseen) = out.split_at_mut(visited[tile] as usize);
+                unseen.fill(Moments::default());
+                let input = TileInput {
+                    ranked,
+                    pairs: &pairs[..visited_out.len()],
+                    x: column * TILE,
+                    y: row * TILE,
+                    width: frame.width,
+                    height: frame.height,
+                };
+                rasterize::rasterize_backward(isa, &input, &band, visited_out);
+            }
+        });
+    }
+
+    /// Adds up the pairs of each splat, in the order of its tiles.
+    fn reduce(&mut self, count: usize) {
+        self.rank.resize(self.records.len(), 0);
+        for (rank, &i) in self.order.iter().enumerate() {
+            self.rank[i as usize] = rank as u32;
+        }
+        self.sums.resize(count, Moments::default());
+        let (bins, seen, rank, moments) = (&self.bins, &self.seen, &self.rank, &self.moments);
+        self.sums.par_chunks_mut(CHUNK).enumerate().for_each(|(chunk, sums)| {
+            for (n, sum) in sums.iter_mut().enumerate() {
+                let i = chunk * CHUNK + n;
+                if seen[i / simd::LANES] >> (i % simd::LANES) & 1 == 0 {
+                    continue;
+                }
+                let rank = rank[i] as usize;
+                let mut total = [0.0f32; 16];
+                for &place in &bins.place[bins.emitted[rank] as usize..bins.emitted[rank + 1] as usize] {
+                    for (total, value) in total.iter_mut().zip(&moments[place as usize].0) {
+                        *total += value;
+                    }
+                }
+                *sum = Moments(total);
+            }
+        });
+    }
+
+    fn project_backward(&mut self, splats: &Splats, view: &View, options: &Options) {
+        let n = splats.len();
+        let out = &mut self.gradients;
+        out.columns.resize(splats.columns().len(), Vec::new());
+        for column in out.columns.iter_mut().chain([&mut out.screen, &mut out.screen_abs, &mut out.weight]) {
+            column.resize(n, 0.0);
+        }
+        let words = n.div_ceil(simd::LANES);
+        out.seen.clear();
+        out.seen.extend_from_slice(&self.seen[..words]);
+        // Coefficients above the degree in use are not touched: their columns stay out of the sinks.
+        let used = scene::column::SH + 3 * scene::splats::sh_coefficients(options.sh_degree);
+        let mut sinks: Vec<Sink> =
+            (out.screen.chunks_mut(CHUNK).zip(out.screen_abs.chunks_mut(CHUNK)).zip(out.weight.chunks_mut(CHUNK)))
+                .map(|((screen, screen_abs), weight)| Sink { columns: Vec::with_capacity(used), screen, screen_abs, weight })
+                .collect();
+        for column in &mut out.columns[..used] {
+            for (sink, chunk) in sinks.iter_mut().zip(column.chunks_mut(CHUNK)) {
+                sink.columns.push(chunk);
+            }
+        }
+        let (isa, seen, sums) = (self.isa, &self.seen, &self.sums);
+        let poses: Vec<[f32; 6]> = (sinks.par_iter_mut().enumerate())
+            .map(|(chunk, sink)| {
+                let first = chunk * CHUNK;
+                let sums = &sums[first..(first + CHUNK).min(n)];
+                let seen = &seen[first / simd::LANES..];
+                project_backward::project_backward(isa, splats, first, view, options, seen, sums, sink)
+            })
+            .collect();
+        out.pose = [0.0; 6];
+        for pose in poses {
+            for (total, part) in out.pose.iter_mut().zip(pose) {
+                *total += part;
+            }
+        }
+    }
+}

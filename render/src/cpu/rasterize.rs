@@ -1,0 +1,370 @@
+//! Stages `rasterize` and `rasterize_backward`: one tile at a time, sixteen pixels (a 4×4 block) at a time.
+//!
+//! Forward blends front to back until every pixel of the tile is finished. Backward walks the same list in the same
+//! direction: with the colour behind a splat known as "final minus what was seen so far", no list per pixel and no
+//! back-to-front pass is needed (the replay of Taming-3DGS and Brush, on lanes instead of threads). A pair's gradient is
+//! the sums over its pixels of a few moments; the conic's and the mean's gradients are linear in them.
+
+use super::bin::{Pair, TILE};
+use super::project::{Projected, at};
+use super::simd::Lanes;
+use crate::{ALPHA_MAX, ALPHA_MIN, Frame, TRANSMITTANCE_MIN, Upstream, each, kernel};
+
+/// Blocks in a tile, lanes in a block.
+const BLOCKS: usize = 16;
+
+/// Sixteen blocks of sixteen pixels.
+type Plane = [[f32; 16]; BLOCKS];
+
+/// Places of the moments in a pair's gradient; `v = dL/dα · α`, `w = α T`.
+pub(crate) mod moment {
+    pub(crate) const V: usize = 0;
+    pub(crate) const VX: usize = 1;
+    pub(crate) const VY: usize = 2;
+    pub(crate) const VXX: usize = 3;
+    pub(crate) const VXY: usize = 4;
+    pub(crate) const VYY: usize = 5;
+    pub(crate) const RED: usize = 6;
+    pub(crate) const GREEN: usize = 7;
+    pub(crate) const BLUE: usize = 8;
+    pub(crate) const Z: usize = 9;
+    pub(crate) const WEIGHT: usize = 10;
+    pub(crate) const ABS_X: usize = 11;
+    pub(crate) const ABS_Y: usize = 12;
+}
+
+/// A pair's gradient, see [`moment`]: one cache line.
+#[derive(Debug, Clone, Copy, Default)]
+#[repr(C, align(64))]
+pub(crate) struct Moments(pub(crate) [f32; 16]);
+
+/// A band of tiles: sixteen rows of every plane of a frame.
+pub(crate) struct Band<'a> {
+    pub(crate) colour: [&'a mut [f32]; 3],
+    pub(crate) transmittance: &'a mut [f32],
+    /// Empty without extras.
+    pub(crate) depth: &'a mut [f32],
+    /// Empty without extras.
+    pub(crate) own: &'a mut [f32],
+}
+
+/// What a tile is drawn from.
+pub(crate) struct TileInput<'a> {
+    pub(crate) ranked: &'a [Projected],
+    pub(crate) pairs: &'a [Pair],
+    /// Left edge in pixels; the band's top edge in pixels.
+    pub(crate) x: usize,
+    pub(crate) y: usize,
+    /// Size of the whole image.
+    pub(crate) width: usize,
+    pub(crate) height: usize,
+}
+
+impl TileInput<'_> {
+    /// Calls `f(block, lane, count, offset in the band's planes)` for each run of up to four pixels inside the image.
+    #[inline(always)]
+    fn runs(&self, mut f: impl FnMut(usize, usize, usize, usize)) {
+        let columns = (self.width - self.x).min(TILE);
+        let rows = (self.height - self.y).min(TILE);
+        for y in 0..rows {
+            for x in (0..columns).step_by(4) {
+                let block = y / 4 * 4 + x / 4;
+                f(block, y % 4 * 4, (columns - x).min(4), y * self.width + self.x + x);
+            }
+        }
+    }
+
+    #[inline(always)]
+    fn gather(&self, plane: &[f32], scale: f32, out: &mut Plane) {
+        self.runs(|block, lane, count, offset| {
+            for k in 0..count {
+                out[block][lane + k] = plane[offset + k] * scale;
+            }
+        });
+    }
+
+    #[inline(always)]
+    fn scatter(&self, from: &Plane, plane: &mut [f32]) {
+        self.runs(|block, lane, count, offset| {
+            plane[offset..offset + count].copy_from_slice(&from[block][lane..lane + count]);
+        });
+    }
+
+    /// Transmittance one inside the image, zero outside: pixels that do not exist are finished from the start.
+    #[inline(always)]
+    fn start(&self) -> (Plane, u32) {
+        let mut live = [[0.0; 16]; BLOCKS];
+        self.runs(|block, lane, count, _| live[block][lane..lane + count].fill(1.0));
+        let alive = live.iter().enumerate().fold(0, |mask, (b, lanes)| mask | (u32::from(lanes[0] > 0.0) << b));
+        (live, alive)
+    }
+}
+
+/// α of sixteen pixels under a splat, zero where it is skipped; dx, dy from its mean; and the lanes where α is clamped.
+struct Alpha<L> {
+    alpha: L,
+    dx: L,
+    dy: L,
+    clamped: u16,
+}
+
+/// A splat's record spread over lanes.
+struct Spread<L> {
+    a: L,
+    b: L,
+    c: L,
+    log2_opacity: L,
+    x: f32,
+    y: f32,
+}
+
+impl<L: Lanes> Spread<L> {
+    /// Relative to the tile's first pixel centre.
+    #[inline(always)]
+    fn new(r: &[f32; 16], tile: &TileInput) -> Self {
+        Self {
+            a: L::splat(r[at::A]),
+            b: L::splat(r[at::B]),
+            c: L::splat(r[at::C]),
+            log2_opacity: L::splat(r[at::LOG2_OPACITY]),
+            x: tile.x as f32 + 0.5 - r[at::X],
+            y: tile.y as f32 + 0.5 - r[at::Y],
+        }
+    }
+
+    #[inline(always)]
+    fn alpha(&self, block: usize, lane_x: L, lane_y: L) -> Alpha<L> {
+        let dx = lane_x + L::splat(self.x + (block % 4 * 4) as f32);
+        let dy = lane_y + L::splat(self.y + (block / 4 * 4) as f32);
+        let exponent = dx.fma(self.a.fma(dx, self.b * dy), (self.c * dy).fma(dy, self.log2_opacity));
+        let raw = exponent.exp2();
+        let drawn = L::splat(ALPHA_MIN).le(raw);
+        let clamped = L::splat(ALPHA_MAX).le(raw);
+        let alpha = L::select(drawn, raw.min(L::splat(ALPHA_MAX)), L::zero());
+        Alpha { alpha, dx, dy, clamped }
+    }
+}
+
+/// Column and row of each lane in its block.
+#[inline(always)]
+fn lane_offsets<L: Lanes>() -> (L, L) {
+    (L::load(&std::array::from_fn(|i| (i % 4) as f32)), L::load(&std::array::from_fn(|i| (i / 4) as f32)))
+}
+
+kernel!(
+    /// Draws a tile into its band; returns how many of its pairs were visited before all pixels were finished.
+    pub(crate) fn rasterize(tile: &TileInput, background: &[f32; 3], extras: bool, band: &mut Band) -> u32
+        = rasterize_lanes
+);
+
+#[inline(always)]
+fn rasterize_lanes<L: Lanes>(tile: &TileInput, background: &[f32; 3], extras: bool, band: &mut Band) -> u32 {
+    if extras {
+        rasterize_tile::<L, true>(tile, background, band)
+    } else {
+        rasterize_tile::<L, false>(tile, background, band)
+    }
+}
+
+#[inline(always)]
+fn rasterize_tile<L: Lanes, const EXTRAS: bool>(tile: &TileInput, background: &[f32; 3], band: &mut Band) -> u32 {
+    let (mut live, mut alive) = tile.start();
+    let mut last: Plane = live; // the transmittance that is kept once a pixel is finished
+    let mut colour = [[[0.0; 16]; BLOCKS]; 3];
+    let mut depth: Plane = [[0.0; 16]; BLOCKS];
+    let mut own: Plane = [[0.0; 16]; BLOCKS];
+    let (lane_x, lane_y) = lane_offsets::<L>();
+
+    let mut visited = 0;
+    for pair in tile.pairs {
+        if alive == 0 {
+            break;
+        }
+        visited += 1;
+        let mut blocks = u32::from(pair.blocks) & alive;
+        if blocks == 0 {
+            continue;
+        }
+        let r = &tile.ranked[pair.rank as usize].0;
+        let spread = Spread::<L>::new(r, tile);
+        while blocks != 0 {
+            let b = blocks.trailing_zeros() as usize & (BLOCKS - 1);
+            blocks &= blocks - 1;
+            let Alpha { alpha, .. } = spread.alpha(b, lane_x, lane_y);
+            let t = L::load(&live[b]);
+            let weight = alpha * t;
+            let next = t - weight;
+            let finished = next.le(L::splat(TRANSMITTANCE_MIN));
+            let weight = L::select(finished, L::zero(), weight);
+            let next = L::select(finished, L::zero(), next);
+            next.store(&mut live[b]);
+            (L::load(&last[b]) - weight).store(&mut last[b]);
+            for c in 0..3 {
+                weight.fma(L::splat(r[at::RED + c]), L::load(&colour[c][b])).store(&mut colour[c][b]);
+            }
+            if EXTRAS {
+                weight.fma(L::splat(r[at::Z]), L::load(&depth[b])).store(&mut depth[b]);
+                weight.fma(L::splat(r[at::OWN]), L::load(&own[b])).store(&mut own[b]);
+            }
+            if finished == u16::MAX {
+                alive &= !(1 << b);
+            }
+        }
+    }
+
+    for b in 0..BLOCKS {
+        let t = L::load(&last[b]);
+        for c in 0..3 {
+            t.fma(L::splat(background[c]), L::load(&colour[c][b])).store(&mut colour[c][b]);
+        }
+    }
+    for c in 0..3 {
+        tile.scatter(&colour[c], band.colour[c]);
+    }
+    tile.scatter(&last, band.transmittance);
+    if EXTRAS {
+        tile.scatter(&depth, band.depth);
+        tile.scatter(&own, band.own);
+    }
+    visited
+}
+
+/// The rows of a frame and of the loss's gradient that belong to a band; empty planes are zero.
+pub(crate) struct BackwardBand<'a> {
+    colour: [&'a [f32]; 3],
+    transmittance: &'a [f32],
+    depth: &'a [f32],
+    d_colour: [&'a [f32]; 3],
+    d_transmittance: &'a [f32],
+    d_depth: &'a [f32],
+}
+
+impl<'a> BackwardBand<'a> {
+    pub(crate) fn new(frame: &'a Frame, upstream: &'a Upstream, band: usize) -> Self {
+        let area = frame.width * frame.height;
+        let from = band * TILE * frame.width;
+        let to = (from + TILE * frame.width).min(area);
+        let rows = |plane: &'a [f32], k: usize| plane.get(k * area + from..k * area + to).unwrap_or(&[]);
+        Self {
+            colour: [0, 1, 2].map(|c| rows(&frame.colour, c)),
+            transmittance: rows(&frame.transmittance, 0),
+            depth: rows(&frame.depth, 0),
+            d_colour: [0, 1, 2].map(|c| rows(&upstream.colour, c)),
+            d_transmittance: rows(&upstream.transmittance, 0),
+            d_depth: rows(&upstream.depth, 0),
+        }
+    }
+}
+
+kernel!(
+    /// The gradient of each pair of a tile, into `out` (one entry a pair; context splats and pairs that no pixel saw get
+    /// zeros).
+    pub(crate) fn rasterize_backward(tile: &TileInput, band: &BackwardBand, out: &mut [Moments]) = rasterize_backward_lanes
+);
+
+#[inline(always)]
+fn rasterize_backward_lanes<L: Lanes>(tile: &TileInput, band: &BackwardBand, out: &mut [Moments]) {
+    if band.d_depth.is_empty() {
+        rasterize_backward_tile::<L, false>(tile, band, out);
+    } else {
+        rasterize_backward_tile::<L, true>(tile, band, out);
+    }
+}
+
+#[inline(always)]
+fn rasterize_backward_tile<L: Lanes, const DEPTH: bool>(tile: &TileInput, band: &BackwardBand, out: &mut [Moments]) {
+    let (mut live, mut alive) = tile.start();
+    let mut d_colour = [[[0.0; 16]; BLOCKS]; 3];
+    let mut d_depth: Plane = [[0.0; 16]; BLOCKS];
+    for c in 0..3 {
+        tile.gather(band.d_colour[c], 1.0, &mut d_colour[c]);
+    }
+    // What lies behind the splats seen so far, weighted by the upstream gradient; at first all of it.
+    let mut behind: Plane = [[0.0; 16]; BLOCKS];
+    tile.runs(|block, lane, count, offset| {
+        for k in 0..count {
+            behind[block][lane + k] = (0..3).map(|c| band.colour[c][offset + k] * band.d_colour[c][offset + k]).sum();
+        }
+    });
+    let mut product = |value: &[f32], gradient: &[f32]| {
+        if !gradient.is_empty() {
+            tile.runs(|block, lane, count, offset| {
+                for k in 0..count {
+                    behind[block][lane + k] += value[offset + k] * gradient[offset + k];
+                }
+            });
+        }
+    };
+    product(band.transmittance, band.d_transmittance);
+    if DEPTH {
+        product(band.depth, band.d_depth);
+        tile.gather(band.d_depth, 1.0, &mut d_depth);
+    }
+
+    let (lane_x, lane_y) = lane_offsets::<L>();
+    for (pair, out) in tile.pairs.iter().zip(out) {
+        *out = Moments::default();
+        let mut blocks = u32::from(pair.blocks) & alive;
+        if blocks == 0 {
+            continue;
+        }
+        let r = &tile.ranked[pair.rank as usize].0;
+        let spread = Spread::<L>::new(r, tile);
+        let own = r[at::OWN] > 0.0;
+        // dα/d(mean) / α, for the absolute sums: the exponent's derivative in natural units.
+        let ln2 = std::f32::consts::LN_2;
+        let (a2, b1, c2) =
+            (L::splat(2.0 * ln2 * r[at::A]), L::splat(ln2 * r[at::B]), L::splat(2.0 * ln2 * r[at::C]));
+        let mut sums = [L::zero(); 16];
+        while blocks != 0 {
+            let b = blocks.trailing_zeros() as usize & (BLOCKS - 1);
+            blocks &= blocks - 1;
+            let Alpha { alpha, dx, dy, clamped } = spread.alpha(b, lane_x, lane_y);
+            let t = L::load(&live[b]);
+            let weight = alpha * t;
+            let next = t - weight;
+            let finished = next.le(L::splat(TRANSMITTANCE_MIN));
+            let weight = L::select(finished, L::zero(), weight);
+            L::select(finished, L::zero(), next).store(&mut live[b]);
+            if finished == u16::MAX {
+                alive &= !(1 << b);
+            }
+            let gradient = each!(c in [0, 1, 2] => L::load(&d_colour[c][b]));
+            let mut along = gradient[0].fma(
+                L::splat(r[at::RED]),
+                gradient[1].fma(L::splat(r[at::GREEN]), gradient[2] * L::splat(r[at::BLUE])),
+            );
+            let g_depth = L::load(&d_depth[b]);
+            if DEPTH {
+                along = g_depth.fma(L::splat(r[at::Z]), along);
+            }
+            let rest = L::load(&behind[b]) - weight * along;
+            rest.store(&mut behind[b]);
+            if !own {
+                continue;
+            }
+            // α dL/dα = α (T·along - rest / (1 - α)); zero where clamped, finished or skipped.
+            let d_alpha = t * along - rest * (L::splat(1.0) - alpha).recip();
+            let v = L::select(finished | clamped, L::zero(), alpha * d_alpha);
+            let (vx, vy) = (v * dx, v * dy);
+            sums[moment::V] = sums[moment::V] + v;
+            sums[moment::VX] = sums[moment::VX] + vx;
+            sums[moment::VY] = sums[moment::VY] + vy;
+            sums[moment::VXX] = vx.fma(dx, sums[moment::VXX]);
+            sums[moment::VXY] = vx.fma(dy, sums[moment::VXY]);
+            sums[moment::VYY] = vy.fma(dy, sums[moment::VYY]);
+            for c in 0..3 {
+                sums[moment::RED + c] = weight.fma(gradient[c], sums[moment::RED + c]);
+            }
+            if DEPTH {
+                sums[moment::Z] = weight.fma(g_depth, sums[moment::Z]);
+            }
+            sums[moment::WEIGHT] = sums[moment::WEIGHT] + weight;
+            sums[moment::ABS_X] = sums[moment::ABS_X] + a2.fma(vx, b1 * vy).abs();
+            sums[moment::ABS_Y] = sums[moment::ABS_Y] + c2.fma(vy, b1 * vx).abs();
+        }
+        if own {
+            L::sums(&sums).store(&mut out.0);
+        }
+    }
+}

@@ -1,0 +1,680 @@
+//! Sixteen `f32` lanes, whatever the machine: one AVX-512 register, two AVX2 registers, or a plain array.
+//!
+//! Kernels are written once over [`Lanes`] and compiled three times by [`kernel!`](crate::kernel); [`Isa::detect`] picks
+//! one at run time. Sixteen lanes are one 4×4 pixel block of the rasterizer, or sixteen splats of the projection.
+//!
+//! Safety: the methods of the vector types call intrinsics that need their instruction set. The types are hidden: only
+//! [`kernel!`](crate::kernel) names them, behind an [`Isa`], which exists only after detection.
+
+use std::ops::{Add, Div, Mul, Neg, Sub};
+
+/// The instruction set that kernels run on; part of a backend's name, as results differ in the last bits between them.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Isa(Level);
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[doc(hidden)]
+pub enum Level {
+    #[cfg(target_arch = "x86_64")]
+    Avx512,
+    #[cfg(target_arch = "x86_64")]
+    Avx2,
+    Portable,
+}
+
+impl Isa {
+    /// The best instruction set of this machine.
+    pub fn detect() -> Self {
+        *Self::available().first().expect("the portable kernels are always there")
+    }
+
+    /// Every instruction set that this machine can run, best first: tests compare them all.
+    pub fn available() -> Vec<Self> {
+        let mut all = Vec::new();
+        #[cfg(target_arch = "x86_64")]
+        {
+            let fma = is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma");
+            if fma && is_x86_feature_detected!("avx512f") && is_x86_feature_detected!("avx512dq") {
+                all.push(Self(Level::Avx512));
+            }
+            if fma {
+                all.push(Self(Level::Avx2));
+            }
+        }
+        all.push(Self(Level::Portable));
+        all
+    }
+
+    #[doc(hidden)]
+    pub fn level(self) -> Level {
+        self.0
+    }
+
+    /// "avx512", "avx2" or "portable".
+    pub fn name(self) -> &'static str {
+        match self.0 {
+            #[cfg(target_arch = "x86_64")]
+            Level::Avx512 => "avx512",
+            #[cfg(target_arch = "x86_64")]
+            Level::Avx2 => "avx2",
+            Level::Portable => "portable",
+        }
+    }
+}
+
+/// Compiles a generic kernel (here and in `train`) for every instruction set and dispatches on the first argument, an [`Isa`]:
+/// `kernel!(pub(crate) fn forward(tile: &mut Tile) = forward_lanes);` with `fn forward_lanes<L: Lanes>(tile: &mut Tile)`,
+/// which must be `#[inline(always)]`.
+#[macro_export]
+#[doc(hidden)]
+macro_rules! kernel {
+    ($(#[$meta:meta])* $vis:vis fn $name:ident($($arg:ident: $ty:ty),* $(,)?) $(-> $ret:ty)? = $generic:ident) => {
+        $(#[$meta])*
+        $vis fn $name(isa: $crate::cpu::simd::Isa, $($arg: $ty),*) $(-> $ret)? {
+            #[cfg(target_arch = "x86_64")]
+            #[target_feature(enable = "avx512f,avx512dq,avx2,fma,bmi1,bmi2,lzcnt,popcnt")]
+            fn avx512($($arg: $ty),*) $(-> $ret)? {
+                $generic::<$crate::cpu::simd::Avx512>($($arg),*)
+            }
+            #[cfg(target_arch = "x86_64")]
+            #[target_feature(enable = "avx2,fma,bmi1,bmi2,lzcnt,popcnt")]
+            fn avx2($($arg: $ty),*) $(-> $ret)? {
+                $generic::<$crate::cpu::simd::Avx2>($($arg),*)
+            }
+            match isa.level() {
+                // SAFETY: an Isa of this level exists only where the instruction set was detected.
+                #[cfg(target_arch = "x86_64")]
+                $crate::cpu::simd::Level::Avx512 => unsafe { avx512($($arg),*) },
+                // SAFETY: as above.
+                #[cfg(target_arch = "x86_64")]
+                $crate::cpu::simd::Level::Avx2 => unsafe { avx2($($arg),*) },
+                $crate::cpu::simd::Level::Portable => $generic::<$crate::cpu::simd::Portable>($($arg),*),
+            }
+        }
+    };
+}
+
+/// An array of an expression for each index: `each!(c in [0, 1, 2] => a[c] * b[c])`.
+///
+/// Kernels use it instead of closures: a closure is a function of its own, compiled without the kernel's instruction set,
+/// and intrinsics cannot be inlined into it.
+#[macro_export]
+#[doc(hidden)]
+macro_rules! each {
+    ($k:ident in [$($index:literal),*] => $value:expr) => {
+        [$({
+            let $k: usize = $index;
+            $value
+        }),*]
+    };
+}
+
+/// Lanes in every vector.
+pub const LANES: usize = 16;
+
+/// Arithmetic on sixteen `f32`. Masks are sixteen bits, lane 0 lowest.
+pub trait Lanes:
+    Copy + Add<Output = Self> + Sub<Output = Self> + Mul<Output = Self> + Div<Output = Self> + Neg<Output = Self>
+{
+    /// All lanes the same.
+    fn splat(x: f32) -> Self;
+    /// From memory.
+    fn load(from: &[f32; 16]) -> Self;
+    /// To memory.
+    fn store(self, to: &mut [f32; 16]);
+    /// `self · b + c`, fused where the instruction set has it.
+    fn fma(self, b: Self, c: Self) -> Self;
+    /// Lane-wise minimum.
+    fn min(self, b: Self) -> Self;
+    /// Lane-wise maximum.
+    fn max(self, b: Self) -> Self;
+    /// Absolute value.
+    fn abs(self) -> Self;
+    /// Square root.
+    fn sqrt(self) -> Self;
+    /// `self < b`, false for NaN.
+    fn lt(self, b: Self) -> u16;
+    /// `self <= b`, false for NaN.
+    fn le(self, b: Self) -> u16;
+    /// Lanes of `a` where the mask is set, of `b` elsewhere.
+    fn select(mask: u16, a: Self, b: Self) -> Self;
+    /// 2^self, relative error below 3e-7 for exponents in -126 ..= 126; clamped outside.
+    fn exp2(self) -> Self;
+    /// 1 / self, relative error below 2e-7, for normal numbers.
+    fn recip(self) -> Self;
+    /// Sums of the sixteen vectors: lane `i` of the result is the sum over the lanes of `v[i]`, added in a fixed order.
+    fn sums(v: &[Self; 16]) -> Self;
+
+    /// Zero lanes.
+    #[inline(always)]
+    fn zero() -> Self {
+        Self::splat(0.0)
+    }
+
+    /// From a slice: lanes beyond its end are `fill`.
+    #[inline(always)]
+    fn load_from(slice: &[f32], at: usize, fill: f32) -> Self {
+        match slice.get(at..at + LANES) {
+            Some(lanes) => Self::load(lanes.try_into().expect("sixteen lanes")),
+            None => {
+                let mut lanes = [fill; LANES];
+                let tail = slice.get(at..).unwrap_or(&[]);
+                lanes[..tail.len()].copy_from_slice(tail);
+                Self::load(&lanes)
+            }
+        }
+    }
+
+    /// To a slice: lanes beyond its end are dropped.
+    #[inline(always)]
+    fn store_to(self, slice: &mut [f32], at: usize) {
+        match slice.get_mut(at..at + LANES) {
+            Some(lanes) => self.store(lanes.try_into().expect("sixteen lanes")),
+            None => {
+                let mut lanes = [0.0; LANES];
+                self.store(&mut lanes);
+                let tail = slice.get_mut(at..).unwrap_or(&mut []);
+                tail.copy_from_slice(&lanes[..tail.len()]);
+            }
+        }
+    }
+
+    /// The lanes as an array.
+    #[inline(always)]
+    fn to_array(self) -> [f32; 16] {
+        let mut lanes = [0.0; LANES];
+        self.store(&mut lanes);
+        lanes
+    }
+
+    /// A scalar function of each lane, for what is too rare to be worth vector code.
+    #[inline(always)]
+    fn map(self, f: impl Fn(f32) -> f32) -> Self {
+        Self::load(&self.to_array().map(f))
+    }
+}
+
+/// Minimax polynomial of 2^f on [-½, ½], highest power first: 1.8e-7 relative.
+const EXP2: [f32; 6] = [1.339_887_4e-3, 9.618_437e-3, 5.550_326_5e-2, 2.402_265_1e-1, 6.931_472e-1, 1.0];
+
+macro_rules! operators {
+    ($name:ident) => {
+        impl Add for $name {
+            type Output = Self;
+            #[inline(always)]
+            fn add(self, b: Self) -> Self {
+                self.add_lanes(b)
+            }
+        }
+        impl Sub for $name {
+            type Output = Self;
+            #[inline(always)]
+            fn sub(self, b: Self) -> Self {
+                self.sub_lanes(b)
+            }
+        }
+        impl Mul for $name {
+            type Output = Self;
+            #[inline(always)]
+            fn mul(self, b: Self) -> Self {
+                self.mul_lanes(b)
+            }
+        }
+        impl Div for $name {
+            type Output = Self;
+            #[inline(always)]
+            fn div(self, b: Self) -> Self {
+                self.div_lanes(b)
+            }
+        }
+        impl Neg for $name {
+            type Output = Self;
+            #[inline(always)]
+            fn neg(self) -> Self {
+                Self::splat(-0.0).sub_lanes(self)
+            }
+        }
+    };
+}
+
+/// Sixteen lanes as an array; the compiler vectorises what the target's baseline allows.
+#[derive(Clone, Copy)]
+#[doc(hidden)]
+pub struct Portable([f32; 16]);
+
+impl Portable {
+    #[inline(always)]
+    fn zip(self, b: Self, f: impl Fn(f32, f32) -> f32) -> Self {
+        Self(std::array::from_fn(|i| f(self.0[i], b.0[i])))
+    }
+    #[inline(always)]
+    fn test(self, b: Self, f: impl Fn(f32, f32) -> bool) -> u16 {
+        (0..LANES).fold(0, |mask, i| mask | (u16::from(f(self.0[i], b.0[i])) << i))
+    }
+    #[inline(always)]
+    fn add_lanes(self, b: Self) -> Self {
+        self.zip(b, |a, b| a + b)
+    }
+    #[inline(always)]
+    fn sub_lanes(self, b: Self) -> Self {
+        self.zip(b, |a, b| a - b)
+    }
+    #[inline(always)]
+    fn mul_lanes(self, b: Self) -> Self {
+        self.zip(b, |a, b| a * b)
+    }
+    #[inline(always)]
+    fn div_lanes(self, b: Self) -> Self {
+        self.zip(b, |a, b| a / b)
+    }
+}
+
+operators!(Portable);
+
+impl Lanes for Portable {
+    #[inline(always)]
+    fn splat(x: f32) -> Self {
+        Self([x; 16])
+    }
+    #[inline(always)]
+    fn load(from: &[f32; 16]) -> Self {
+        Self(*from)
+    }
+    #[inline(always)]
+    fn store(self, to: &mut [f32; 16]) {
+        *to = self.0;
+    }
+    #[inline(always)]
+    fn fma(self, b: Self, c: Self) -> Self {
+        self * b + c
+    }
+    #[inline(always)]
+    fn min(self, b: Self) -> Self {
+        self.zip(b, |a, b| if a < b { a } else { b })
+    }
+    #[inline(always)]
+    fn max(self, b: Self) -> Self {
+        self.zip(b, |a, b| if a > b { a } else { b })
+    }
+    #[inline(always)]
+    fn abs(self) -> Self {
+        Self(self.0.map(f32::abs))
+    }
+    #[inline(always)]
+    fn sqrt(self) -> Self {
+        Self(self.0.map(f32::sqrt))
+    }
+    #[inline(always)]
+    fn lt(self, b: Self) -> u16 {
+        self.test(b, |a, b| a < b)
+    }
+    #[inline(always)]
+    fn le(self, b: Self) -> u16 {
+        self.test(b, |a, b| a <= b)
+    }
+    #[inline(always)]
+    fn select(mask: u16, a: Self, b: Self) -> Self {
+        Self(std::array::from_fn(|i| if mask >> i & 1 == 1 { a.0[i] } else { b.0[i] }))
+    }
+    #[inline(always)]
+    fn exp2(self) -> Self {
+        // Adding 1.5·2^23 rounds to an integer that then sits in the low bits.
+        const MAGIC: f32 = 12_582_912.0;
+        let x = self.max(Self::splat(-126.0)).min(Self::splat(126.0));
+        let shifted = x + Self::splat(MAGIC);
+        let f = x - (shifted - Self::splat(MAGIC));
+        let mut p = Self::splat(EXP2[0]);
+        for c in &EXP2[1..] {
+            p = p.fma(f, Self::splat(*c));
+        }
+        Self(std::array::from_fn(|i| f32::from_bits(p.0[i].to_bits().wrapping_add(shifted.0[i].to_bits() << 23))))
+    }
+    #[inline(always)]
+    fn recip(self) -> Self {
+        Self::splat(1.0) / self
+    }
+    #[inline(always)]
+    fn sums(v: &[Self; 16]) -> Self {
+        Self(std::array::from_fn(|i| {
+            let x = &v[i].0;
+            let quarter = |k: usize| (x[k] + x[k + 8]) + (x[k + 4] + x[k + 12]);
+            (quarter(0) + quarter(2)) + (quarter(1) + quarter(3))
+        }))
+    }
+}
+
+#[cfg(target_arch = "x86_64")]
+#[doc(hidden)]
+pub use x86::{Avx2, Avx512};
+
+#[cfg(target_arch = "x86_64")]
+#[allow(clippy::undocumented_unsafe_blocks)] // one reason for all of them: the module's "Safety" paragraph
+mod x86 {
+    use super::{Add, Div, EXP2, Lanes, Mul, Neg, Sub};
+    use std::arch::x86_64::*;
+
+    /// One AVX-512 register.
+    #[derive(Clone, Copy)]
+    #[doc(hidden)]
+    pub struct Avx512(__m512);
+
+    impl Avx512 {
+        #[inline(always)]
+        fn add_lanes(self, b: Self) -> Self {
+            Self(unsafe { _mm512_add_ps(self.0, b.0) })
+        }
+        #[inline(always)]
+        fn sub_lanes(self, b: Self) -> Self {
+            Self(unsafe { _mm512_sub_ps(self.0, b.0) })
+        }
+        #[inline(always)]
+        fn mul_lanes(self, b: Self) -> Self {
+            Self(unsafe { _mm512_mul_ps(self.0, b.0) })
+        }
+        #[inline(always)]
+        fn div_lanes(self, b: Self) -> Self {
+            Self(unsafe { _mm512_div_ps(self.0, b.0) })
+        }
+    }
+
+    operators!(Avx512);
+
+    impl Lanes for Avx512 {
+        #[inline(always)]
+        fn splat(x: f32) -> Self {
+            Self(unsafe { _mm512_set1_ps(x) })
+        }
+        #[inline(always)]
+        fn load(from: &[f32; 16]) -> Self {
+            Self(unsafe { _mm512_loadu_ps(from.as_ptr()) })
+        }
+        #[inline(always)]
+        fn store(self, to: &mut [f32; 16]) {
+            unsafe { _mm512_storeu_ps(to.as_mut_ptr(), self.0) }
+        }
+        #[inline(always)]
+        fn fma(self, b: Self, c: Self) -> Self {
+            Self(unsafe { _mm512_fmadd_ps(self.0, b.0, c.0) })
+        }
+        #[inline(always)]
+        fn min(self, b: Self) -> Self {
+            Self(unsafe { _mm512_min_ps(self.0, b.0) })
+        }
+        #[inline(always)]
+        fn max(self, b: Self) -> Self {
+            Self(unsafe { _mm512_max_ps(self.0, b.0) })
+        }
+        #[inline(always)]
+        fn abs(self) -> Self {
+            Self(unsafe { _mm512_abs_ps(self.0) })
+        }
+        #[inline(always)]
+        fn sqrt(self) -> Self {
+            Self(unsafe { _mm512_sqrt_ps(self.0) })
+        }
+        #[inline(always)]
+        fn lt(self, b: Self) -> u16 {
+            unsafe { _mm512_cmp_ps_mask::<_CMP_LT_OQ>(self.0, b.0) }
+        }
+        #[inline(always)]
+        fn le(self, b: Self) -> u16 {
+            unsafe { _mm512_cmp_ps_mask::<_CMP_LE_OQ>(self.0, b.0) }
+        }
+        #[inline(always)]
+        fn select(mask: u16, a: Self, b: Self) -> Self {
+            Self(unsafe { _mm512_mask_blend_ps(mask, b.0, a.0) })
+        }
+        #[inline(always)]
+        fn exp2(self) -> Self {
+            let x = self.max(Self::splat(-126.0)).min(Self::splat(126.0));
+            let whole = unsafe { _mm512_roundscale_ps::<0>(x.0) };
+            let f = x - Self(whole);
+            let mut p = Self::splat(EXP2[0]);
+            for c in &EXP2[1..] {
+                p = p.fma(f, Self::splat(*c));
+            }
+            Self(unsafe { _mm512_scalef_ps(p.0, whole) })
+        }
+        #[inline(always)]
+        fn recip(self) -> Self {
+            // 14 bits, then one Newton step: r·(2 - x·r).
+            let r = Self(unsafe { _mm512_rcp14_ps(self.0) });
+            let two_minus = Self(unsafe { _mm512_fnmadd_ps(self.0, r.0, _mm512_set1_ps(2.0)) });
+            r * two_minus
+        }
+        #[inline(always)]
+        fn sums(v: &[Self; 16]) -> Self {
+            // A transpose that adds: after each round a register carries partial sums of twice as many vectors.
+            let (low, high) = (Self::fold_eight(Self::fold_four(v, 0), Self::fold_four(v, 4)), {
+                Self::fold_eight(Self::fold_four(v, 8), Self::fold_four(v, 12))
+            });
+            Self::fold_eight(low, high)
+        }
+    }
+
+    impl Avx512 {
+        #[inline(always)]
+        fn fold_two(a: Self, b: Self) -> __m512d {
+            unsafe {
+                _mm512_castps_pd(_mm512_add_ps(_mm512_unpacklo_ps(a.0, b.0), _mm512_unpackhi_ps(a.0, b.0)))
+            }
+        }
+        #[inline(always)]
+        fn fold_four(v: &[Self; 16], i: usize) -> Self {
+            let (ab, cd) = (Self::fold_two(v[i], v[i + 1]), Self::fold_two(v[i + 2], v[i + 3]));
+            unsafe {
+                let (low, high) = (_mm512_unpacklo_pd(ab, cd), _mm512_unpackhi_pd(ab, cd));
+                Self(_mm512_add_ps(_mm512_castpd_ps(low), _mm512_castpd_ps(high)))
+            }
+        }
+        #[inline(always)]
+        fn fold_eight(a: Self, b: Self) -> Self {
+            unsafe {
+                let even = _mm512_shuffle_f32x4::<0b10_00_10_00>(a.0, b.0);
+                let odd = _mm512_shuffle_f32x4::<0b11_01_11_01>(a.0, b.0);
+                Self(_mm512_add_ps(even, odd))
+            }
+        }
+    }
+
+    /// Two AVX2 registers.
+    #[derive(Clone, Copy)]
+    #[doc(hidden)]
+    pub struct Avx2(__m256, __m256);
+
+    impl Avx2 {
+        #[inline(always)]
+        fn add_lanes(self, b: Self) -> Self {
+            unsafe { Self(_mm256_add_ps(self.0, b.0), _mm256_add_ps(self.1, b.1)) }
+        }
+        #[inline(always)]
+        fn sub_lanes(self, b: Self) -> Self {
+            unsafe { Self(_mm256_sub_ps(self.0, b.0), _mm256_sub_ps(self.1, b.1)) }
+        }
+        #[inline(always)]
+        fn mul_lanes(self, b: Self) -> Self {
+            unsafe { Self(_mm256_mul_ps(self.0, b.0), _mm256_mul_ps(self.1, b.1)) }
+        }
+        #[inline(always)]
+        fn div_lanes(self, b: Self) -> Self {
+            unsafe { Self(_mm256_div_ps(self.0, b.0), _mm256_div_ps(self.1, b.1)) }
+        }
+        #[inline(always)]
+        fn mask(half: u16) -> __m256 {
+            unsafe {
+                let bits = _mm256_setr_epi32(1, 2, 4, 8, 16, 32, 64, 128);
+                let set = _mm256_and_si256(_mm256_set1_epi32(i32::from(half & 0xff)), bits);
+                _mm256_castsi256_ps(_mm256_cmpeq_epi32(set, bits))
+            }
+        }
+        #[inline(always)]
+        fn bits(lo: __m256, hi: __m256) -> u16 {
+            unsafe { (_mm256_movemask_ps(lo) as u16) | ((_mm256_movemask_ps(hi) as u16) << 8) }
+        }
+    }
+
+    operators!(Avx2);
+
+    impl Lanes for Avx2 {
+        #[inline(always)]
+        fn splat(x: f32) -> Self {
+            unsafe { Self(_mm256_set1_ps(x), _mm256_set1_ps(x)) }
+        }
+        #[inline(always)]
+        fn load(from: &[f32; 16]) -> Self {
+            unsafe { Self(_mm256_loadu_ps(from.as_ptr()), _mm256_loadu_ps(from.as_ptr().add(8))) }
+        }
+        #[inline(always)]
+        fn store(self, to: &mut [f32; 16]) {
+            unsafe {
+                _mm256_storeu_ps(to.as_mut_ptr(), self.0);
+                _mm256_storeu_ps(to.as_mut_ptr().add(8), self.1);
+            }
+        }
+        #[inline(always)]
+        fn fma(self, b: Self, c: Self) -> Self {
+            unsafe { Self(_mm256_fmadd_ps(self.0, b.0, c.0), _mm256_fmadd_ps(self.1, b.1, c.1)) }
+        }
+        #[inline(always)]
+        fn min(self, b: Self) -> Self {
+            unsafe { Self(_mm256_min_ps(self.0, b.0), _mm256_min_ps(self.1, b.1)) }
+        }
+        #[inline(always)]
+        fn max(self, b: Self) -> Self {
+            unsafe { Self(_mm256_max_ps(self.0, b.0), _mm256_max_ps(self.1, b.1)) }
+        }
+        #[inline(always)]
+        fn abs(self) -> Self {
+            unsafe {
+                let sign = _mm256_set1_ps(-0.0);
+                Self(_mm256_andnot_ps(sign, self.0), _mm256_andnot_ps(sign, self.1))
+            }
+        }
+        #[inline(always)]
+        fn sqrt(self) -> Self {
+            unsafe { Self(_mm256_sqrt_ps(self.0), _mm256_sqrt_ps(self.1)) }
+        }
+        #[inline(always)]
+        fn lt(self, b: Self) -> u16 {
+            unsafe {
+                Self::bits(
+                    _mm256_cmp_ps::<_CMP_LT_OQ>(self.0, b.0),
+                    _mm256_cmp_ps::<_CMP_LT_OQ>(self.1, b.1),
+                )
+            }
+        }
+        #[inline(always)]
+        fn le(self, b: Self) -> u16 {
+            unsafe {
+                Self::bits(
+                    _mm256_cmp_ps::<_CMP_LE_OQ>(self.0, b.0),
+                    _mm256_cmp_ps::<_CMP_LE_OQ>(self.1, b.1),
+                )
+            }
+        }
+        #[inline(always)]
+        fn select(mask: u16, a: Self, b: Self) -> Self {
+            unsafe {
+                Self(
+                    _mm256_blendv_ps(b.0, a.0, Self::mask(mask)),
+                    _mm256_blendv_ps(b.1, a.1, Self::mask(mask >> 8)),
+                )
+            }
+        }
+        #[inline(always)]
+        fn exp2(self) -> Self {
+            let x = self.max(Self::splat(-126.0)).min(Self::splat(126.0));
+            let whole = Self(Self::round(x.0), Self::round(x.1));
+            let f = x - whole;
+            let mut p = Self::splat(EXP2[0]);
+            for c in &EXP2[1..] {
+                p = p.fma(f, Self::splat(*c));
+            }
+            Self(Self::scale(p.0, whole.0), Self::scale(p.1, whole.1))
+        }
+        #[inline(always)]
+        fn recip(self) -> Self {
+            Self::splat(1.0) / self
+        }
+        #[inline(always)]
+        fn sums(v: &[Self; 16]) -> Self {
+            Self(Self::fold_eight(v, 0), Self::fold_eight(v, 8))
+        }
+    }
+
+    impl Avx2 {
+        #[inline(always)]
+        fn fold_two(v: &[Self; 16], i: usize) -> __m256 {
+            unsafe { _mm256_hadd_ps(_mm256_add_ps(v[i].0, v[i].1), _mm256_add_ps(v[i + 1].0, v[i + 1].1)) }
+        }
+        #[inline(always)]
+        fn fold_four(v: &[Self; 16], i: usize) -> __m256 {
+            unsafe { _mm256_hadd_ps(Self::fold_two(v, i), Self::fold_two(v, i + 2)) }
+        }
+        #[inline(always)]
+        fn fold_eight(v: &[Self; 16], i: usize) -> __m256 {
+            let (a, b) = (Self::fold_four(v, i), Self::fold_four(v, i + 4));
+            unsafe { _mm256_add_ps(_mm256_permute2f128_ps::<0x20>(a, b), _mm256_permute2f128_ps::<0x31>(a, b)) }
+        }
+        #[inline(always)]
+        fn round(v: __m256) -> __m256 {
+            unsafe { _mm256_round_ps::<{ _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC }>(v) }
+        }
+        /// p · 2^whole
+        #[inline(always)]
+        fn scale(p: __m256, whole: __m256) -> __m256 {
+            unsafe {
+                let exponent = _mm256_slli_epi32::<23>(_mm256_cvtps_epi32(whole));
+                _mm256_castsi256_ps(_mm256_add_epi32(_mm256_castps_si256(p), exponent))
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    kernel!(fn all_ops(x: &[f32; 16], y: &[f32; 16], out: &mut Vec<[f32; 16]>) = all_ops_lanes);
+
+    #[inline(always)]
+    fn all_ops_lanes<L: Lanes>(x: &[f32; 16], y: &[f32; 16], out: &mut Vec<[f32; 16]>) {
+        let (a, b) = (L::load(x), L::load(y));
+        let sums: [L; 16] = std::array::from_fn(|i| a * L::splat(i as f32) + b);
+        let mask = a.lt(b);
+        for v in [
+            a + b, a - b, a * b, a / b, -a, a.fma(b, a), a.min(b), a.max(b), a.abs(), b.abs().sqrt(), a.exp2(),
+            b.abs().recip(), L::select(mask, a, b), L::select(b.le(a), a, b), L::sums(&sums),
+        ] {
+            out.push(v.to_array());
+        }
+    }
+
+    #[test]
+    fn every_instruction_set_computes_the_same() {
+        let x: [f32; 16] = std::array::from_fn(|i| (i as f32 - 7.3) * 1.7);
+        let y: [f32; 16] = std::array::from_fn(|i| 5.0 - (i as f32) * 0.83);
+        let close = |a: f32, b: f32| (a - b).abs() <= 1e-6 * (1.0 + a.abs().max(b.abs()));
+        let mut results = Vec::new();
+        for isa in Isa::available() {
+            let mut out = Vec::new();
+            all_ops(isa, &x, &y, &mut out);
+            results.push(out);
+        }
+        for other in &results[1..] {
+            for (op, (a, b)) in results[0].iter().zip(other).enumerate() {
+                // Sums cancel: their error is relative to the terms, up to 180 each.
+                let scale = if op == 14 { 1e3 } else { 1.0 };
+                assert!(a.iter().zip(b).all(|(a, b)| close(*a / scale, *b / scale)), "op {op}: {a:?} {b:?}");
+            }
+        }
+        let out = &results[0];
+        for i in 0..16 {
+            assert!(close(out[10][i] / x[i].exp2(), 1.0));
+            assert!(close(out[11][i], 1.0 / y[i].abs()));
+            assert_eq!(out[12][i], if x[i] < y[i] { x[i] } else { y[i] });
+            let sum: f32 = (0..16).map(|l| x[l] * i as f32 + y[l]).sum();
+            assert!((out[14][i] - sum).abs() < 1e-3);
+        }
+    }
+}

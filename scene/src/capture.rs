@@ -1,0 +1,81 @@
+//! A capture after it was opened: posed views, sparse points, and where on Earth they lie.
+
+use glam::DVec3;
+use serde::{Deserialize, Serialize};
+
+use crate::camera::Camera;
+use crate::ids::ArtefactId;
+
+/// WGS84 origin of the capture's local east-north-up frame.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct GeoOrigin {
+    /// Degrees north.
+    pub latitude_degrees: f64,
+    /// Degrees east.
+    pub longitude_degrees: f64,
+    /// Metres above the ellipsoid.
+    pub altitude_metres: f64,
+}
+
+/// One image with its camera.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct View {
+    /// The image's name as the capture has it, with `/` between folders.
+    pub name: String,
+    /// The ideal pinhole camera of mip 0.
+    pub camera: Camera,
+    /// One artefact per mip, finest first; empty until the capture was ingested.
+    pub mips: Vec<ArtefactId>,
+    /// True when pixels carry a mask (mips then have a fourth channel: 255 = use, 0 = leave out).
+    pub masked: bool,
+}
+
+/// Structure-from-motion points, and the views that saw each.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct SparsePoints {
+    /// World positions, metres.
+    pub positions: Vec<DVec3>,
+    /// sRGB colours, one per position.
+    pub colours: Vec<[u8; 3]>,
+    /// `seen_by[track_start[i] .. track_start[i + 1]]` are the views that saw point `i`; one longer than `positions`,
+    /// or empty where the capture has no tracks.
+    pub track_start: Vec<u32>,
+    /// Indices into the capture's views.
+    pub seen_by: Vec<u32>,
+}
+
+impl SparsePoints {
+    /// The number of points.
+    pub fn len(&self) -> usize {
+        self.positions.len()
+    }
+
+    /// True without points.
+    pub fn is_empty(&self) -> bool {
+        self.positions.is_empty()
+    }
+
+    /// The views that saw point `i`; `None` where the capture has no tracks.
+    pub fn track(&self, i: usize) -> Option<&[u32]> {
+        let (from, to) = (*self.track_start.get(i)?, *self.track_start.get(i + 1)?);
+        self.seen_by.get(from as usize..to as usize)
+    }
+}
+
+/// Images, cameras and points, views in name order.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct Capture {
+    /// Posed views, sorted by name.
+    pub views: Vec<View>,
+    /// Sparse points.
+    pub points: SparsePoints,
+    /// Where the local frame lies on Earth, if the capture says so.
+    pub geo_origin: Option<GeoOrigin>,
+}
+
+impl Capture {
+    /// True for the views that are held out: every `test_every`-th by name order, starting with the first.
+    pub fn is_test(index: usize, test_every: u32) -> bool {
+        test_every > 0 && index.is_multiple_of(test_every as usize)
+    }
+}

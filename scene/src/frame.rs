@@ -1,0 +1,137 @@
+//! The one envelope for everything plat writes for itself: plans, indices, checkpoints, splat columns.
+//!
+//! Layout, little endian: `"plat"`, four bytes of kind, version u32, header length u32, bulk length u64, the first 16
+//! bytes of the BLAKE3 hash of header and bulk, the header (bincode, fixed by serde), the bulk (plain bytes).
+//! bincode 2.0.1 is no longer developed; this module is the only one that calls it, with a limit.
+
+use serde::{Serialize, de::DeserializeOwned};
+
+use crate::error::CodecError;
+use crate::splats::Splats;
+
+const MAGIC: &[u8; 4] = b"plat";
+const PREFIX: usize = 40;
+/// The largest header that a reader accepts: a plan of 100,000 tasks needs about a tenth of it.
+pub const HEADER_LIMIT: usize = 1 << 30;
+
+/// Kinds of frames and the version each is at.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Kind(pub [u8; 4], pub u32);
+
+/// Splat columns; the header is [`SplatsHeader`].
+pub const SPLATS: Kind = Kind(*b"spla", 1);
+
+/// Wraps a header and bulk bytes.
+pub fn encode<T: Serialize>(kind: Kind, header: &T, bulk: &[u8]) -> Vec<u8> {
+    let header = bincode::serde::encode_to_vec(header, bincode::config::standard())
+        .expect("headers are plain data, which bincode always encodes");
+    let mut bytes = Vec::with_capacity(PREFIX + header.len() + bulk.len());
+    bytes.extend_from_slice(MAGIC);
+    bytes.extend_from_slice(&kind.0);
+    bytes.extend_from_slice(&kind.1.to_le_bytes());
+    bytes.extend_from_slice(&u32::try_from(header.len()).expect("a header is under HEADER_LIMIT").to_le_bytes());
+    bytes.extend_from_slice(&(bulk.len() as u64).to_le_bytes());
+    bytes.extend_from_slice(&checksum(&header, bulk));
+    bytes.extend_from_slice(&header);
+    bytes.extend_from_slice(bulk);
+    bytes
+}
+
+/// Unwraps a frame of this kind: its header and a view of its bulk.
+///
+/// # Errors
+/// Wrong magic, kind, version, length or checksum, or a header that does not decode to the last byte.
+pub fn decode<T: DeserializeOwned>(kind: Kind, bytes: &[u8]) -> Result<(T, &[u8]), CodecError> {
+    let name = String::from_utf8_lossy(&kind.0).into_owned();
+    if bytes.len() < PREFIX || &bytes[..4] != MAGIC || bytes[4..8] != kind.0 {
+        return Err(CodecError::new(format!("not a plat '{name}' frame")));
+    }
+    let word = |at: usize| u32::from_le_bytes(bytes[at..at + 4].try_into().expect("four bytes"));
+    if word(8) != kind.1 {
+        return Err(CodecError::new(format!("'{name}' frame of version {}, this program reads {}", word(8), kind.1)));
+    }
+    let header_len = word(12) as usize;
+    let bulk_len = u64::from_le_bytes(bytes[16..24].try_into().expect("eight bytes"));
+    if header_len > HEADER_LIMIT || (PREFIX + header_len) as u64 + bulk_len != bytes.len() as u64 {
+        return Err(CodecError::new(format!("'{name}' frame is cut short or padded")));
+    }
+    let (header, bulk) = bytes[PREFIX..].split_at(header_len);
+    if bytes[24..40] != checksum(header, bulk) {
+        return Err(CodecError::new(format!("'{name}' frame fails its checksum")));
+    }
+    let config = bincode::config::standard().with_limit::<HEADER_LIMIT>();
+    let (value, used) = bincode::serde::decode_from_slice(header, config)
+        .map_err(|e| CodecError::new(format!("'{name}' frame header: {e}")))?;
+    if used != header.len() {
+        return Err(CodecError::new(format!("'{name}' frame header has {} bytes too many", header.len() - used)));
+    }
+    Ok((value, bulk))
+}
+
+fn checksum(header: &[u8], bulk: &[u8]) -> [u8; 16] {
+    let mut hasher = blake3::Hasher::new();
+    hasher.update(header).update(bulk);
+    hasher.finalize().as_bytes()[..16].try_into().expect("16 of 32 bytes")
+}
+
+/// What precedes splat columns in a frame.
+#[derive(Debug, Clone, Copy, PartialEq, serde::Serialize, serde::Deserialize)]
+pub struct SplatsHeader {
+    /// SH degree.
+    pub sh_degree: u8,
+    /// Number of splats.
+    pub count: u64,
+}
+
+/// Splats as a frame: all columns one after the other, f32 little endian.
+pub fn encode_splats(splats: &Splats) -> Vec<u8> {
+    let bulk: Vec<u8> =
+        splats.columns().iter().flat_map(|c| bytemuck::cast_slice::<f32, u8>(c)).copied().collect();
+    encode(SPLATS, &SplatsHeader { sh_degree: splats.sh_degree(), count: splats.len() as u64 }, &bulk)
+}
+
+/// Splats from a frame.
+///
+/// # Errors
+/// As [`decode`], or a bulk whose length is not that of the columns.
+pub fn decode_splats(bytes: &[u8]) -> Result<Splats, CodecError> {
+    let (header, bulk): (SplatsHeader, _) = decode(SPLATS, bytes)?;
+    if header.sh_degree > 3 {
+        return Err(CodecError::new(format!("SH degree {} is above 3", header.sh_degree)));
+    }
+    let columns = Splats::new(header.sh_degree).columns().len();
+    if header.count.checked_mul(4 * columns as u64) != Some(bulk.len() as u64) {
+        return Err(CodecError::new("splat columns do not fit their header"));
+    }
+    if header.count == 0 {
+        return Ok(Splats::new(header.sh_degree));
+    }
+    let values = |chunk: &[u8]| {
+        chunk.chunks_exact(4).map(|b| f32::from_le_bytes(b.try_into().expect("four bytes"))).collect()
+    };
+    let columns = bulk.chunks_exact(4 * header.count as usize).map(values).collect();
+    Splats::from_columns(columns).ok_or_else(|| CodecError::new("splat columns of unequal length"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::splats::Splat;
+    use glam::Vec3;
+
+    #[test]
+    fn splats_round_trip_and_damage_is_seen() {
+        let mut splats = Splats::new(1);
+        for i in 0..5 {
+            splats.push(&Splat::round(Vec3::splat(i as f32), -1.0, Vec3::splat(0.4), 0.3));
+        }
+        let bytes = encode_splats(&splats);
+        assert_eq!(decode_splats(&bytes).unwrap(), splats);
+        for at in 0..bytes.len() {
+            let mut damaged = bytes.clone();
+            damaged[at] ^= 0x40;
+            assert!(decode_splats(&damaged).is_err(), "flip at {at} went unseen");
+        }
+        assert!(decode_splats(&bytes[..bytes.len() - 1]).is_err());
+    }
+}

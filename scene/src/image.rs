@@ -1,0 +1,21 @@
+//! Pixels in memory: what a window of a view looks like to the trainer.
+
+/// An 8-bit sRGB image or window, as planes: all red, all green, all blue, rows from the top.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Pixels {
+    /// Width in pixels.
+    pub width: u32,
+    /// Height in pixels.
+    pub height: u32,
+    /// `3 · width · height` bytes.
+    pub rgb: Vec<u8>,
+    /// `width · height` bytes where the view has a mask: 255 = use, 0 = leave out.
+    pub mask: Option<Vec<u8>>,
+}
+
+impl Pixels {
+    /// The number of pixels.
+    pub fn area(&self) -> usize {
+        self.width as usize * self.height as usize
+    }
+}

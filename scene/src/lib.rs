@@ -1,0 +1,26 @@
+//! The nouns of plat, and the codecs that turn them into bytes and back.
+//!
+//! Architecture invariant: nothing here opens a file, knows the network, a clock or a thread. A codec maps a byte
+//! slice to a value or to a [`CodecError`]; whoever opened the file adds its name.
+//!
+//! Conventions: the world is metres, right-handed; cameras are OpenCV (x right, y down, z forward); pixel centres
+//! lie at `+0.5`; quaternions are stored `wxyz` for splats (as INRIA's PLY does) and normalised on use.
+
+pub mod camera;
+pub mod capture;
+pub mod colmap;
+pub mod error;
+pub mod frame;
+pub mod ids;
+pub mod image;
+pub mod npy;
+pub mod ply;
+pub mod splats;
+pub mod transforms;
+
+pub use camera::{Camera, CameraModel, Pinhole, Rect, Rigid};
+pub use capture::{Capture, GeoOrigin, SparsePoints, View};
+pub use error::{BadInput, CodecError};
+pub use image::Pixels;
+pub use ids::{ArtefactId, BlockId};
+pub use splats::{Splat, Splats, column};

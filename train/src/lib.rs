@@ -1,0 +1,15 @@
+//! Trains the splats of one block: losses, optimiser, growth, and the metrics that judge the result.
+//!
+//! Architecture invariant: no files, no network, no clock. Pixels come through [`WindowSource`]; randomness is counter-based
+//! ([`random`]), so the same job gives the same splats whatever the number of threads.
+
+pub mod growth;
+pub mod init;
+pub mod loss;
+pub mod optimiser;
+pub mod random;
+pub mod source;
+pub mod trainer;
+
+pub use source::WindowSource;
+pub use trainer::{Flow, Job, Progress, Recipe, TrainError, TrainView, train};

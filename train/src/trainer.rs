@@ -1,0 +1,282 @@
+//! The training loop of one block.
+//!
+//! A step draws one window of one view, compares it with the photo, and moves the splats that were seen. Coarse mips come
+//! first, growth follows a schedule towards the budget, step sizes decay to the end. What lies outside the block is drawn from
+//! a frozen context, and a pixel counts by the share of it that the block's own splats explain.
+
+use glam::Vec3;
+use render::cpu::{Isa, Renderer};
+use render::{Options, Upstream};
+use scene::{Camera, Pixels, Rect, Splats};
+use serde::{Deserialize, Serialize};
+
+use crate::growth::{self, Evidence, Growth};
+use crate::loss::Photometric;
+use crate::optimiser::{Adam, Rates};
+use crate::{WindowSource, random};
+
+/// How a block is trained. Shares are of the number of steps; rates are per step of Adam.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Recipe {
+    /// Weight of 1 - SSIM in the loss.
+    pub lambda: f32,
+    /// Step of means, in units of each splat's size: at first, at the end.
+    pub mean: [f32; 2],
+    /// Step of ln(scale): at first, at the end.
+    pub log_scale: [f32; 2],
+    /// Step of quaternions: at first, at the end.
+    pub quat: [f32; 2],
+    /// Step of opacity logits: at first, at the end.
+    pub opacity: [f32; 2],
+    /// Step of the constant colour coefficient: at first, at the end.
+    pub sh_dc: [f32; 2],
+    /// The other coefficients' step relative to that.
+    pub sh_rest: f32,
+    /// Decay of Adam's second moment.
+    pub beta2: f32,
+    /// Pull on opacities and needles, see [`Rates`].
+    pub opacity_pull: f32,
+    /// See `opacity_pull`.
+    pub needle_pull: f32,
+    /// Each entry is the share of the steps after which the next SH degree joins.
+    pub sh_from: [f32; 3],
+    /// Each entry is the share of the steps that is trained at one mip coarser than the next, coarsest first.
+    pub coarse: Vec<f32>,
+    /// Opacity of the first splats.
+    pub initial_opacity: f32,
+    /// When and how splats are added and removed.
+    pub growth: Growth,
+}
+
+impl Default for Recipe {
+    fn default() -> Self {
+        Self {
+            lambda: 0.2,
+            mean: [0.03, 0.003],
+            log_scale: [0.01, 0.005],
+            quat: [0.002, 0.001],
+            opacity: [0.05, 0.02],
+            sh_dc: [0.01, 0.0025],
+            sh_rest: 0.05,
+            beta2: 0.999,
+            opacity_pull: 0.0,
+            needle_pull: 0.01,
+            sh_from: [0.3, 0.45, 0.6],
+            coarse: vec![0.1, 0.2],
+            initial_opacity: 0.3,
+            growth: Growth::default(),
+        }
+    }
+}
+
+/// A window of a view that a block trains on.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct TrainView {
+    /// Index in the capture.
+    pub view: u32,
+    /// Mip of the image at which the block is trained at the end.
+    pub mip: u8,
+    /// Window in pixels of that mip.
+    pub rect: Rect,
+    /// Camera of the whole image at mip 0.
+    pub camera: Camera,
+}
+
+impl TrainView {
+    /// The window `coarser` mips up: its mip, rectangle and camera; `None` when it would be under 8 pixels.
+    pub fn at(&self, coarser: u8) -> Option<(u8, Rect, Camera)> {
+        let mip = self.mip + coarser;
+        let (x, y) = (self.rect.x >> coarser, self.rect.y >> coarser);
+        let image = self.camera.mip(mip);
+        let width = ((self.rect.x + self.rect.width) >> coarser).min(image.pinhole.width).saturating_sub(x);
+        let height = ((self.rect.y + self.rect.height) >> coarser).min(image.pinhole.height).saturating_sub(y);
+        let rect = Rect { x, y, width, height };
+        (coarser == 0 || width.min(height) >= 8).then(|| (mip, rect, image.window(rect)))
+    }
+}
+
+/// What to train.
+pub struct Job<'a> {
+    /// The first splats.
+    pub initial: Splats,
+    /// What lies outside, drawn but not moved.
+    pub context: Option<&'a Splats>,
+    /// The windows, in the capture's order.
+    pub views: &'a [TrainView],
+    /// Is a splat here counted against the budget?
+    pub counts: &'a (dyn Fn(Vec3) -> bool + Sync),
+    /// Number of counted splats wanted at the end.
+    pub budget: usize,
+    /// Number of steps.
+    pub steps: u32,
+    /// Opacity compensated for the pixel's blur.
+    pub antialiased: bool,
+    /// Key of all random choices.
+    pub seed: u64,
+    /// Smallest and largest standard deviation, metres.
+    pub size_bounds_metres: [f32; 2],
+    /// How.
+    pub recipe: &'a Recipe,
+    /// Pixels.
+    pub source: &'a dyn WindowSource,
+}
+
+/// Where training stands.
+#[derive(Debug)]
+pub struct Progress<'a> {
+    /// Steps done.
+    pub step: u32,
+    /// Steps in all.
+    pub steps: u32,
+    /// Loss of the last window.
+    pub loss: f64,
+    /// The splats now.
+    pub splats: &'a Splats,
+    /// Steps whose gradient was not finite; such a step is left out.
+    pub skipped: u32,
+}
+
+/// Should training go on?
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Flow {
+    /// Yes.
+    Continue,
+    /// No: the splats so far are the result.
+    Stop,
+}
+
+/// Why a block could not be trained.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum TrainError {
+    /// No window to train on.
+    #[error("no view sees this block")]
+    NoViews,
+    /// A window could not be read.
+    #[error("{0}")]
+    Source(String),
+    /// All splats were removed.
+    #[error("every splat was removed after {0} steps: the views and the points do not agree, or poses are wrong")]
+    Empty(u32),
+}
+
+/// Trains a block; `report` is called after every step.
+///
+/// # Errors
+/// See [`TrainError`].
+pub fn train(job: Job, report: &mut dyn FnMut(Progress) -> Flow) -> Result<Splats, TrainError> {
+    let Job { initial: mut splats, context, views, counts, budget, steps, recipe, .. } = job;
+    if views.is_empty() {
+        return Err(TrainError::NoViews);
+    }
+    let isa = Isa::detect();
+    let mut renderer = Renderer::new(isa);
+    let mut loss = Photometric::new(isa, recipe.lambda);
+    let mut adam = Adam::new(isa, &splats);
+    let mut evidence = Evidence::default();
+    let mut upstream = Upstream::default();
+    let mut weights = Vec::new();
+    let mut skipped = 0;
+    let start_count = (0..splats.len()).filter(|&i| counts(splats.mean(i))).count();
+    let log_scale_bounds = job.size_bounds_metres.map(f32::ln);
+
+    for step in 0..steps {
+        if splats.is_empty() {
+            return Err(TrainError::Empty(step));
+        }
+        let progress = step as f32 / steps as f32;
+        let view = pick(views, job.seed, step);
+        let (mip, rect, camera) = (0..=coarser(recipe, progress)).rev().find_map(|c| view.at(c)).expect("at(0) always is");
+        let photo = job.source.window(view.view, mip, rect).map_err(TrainError::Source)?;
+
+        let sh_degree = recipe.sh_from.iter().filter(|&&from| progress >= from).count() as u8;
+        let options = Options {
+            antialiased: job.antialiased,
+            sh_degree: sh_degree.min(splats.sh_degree()),
+            background: [0.0; 3],
+            extras: context.is_some(),
+        };
+        let frame = renderer.forward(&splats, context, &camera, &options);
+        pixel_weights(frame, &photo, &mut weights);
+        let value = loss.evaluate(&frame.colour, &photo, &weights, &mut upstream.colour);
+        if value.total.is_finite() {
+            let gradients = renderer.backward(&splats, &upstream);
+            evidence.add(gradients, photo.area() as f32);
+            adam.step(&mut splats, gradients, options.sh_degree, &rates(recipe, progress, log_scale_bounds));
+        } else {
+            skipped += 1;
+        }
+
+        let growth = &recipe.growth;
+        let done = step + 1;
+        let last_refinement = (growth.until * steps as f32) as u32 + growth.every;
+        if done.is_multiple_of(growth.every) && progress >= growth.from && done <= last_refinement && done < steps {
+            let target = growth.target(done, steps, start_count, budget);
+            let (grown, rows, _) = growth::refine(&splats, &mut evidence, growth, target, counts);
+            splats = grown;
+            adam.rearrange(&rows);
+        }
+        if report(Progress { step: done, steps, loss: value.total, splats: &splats, skipped }) == Flow::Stop {
+            break;
+        }
+    }
+    Ok(splats)
+}
+
+/// Every view once per epoch, each epoch in another order.
+fn pick(views: &[TrainView], seed: u64, step: u32) -> &TrainView {
+    let n = views.len() as u32;
+    let order = random::shuffle(random::bits(seed, u64::from(step / n)), views.len());
+    &views[order[(step % n) as usize] as usize]
+}
+
+/// How many mips coarser than the last a step is trained.
+fn coarser(recipe: &Recipe, progress: f32) -> u8 {
+    let mut from = 0.0;
+    for (n, share) in recipe.coarse.iter().enumerate() {
+        from += share;
+        if progress < from {
+            return (recipe.coarse.len() - n) as u8;
+        }
+    }
+    0
+}
+
+/// Step sizes at a share of the way: geometric between first and last.
+fn rates(recipe: &Recipe, progress: f32, log_scale_bounds: [f32; 2]) -> Rates {
+    let at = |[first, last]: [f32; 2]| first * (last / first).powf(progress);
+    Rates {
+        mean: at(recipe.mean),
+        log_scale: at(recipe.log_scale),
+        quat: at(recipe.quat),
+        opacity: at(recipe.opacity),
+        sh_dc: at(recipe.sh_dc),
+        sh_rest: at(recipe.sh_dc) * recipe.sh_rest,
+        beta2: recipe.beta2,
+        opacity_pull: recipe.opacity_pull,
+        needle_pull: recipe.needle_pull,
+        log_scale_bounds,
+    }
+}
+
+/// What each pixel counts: nothing under a mask; else the share of what is drawn there that the block's own splats explain.
+/// Empty where every pixel counts alike.
+fn pixel_weights(frame: &render::Frame, photo: &Pixels, weights: &mut Vec<f32>) {
+    weights.clear();
+    if !frame.own.is_empty() {
+        // A pixel that nothing explains yet counts in full: whoever sees it may repair it.
+        const UNEXPLAINED: f32 = 0.01;
+        weights.extend(frame.own.iter().zip(&frame.transmittance).map(|(own, transmittance)| {
+            (own + UNEXPLAINED) / (1.0 - transmittance + UNEXPLAINED)
+        }));
+    }
+    if let Some(mask) = &photo.mask {
+        if weights.is_empty() {
+            weights.resize(mask.len(), 1.0);
+        }
+        for (weight, &mask) in weights.iter_mut().zip(mask) {
+            if mask < 128 {
+                *weight = 0.0;
+            }
+        }
+    }
+}
