@@ -1,1 +1,305 @@
-//! Placeholder until written.
+//! `transforms.json` of nerfstudio and instant-ngp: posed images of perspective cameras.
+//!
+//! A frame's `transform_matrix` is world_from_camera in OpenGL axes (x right, y up, z backward); ours is OpenCV
+//! camera_from_world. `applied_transform` needs nothing: nerfstudio has applied it to the frames and to the points of
+//! `ply_file_path` alike, so they agree. Intrinsics stand at the top, in a frame, or both (the frame's win).
+//! File paths are passed on as they stand: whoever opens them confines them.
+//!
+//! Sources: nerfstudio, "Data conventions"; instant-ngp, `nerf_loader`.
+
+use std::f64::consts::PI;
+
+use glam::{DMat3, DQuat, DVec3};
+use serde::{Deserialize, Serialize};
+
+use crate::camera::{CameraModel, Rigid};
+use crate::error::CodecError;
+
+/// How far from zero the cosine between two columns of a rotation may be.
+const ORTHOGONAL_WITHIN: f64 = 1e-3;
+
+/// A `transforms.json`.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Transforms {
+    /// At least one, in the file's order.
+    pub frames: Vec<Frame>,
+    /// A point cloud in the same world as the frames.
+    pub ply_file_path: Option<String>,
+}
+
+/// One posed image.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Frame {
+    /// The image, as the file says: relative to the file's folder, at times without an extension.
+    pub file_path: String,
+    /// A mask, as the file says.
+    pub mask_path: Option<String>,
+    /// What is known of the lens.
+    pub intrinsics: Intrinsics,
+    /// Pose: OpenCV camera axes from world axes.
+    pub camera_from_world: Rigid,
+}
+
+/// The intrinsics of a frame as far as the file says them; [`Intrinsics::model`] fills in the rest from the image.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Intrinsics {
+    /// Width and height in pixels, where the file has them. All pixels below are pixels of an image of this size.
+    pub size: Option<(u32, u32)>,
+    /// Horizontal and vertical focal length; at least one is there, and pixels are square where the other is not.
+    pub focal: [Option<Focal>; 2],
+    /// Principal point in pixels; absent coordinates are the image's middle.
+    pub centre: [Option<f64>; 2],
+    /// k1, k2, p1, p2, k3, k4, k5, k6 as in [`CameraModel::distortion`].
+    pub distortion: [f64; 8],
+}
+
+/// A focal length.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Focal {
+    /// In pixels (`fl_x`, `fl_y`).
+    Pixels(f64),
+    /// The full field of view in radians (`camera_angle_x`, `camera_angle_y`).
+    Angle(f64),
+}
+
+impl Focal {
+    fn pixels(self, side: u32) -> f64 {
+        match self {
+            Self::Pixels(focal) => focal,
+            Self::Angle(angle) => 0.5 * f64::from(side) / (0.5 * angle).tan(),
+        }
+    }
+}
+
+impl Intrinsics {
+    /// The intrinsics of a camera model.
+    pub fn from_model(model: &CameraModel, size: Option<(u32, u32)>) -> Self {
+        let [fx, fy, cx, cy] = model.focal_and_centre();
+        Self {
+            size,
+            focal: [Some(Focal::Pixels(fx)), Some(Focal::Pixels(fy))],
+            centre: [Some(cx), Some(cy)],
+            distortion: model.distortion(),
+        }
+    }
+
+    /// The camera model for the image of this width and height in pixels, which should be [`Intrinsics::size`] where
+    /// that is there: nothing is scaled here.
+    pub fn model(&self, width: u32, height: u32) -> CameraModel {
+        let [fx, fy] = [self.focal[0].map(|f| f.pixels(width)), self.focal[1].map(|f| f.pixels(height))];
+        // Neither: read refuses that, a caller who builds one by hand gets a focal length that is no number.
+        let (fx, fy) = (fx.or(fy).unwrap_or(f64::NAN), fy.or(fx).unwrap_or(f64::NAN));
+        let cx = self.centre[0].unwrap_or(0.5 * f64::from(width));
+        let cy = self.centre[1].unwrap_or(0.5 * f64::from(height));
+        match self.distortion {
+            [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0] => CameraModel::Pinhole([fx, fy, cx, cy]),
+            [k1, k2, p1, p2, 0.0, 0.0, 0.0, 0.0] => CameraModel::OpenCv([fx, fy, cx, cy, k1, k2, p1, p2]),
+            [k1, k2, p1, p2, k3, k4, k5, k6] => {
+                CameraModel::FullOpenCv([fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6])
+            }
+        }
+    }
+}
+
+/// Frames and their intrinsics.
+///
+/// # Errors
+/// Malformed JSON, no frames, a lens model that is not perspective, intrinsics without a focal length or out of
+/// range, or a `transform_matrix` whose 3×3 part is not a rotation times a scale (which is dropped).
+pub fn read(bytes: &[u8]) -> Result<Transforms, CodecError> {
+    let file: File = serde_json::from_slice(bytes).map_err(|e| CodecError::new(format!("transforms.json: {e}")))?;
+    if file.frames.is_empty() {
+        return Err(CodecError::new("transforms.json has no frames"));
+    }
+    let mut frames = Vec::with_capacity(file.frames.len());
+    for frame in file.frames {
+        let named = |problem: String| {
+            let name: String = frame.file_path.chars().take(120).collect();
+            CodecError::new(format!("frame {name:?}: {problem}"))
+        };
+        let intrinsics = frame.lens.over(&file.lens).resolve().map_err(named)?;
+        let camera_from_world = pose(&frame.transform_matrix).map_err(named)?;
+        frames.push(Frame { file_path: frame.file_path, mask_path: frame.mask_path, intrinsics, camera_from_world });
+    }
+    Ok(Transforms { frames, ply_file_path: file.ply_file_path })
+}
+
+/// The file, with all intrinsics in the frames; numbers that are not finite become `null`, which [`read`] refuses or
+/// takes for absent.
+pub fn write(transforms: &Transforms) -> Vec<u8> {
+    let frames = transforms.frames.iter().map(|frame| FileFrame {
+        file_path: frame.file_path.clone(),
+        mask_path: frame.mask_path.clone(),
+        lens: Lens::of(&frame.intrinsics),
+        transform_matrix: matrix(&frame.camera_from_world),
+    });
+    let file =
+        File { lens: Lens::default(), ply_file_path: transforms.ply_file_path.clone(), frames: frames.collect() };
+    serde_json::to_vec_pretty(&file).expect("text and numbers always serialise")
+}
+
+/// OpenCV camera_from_world of the rows of an OpenGL world_from_camera.
+fn pose(rows: &[[f64; 4]]) -> Result<Rigid, String> {
+    let (rows, last) = match rows {
+        [a, b, c] => ([a, b, c], &[0.0, 0.0, 0.0, 1.0]),
+        [a, b, c, last] => ([a, b, c], last),
+        _ => return Err(format!("transform_matrix has {} rows, not 4", rows.len())),
+    };
+    if last.iter().zip([0.0, 0.0, 0.0, 1.0]).any(|(a, b)| (a - b).abs() > 1e-6) {
+        return Err("transform_matrix does not end in 0 0 0 1".into());
+    }
+    let column = |k: usize| DVec3::new(rows[0][k], rows[1][k], rows[2][k]);
+    let [Some(x), Some(y), Some(z)] = [column(0), column(1), column(2)].map(DVec3::try_normalize) else {
+        return Err("transform_matrix has an axis without length".into());
+    };
+    let cosine = x.dot(y).abs().max(y.dot(z).abs()).max(z.dot(x).abs());
+    if cosine > ORTHOGONAL_WITHIN || x.cross(y).dot(z) < 0.0 {
+        return Err("transform_matrix is not a rotation: its axes are not orthogonal or not right-handed".into());
+    }
+    let rotation = DQuat::from_mat3(&DMat3::from_cols(x, -y, -z)).normalize();
+    let camera_from_world = Rigid { rotation, translation: column(3) }.inverse();
+    if !camera_from_world.is_sane() {
+        return Err("transform_matrix has numbers that are not finite".into());
+    }
+    Ok(camera_from_world)
+}
+
+/// The rows of the OpenGL world_from_camera of an OpenCV camera_from_world.
+fn matrix(camera_from_world: &Rigid) -> Vec<[f64; 4]> {
+    let world_from_camera = camera_from_world.inverse();
+    let axes = DMat3::from_quat(world_from_camera.rotation);
+    let (x, y, z, centre) = (axes.x_axis, -axes.y_axis, -axes.z_axis, world_from_camera.translation);
+    let mut rows: Vec<_> = (0..3).map(|k| [x[k], y[k], z[k], centre[k]]).collect();
+    rows.push([0.0, 0.0, 0.0, 1.0]);
+    rows
+}
+
+/// The file as JSON.
+#[derive(Serialize, Deserialize)]
+struct File {
+    #[serde(flatten)]
+    lens: Lens,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    ply_file_path: Option<String>,
+    frames: Vec<FileFrame>,
+}
+
+#[derive(Serialize, Deserialize)]
+struct FileFrame {
+    file_path: String,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    mask_path: Option<String>,
+    #[serde(flatten)]
+    lens: Lens,
+    transform_matrix: Vec<[f64; 4]>,
+}
+
+macro_rules! lens {
+    ($($field:ident: $type:ty),* $(,)?) => {
+        /// The keys that a frame shares with the top of the file.
+        #[derive(Default, Clone, Serialize, Deserialize)]
+        struct Lens {
+            $(#[serde(skip_serializing_if = "Option::is_none")] $field: Option<$type>,)*
+        }
+
+        impl Lens {
+            /// This where it says something, else `shared`.
+            fn over(&self, shared: &Self) -> Self {
+                let mut both = Self { $($field: self.$field.clone().or_else(|| shared.$field.clone()),)* };
+                // Either of the two says the focal length, so a frame's angle beats the file's length.
+                if self.fl_x.is_none() && self.camera_angle_x.is_some() {
+                    both.fl_x = None;
+                }
+                if self.fl_y.is_none() && self.camera_angle_y.is_some() {
+                    both.fl_y = None;
+                }
+                both
+            }
+        }
+    };
+}
+
+lens! {
+    camera_model: String, is_fisheye: bool, w: f64, h: f64, fl_x: f64, fl_y: f64, camera_angle_x: f64,
+    camera_angle_y: f64, cx: f64, cy: f64, k1: f64, k2: f64, p1: f64, p2: f64, k3: f64, k4: f64, k5: f64, k6: f64,
+}
+
+impl Lens {
+    fn of(intrinsics: &Intrinsics) -> Self {
+        let pixels = |focal| if let Some(Focal::Pixels(f)) = focal { Some(f) } else { None };
+        let angle = |focal| if let Some(Focal::Angle(a)) = focal { Some(a) } else { None };
+        let [fx, fy] = intrinsics.focal;
+        let distortion = intrinsics.distortion;
+        let model = match distortion {
+            [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0] => "PINHOLE",
+            [.., 0.0, 0.0, 0.0] => "OPENCV",
+            _ => "FULL_OPENCV",
+        };
+        let [k1, k2, p1, p2, k3, k4, k5, k6] = distortion.map(|k| (k != 0.0).then_some(k));
+        Self {
+            camera_model: Some(model.into()),
+            is_fisheye: None,
+            w: intrinsics.size.map(|(w, _)| w.into()),
+            h: intrinsics.size.map(|(_, h)| h.into()),
+            fl_x: pixels(fx),
+            fl_y: pixels(fy),
+            camera_angle_x: angle(fx),
+            camera_angle_y: angle(fy),
+            cx: intrinsics.centre[0],
+            cy: intrinsics.centre[1],
+            k1,
+            k2,
+            p1,
+            p2,
+            k3,
+            k4,
+            k5,
+            k6,
+        }
+    }
+
+    fn resolve(&self) -> Result<Intrinsics, String> {
+        const PERSPECTIVE: [&str; 6] =
+            ["PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"];
+        let fisheye = self.is_fisheye == Some(true);
+        let model = if fisheye { "fisheye" } else { self.camera_model.as_deref().unwrap_or("OPENCV") };
+        if !PERSPECTIVE.contains(&model) {
+            let model: String = model.chars().take(40).collect();
+            return Err(format!("camera model {model:?} is not perspective; undistort the images first"));
+        }
+        let side = |key: &str, value: Option<f64>| match value {
+            Some(v) if !(v >= 1.0 && v <= f64::from(u32::MAX) && v.fract() == 0.0) => {
+                Err(format!("'{key}' is {v}, not a number of pixels"))
+            }
+            value => Ok(value.map(|v| v as u32)),
+        };
+        let size = side("w", self.w)?.zip(side("h", self.h)?);
+        let focal = |axis: &str, length: Option<f64>, angle: Option<f64>| match (length, angle) {
+            (Some(f), _) if f.is_finite() && f > 0.0 => Ok(Some(Focal::Pixels(f))),
+            (Some(f), _) => Err(format!("'fl_{axis}' is {f}, not a focal length")),
+            (None, Some(a)) if a > 0.0 && a < PI => Ok(Some(Focal::Angle(a))),
+            (None, Some(a)) => Err(format!("'camera_angle_{axis}' is {a}, not between 0 and π")),
+            (None, None) => Ok(None),
+        };
+        let focal = [focal("x", self.fl_x, self.camera_angle_x)?, focal("y", self.fl_y, self.camera_angle_y)?];
+        if focal == [None, None] {
+            return Err("neither 'fl_x' nor 'camera_angle_x'".into());
+        }
+        let distortion =
+            [self.k1, self.k2, self.p1, self.p2, self.k3, self.k4, self.k5, self.k6].map(Option::unwrap_or_default);
+        // In nerfstudio k4 is the factor of r⁸, in OpenCV it stands below the line: without a name nobody can say.
+        if model != "FULL_OPENCV" && distortion[5..].iter().any(|&k| k != 0.0) {
+            return Err(
+                "'k4' and above are clear only with camera_model FULL_OPENCV; undistort the images first".into()
+            );
+        }
+        let centre = [self.cx, self.cy];
+        if !distortion.iter().chain(centre.iter().flatten()).all(|v| v.is_finite()) {
+            return Err("intrinsics that are not finite".into());
+        }
+        Ok(Intrinsics { size, focal, centre, distortion })
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,8 +1,10 @@
-//! The first splats: one for every sparse point, as large as the gap to its neighbours.
+//! The first splats: one for every sparse point, as large as the gap to its neighbours, and a backdrop behind them.
 
-use glam::Vec3;
+use glam::{DVec3, Vec3};
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
 use scene::{SparsePoints, Splat, Splats};
+
+use crate::{TrainView, WindowSource};
 
 /// Neighbours whose mean distance gives a splat its size, as in 3DGS.
 const NEIGHBOURS: usize = 3;
@@ -27,4 +29,69 @@ pub fn from_points(points: &SparsePoints, sh_degree: u8, opacity: f32, bounds: [
         splats.push(&Splat::round(mean, size.ln(), colour, opacity));
     }
     splats
+}
+
+/// Splats of a backdrop; 6° apart.
+const BACKDROP: usize = 1024;
+
+/// A sphere of opaque splats around everything, coloured by what the views show in each direction: the sky, and whatever
+/// else no point was found on. It gives every ray something to end in, so that near splats are not stretched to fill
+/// the distance. `centre` and `radius_metres` should enclose cameras and points with room to spare.
+///
+/// # Errors
+/// A view that cannot be read.
+pub fn backdrop(
+    views: &[TrainView],
+    source: &dyn WindowSource,
+    sh_degree: u8,
+    centre: DVec3,
+    radius_metres: f64,
+) -> Result<Splats, String> {
+    // A Fibonacci lattice: turn by the golden angle, equal steps in height.
+    let golden = std::f64::consts::PI * (3.0 - 5f64.sqrt());
+    let directions: Vec<[f64; 3]> = (0..BACKDROP)
+        .map(|i| {
+            let z = 1.0 - (2.0 * i as f64 + 1.0) / BACKDROP as f64;
+            let (sin, cos) = (golden * i as f64).sin_cos();
+            let ring = (1.0 - z * z).sqrt();
+            [ring * cos, ring * sin, z]
+        })
+        .collect();
+    let tree = ImmutableKdTree::<f64, 3>::new_from_slice(&directions).map_err(|_| "no backdrop lattice".to_string())?;
+    let mut sums = vec![[0.0f64; 4]; BACKDROP];
+    for view in views {
+        let coarsest = (0..=8).rev().find_map(|c| view.at(c));
+        let Some((mip, rect, camera)) = coarsest else { continue };
+        let photo = source.window(view.view, mip, rect)?;
+        let area = photo.area();
+        let world_from_camera = camera.camera_from_world.rotation.inverse();
+        for (i, y, x) in (0..area).map(|i| (i, i / photo.width as usize, i % photo.width as usize)) {
+            if photo.mask.as_ref().is_some_and(|mask| mask[i] < 128) {
+                continue;
+            }
+            let k = &camera.pinhole;
+            let ray = DVec3::new((x as f64 + 0.5 - k.cx) / k.fx, (y as f64 + 0.5 - k.cy) / k.fy, 1.0);
+            let direction = (world_from_camera * ray).normalize();
+            let near = tree.query(&direction.to_array()).nearest_one::<SquaredEuclidean<f64>>().execute();
+            let sum = &mut sums[near.item as usize];
+            for c in 0..3 {
+                sum[c] += f64::from(photo.rgb[c * area + i]) / 255.0;
+            }
+            sum[3] += 1.0;
+        }
+    }
+    let total = sums.iter().fold([0.0; 4], |mut t, s| {
+        t.iter_mut().zip(s).for_each(|(t, s)| *t += s);
+        t
+    });
+    let size = radius_metres * (4.0 * std::f64::consts::PI / BACKDROP as f64).sqrt() * 0.6;
+    let mut splats = Splats::new(sh_degree);
+    for (direction, sum) in directions.iter().zip(&sums) {
+        // A direction nobody looks in shows what all views show on average.
+        let sum = if sum[3] > 0.0 { sum } else { &total };
+        let colour = Vec3::from_array([0, 1, 2].map(|c| (sum[c] / sum[3].max(1.0)) as f32));
+        let mean = centre + DVec3::from_array(*direction) * radius_metres;
+        splats.push(&Splat::round(mean.as_vec3(), (size as f32).ln(), colour, 0.95));
+    }
+    Ok(splats)
 }

@@ -6,6 +6,7 @@
 pub mod growth;
 pub mod init;
 pub mod loss;
+pub mod metrics;
 pub mod optimiser;
 pub mod random;
 pub mod source;

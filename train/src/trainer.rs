@@ -69,6 +69,20 @@ impl Default for Recipe {
     }
 }
 
+impl Recipe {
+    /// For splats that already fit one mip coarser: no coarse beginning, full SH degree at once, smaller steps.
+    pub fn refinement() -> Self {
+        let recipe = Self::default();
+        Self {
+            mean: [recipe.mean[0] * 0.5, recipe.mean[1]],
+            sh_from: [0.0; 3],
+            coarse: Vec::new(),
+            growth: Growth { from: 0.0, ..recipe.growth },
+            ..recipe
+        }
+    }
+}
+
 /// A window of a view that a block trains on.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TrainView {
@@ -83,7 +97,8 @@ pub struct TrainView {
 }
 
 impl TrainView {
-    /// The window `coarser` mips up: its mip, rectangle and camera; `None` when it would be under 8 pixels.
+    /// The window `coarser` mips up: its mip, rectangle and camera; `None` when it would be under 8 pixels, or the image
+    /// under 16, which is where mips end.
     pub fn at(&self, coarser: u8) -> Option<(u8, Rect, Camera)> {
         let mip = self.mip + coarser;
         let (x, y) = (self.rect.x >> coarser, self.rect.y >> coarser);
@@ -91,7 +106,8 @@ impl TrainView {
         let width = ((self.rect.x + self.rect.width) >> coarser).min(image.pinhole.width).saturating_sub(x);
         let height = ((self.rect.y + self.rect.height) >> coarser).min(image.pinhole.height).saturating_sub(y);
         let rect = Rect { x, y, width, height };
-        (coarser == 0 || width.min(height) >= 8).then(|| (mip, rect, image.window(rect)))
+        let image_side = image.pinhole.width.min(image.pinhole.height);
+        (coarser == 0 || (width.min(height) >= 8 && image_side >= 16)).then(|| (mip, rect, image.window(rect)))
     }
 }
 

@@ -120,6 +120,11 @@ impl Renderer {
         self.bins.pairs.len()
     }
 
+    /// Blocks of sixteen pixels that those pairs touch: an upper bound of what the rasterizer visits.
+    pub fn blocks(&self) -> usize {
+        self.bins.pairs.iter().map(|pair| pair.blocks.count_ones() as usize).sum()
+    }
+
     fn project(&mut self, splats: &Splats, context: Option<&Splats>, view: &View, options: &Options) {
         // Context records start at a whole group of lanes.
         let first_context = splats.len().next_multiple_of(simd::LANES);

@@ -1,0 +1,271 @@
+//! What a run leaves for people: result lines, the chart and table drawn from them, contact sheets, bird's-eye cameras.
+//!
+//! `bench/results/*.jsonl` holds one [`ResultLine`] per run and is never edited by hand; the README's chart and table
+//! are functions of it.
+
+pub mod birdseye;
+pub mod chart;
+pub mod sheet;
+pub mod table;
+
+use std::fs;
+use std::io::Write;
+use std::path::Path;
+
+use scene::BadInput;
+use serde::{Deserialize, Serialize};
+
+pub use birdseye::{birdseye_camera, oblique_camera};
+pub use chart::chart;
+pub use sheet::{SheetRow, contact_sheet, write_png};
+pub use table::{replace_table, table};
+
+/// One run, as one line of JSON. What was not measured is null.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct ResultLine {
+    /// What the chart calls the run: `plat tree`, `OpenSplat`.
+    pub label: String,
+    /// The program's git commit.
+    pub commit: String,
+    /// CPU model and cores, see [`machine`].
+    pub machine: String,
+    /// The capture's name: `fox`, `street_lund`.
+    pub scene: String,
+    /// Photos were used at one over this of their size.
+    #[serde(default = "one")]
+    pub downscale: u32,
+    /// Hash of the resolved configuration.
+    pub config_hash: Option<String>,
+    /// Backend and its instruction set or adapter.
+    pub backend: String,
+    /// Number of workers.
+    pub workers: u32,
+    /// Wall time of training, seconds.
+    pub wall_seconds: Option<f64>,
+    /// User and system time of training, image loading included, evaluation not, seconds.
+    pub cpu_seconds: f64,
+    /// Held-out views, dB.
+    pub psnr: f64,
+    /// Held-out views, 0..1.
+    pub ssim: Option<f64>,
+    /// Held-out views.
+    pub lpips: Option<f64>,
+    /// SSIMULACRA2 over held-out views, up to 100.
+    pub perceptual: Option<f64>,
+    /// PSNR inside object zones, dB.
+    pub zone_psnr: Option<f64>,
+    /// Share of the photos' detections that the renders keep.
+    pub detections_kept: Option<f64>,
+    /// Splats at the end.
+    pub splats: Option<u64>,
+    /// Size of the model, bytes.
+    pub bytes: Option<u64>,
+    /// Largest resident memory, bytes.
+    pub peak_memory_bytes: Option<u64>,
+    /// Bytes moved between workers and store.
+    pub bytes_moved: Option<u64>,
+    /// Rendered frames per second.
+    pub fps: Option<f64>,
+    /// The run's seed.
+    pub seed: Option<u64>,
+    /// The command that made the line.
+    pub command: String,
+    /// Held-out PSNR along the way, in order of time.
+    #[serde(default)]
+    pub curve: Vec<CurvePoint>,
+    /// Where a reference's figures come from; null for our own runs.
+    pub source: Option<String>,
+}
+
+/// A report during a run.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct CurvePoint {
+    /// Since the start, as [`ResultLine::cpu_seconds`].
+    pub cpu_seconds: f64,
+    /// Held-out views, dB.
+    pub psnr: f64,
+    /// Splats at that time.
+    pub splats: Option<u64>,
+}
+
+fn one() -> u32 {
+    1
+}
+
+impl ResultLine {
+    /// CPU seconds until the curve first reaches this PSNR, interpolated between its points; `None` if it never does.
+    pub fn cpu_seconds_to(&self, psnr: f64) -> Option<f64> {
+        let reached = self.curve.iter().position(|p| p.psnr >= psnr)?;
+        let at = self.curve[reached];
+        let Some(before) = reached.checked_sub(1).map(|i| self.curve[i]) else { return Some(at.cpu_seconds) };
+        let share = (psnr - before.psnr) / (at.psnr - before.psnr);
+        Some(before.cpu_seconds + share * (at.cpu_seconds - before.cpu_seconds))
+    }
+
+    /// The best PSNR of the curve and the end, dB.
+    pub fn best_psnr(&self) -> f64 {
+        self.curve.iter().map(|p| p.psnr).fold(self.psnr, f64::max)
+    }
+
+    fn is_finite(&self) -> bool {
+        let numbers = [Some(self.cpu_seconds), Some(self.psnr), self.wall_seconds, self.ssim, self.lpips];
+        let more = [self.perceptual, self.zone_psnr, self.detections_kept, self.fps];
+        numbers.iter().chain(&more).flatten().all(|v| v.is_finite())
+            && self.curve.iter().all(|p| p.cpu_seconds.is_finite() && p.psnr.is_finite())
+    }
+}
+
+/// Appends a line to a results file, which it makes if need be.
+///
+/// # Errors
+/// A number that is not finite (JSON has none), or a file that cannot be written.
+pub fn append(path: &Path, line: &ResultLine) -> Result<(), BadInput> {
+    let name = path.display().to_string();
+    if !line.is_finite() {
+        return Err(BadInput::new(name, "a result with a number that is not finite", "give null for what is unknown"));
+    }
+    let refuse = |e: std::io::Error| BadInput::new(name.clone(), format!("cannot be written: {e}"), "check the folder");
+    let mut text = serde_json::to_string(line).expect("a result line is plain data");
+    text.push('\n');
+    let mut file = fs::OpenOptions::new().create(true).append(true).open(path).map_err(refuse)?;
+    file.write_all(text.as_bytes()).map_err(refuse)
+}
+
+/// The lines of a results file, in order; empty lines are skipped.
+///
+/// # Errors
+/// A file that cannot be read, or a line that is not a result.
+pub fn read(path: &Path) -> Result<Vec<ResultLine>, BadInput> {
+    let name = path.display().to_string();
+    let refuse = |e: std::io::Error| BadInput::new(name.clone(), format!("cannot be read: {e}"), "check the path");
+    let text = fs::read_to_string(path).map_err(refuse)?;
+    let lines = text.lines().enumerate().filter(|(_, line)| !line.trim().is_empty());
+    let parse = |(i, line): (usize, &str)| -> Result<ResultLine, BadInput> {
+        let bad =
+            |what: String| BadInput::new(format!("{name}:{}", i + 1), what, "restore the line from version control");
+        let line: ResultLine = serde_json::from_str(line).map_err(|e| bad(format!("is no result line: {e}")))?;
+        if line.is_finite() { Ok(line) } else { Err(bad("has a number that is not finite".into())) }
+    };
+    lines.map(parse).collect()
+}
+
+/// All lines of a folder's `*.jsonl` files, files in name order.
+///
+/// # Errors
+/// As [`read`].
+pub fn read_folder(folder: &Path) -> Result<Vec<ResultLine>, BadInput> {
+    let refuse = |e: std::io::Error| {
+        BadInput::new(folder.display().to_string(), format!("cannot be read: {e}"), "name a folder of results")
+    };
+    let entries = fs::read_dir(folder).map_err(refuse)?.collect::<Result<Vec<_>, _>>().map_err(refuse)?;
+    let mut paths: Vec<_> = entries.into_iter().map(|entry| entry.path()).collect();
+    paths.retain(|path| path.extension().is_some_and(|e| e == "jsonl"));
+    paths.sort();
+    let mut lines = Vec::new();
+    for path in paths {
+        lines.extend(read(&path)?);
+    }
+    Ok(lines)
+}
+
+/// The last line of each scene and label, in the order of their first appearance.
+pub fn latest(lines: &[ResultLine]) -> Vec<&ResultLine> {
+    let mut latest: Vec<&ResultLine> = Vec::new();
+    for line in lines {
+        match latest.iter_mut().find(|l| l.scene == line.scene && l.label == line.label) {
+            Some(older) => *older = line,
+            None => latest.push(line),
+        }
+    }
+    latest
+}
+
+/// CPU model and number of cores of this machine: `Intel(R) Xeon(R) CPU @ 2.50GHz, 2 cores`. No host name.
+pub fn machine() -> String {
+    let cores = std::thread::available_parallelism().map_or(1, usize::from);
+    let info = fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
+    let model = info.lines().find_map(|line| line.strip_prefix("model name")?.split_once(':'));
+    let model = model.map_or(std::env::consts::ARCH, |(_, model)| model.trim());
+    format!("{model}, {cores} core{}", if cores == 1 { "" } else { "s" })
+}
+
+/// Scenes in the order in which chart and table show them: those of the bench first, then others as they come.
+fn scenes<'a>(lines: impl Iterator<Item = &'a ResultLine>) -> Vec<&'a str> {
+    const KNOWN: [&str; 4] = ["fox", "aerial_caliterra", "street_lund", "building_sceaux"];
+    let mut scenes: Vec<&str> = Vec::new();
+    for line in lines {
+        if !scenes.contains(&line.scene.as_str()) {
+            scenes.push(&line.scene);
+        }
+    }
+    scenes.sort_by_key(|s| KNOWN.iter().position(|k| k == s).unwrap_or(KNOWN.len()));
+    scenes
+}
+
+#[cfg(test)]
+pub(crate) mod tests {
+    use super::*;
+
+    pub(crate) fn line(label: &str, scene: &str, curve: &[(f64, f64)]) -> ResultLine {
+        let curve: Vec<CurvePoint> =
+            curve.iter().map(|&(cpu_seconds, psnr)| CurvePoint { cpu_seconds, psnr, splats: Some(12_010) }).collect();
+        let last = *curve.last().unwrap();
+        ResultLine {
+            label: label.into(),
+            scene: scene.into(),
+            downscale: 1,
+            backend: "cpu-avx2".into(),
+            workers: 1,
+            cpu_seconds: last.cpu_seconds,
+            psnr: last.psnr,
+            splats: last.splats,
+            curve,
+            ..Default::default()
+        }
+    }
+
+    #[test]
+    fn lines_round_trip_through_a_file() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("runs.jsonl");
+        let lines = [line("plat tree", "fox", &[(1.0, 20.0)]), line("plat whole", "fox", &[(2.0, 21.5)])];
+        lines.iter().for_each(|l| append(&path, l).unwrap());
+        assert_eq!(read_folder(folder.path()).unwrap(), lines);
+        let not_finite = ResultLine { psnr: f64::NAN, ..lines[0].clone() };
+        assert!(append(&path, &not_finite).is_err());
+        assert_eq!(read(&path).unwrap().len(), 2);
+        fs::write(&path, "{\"label\":\n").unwrap();
+        assert!(read(&path).unwrap_err().to_string().contains("runs.jsonl:1"));
+    }
+
+    #[test]
+    fn unmeasured_figures_are_null_in_the_file() {
+        let text = serde_json::to_string(&line("plat tree", "fox", &[(1.0, 20.0)])).unwrap();
+        assert!(text.contains("\"lpips\":null") && text.contains("\"zone_psnr\":null"), "{text}");
+    }
+
+    #[test]
+    fn time_to_a_quality_is_interpolated() {
+        let run = line("plat", "fox", &[(10.0, 20.0), (20.0, 24.0), (30.0, 23.0)]);
+        assert_eq!(run.cpu_seconds_to(22.0), Some(15.0));
+        assert_eq!(run.cpu_seconds_to(19.0), Some(10.0));
+        assert_eq!(run.cpu_seconds_to(24.1), None);
+        assert_eq!(run.best_psnr(), 24.0);
+    }
+
+    #[test]
+    fn the_latest_of_each_scene_and_label_counts() {
+        let lines = [line("a", "fox", &[(1.0, 1.0)]), line("b", "fox", &[(1.0, 2.0)]), line("a", "fox", &[(1.0, 3.0)])];
+        let psnr: Vec<f64> = latest(&lines).iter().map(|l| l.psnr).collect();
+        assert_eq!(psnr, [3.0, 2.0]);
+    }
+
+    #[test]
+    fn the_stored_reference_reads() {
+        let path = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/results/reference_opensplat.jsonl"));
+        let lines = read(path).unwrap();
+        assert_eq!(scenes(lines.iter()), ["fox", "aerial_caliterra", "street_lund", "building_sceaux"]);
+        assert!(lines.iter().all(|l| l.source.is_some()));
+        assert_eq!(lines[0].cpu_seconds_to(24.44), Some(365.0));
+    }
+}

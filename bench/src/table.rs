@@ -1,0 +1,112 @@
+//! The README's table: markdown from result lines, between two markers.
+
+use std::fmt::Write;
+
+use crate::{ResultLine, latest, scenes};
+
+const BEGIN: &str = "<!-- bench:begin -->";
+const END: &str = "<!-- bench:end -->";
+
+/// The latest run of each scene and label, references (lines with a source) first. The column of times says how long
+/// a run took to the reference's best PSNR, and how much sooner that is than the reference's own.
+pub fn table(lines: &[ResultLine]) -> String {
+    let lines = latest(lines);
+    let mut text = String::from(
+        "| scene | run | backend | PSNR, dB | SSIM | SSIMULACRA2 | CPU s | to the reference's best, CPU s | splats | peak MB |\n\
+         |---|---|---|---:|---:|---:|---:|---:|---:|---:|\n",
+    );
+    for scene in scenes(lines.iter().copied()) {
+        let of_scene = || lines.iter().filter(|line| line.scene == scene);
+        let reference = of_scene().find(|line| line.source.is_some());
+        let ordered = of_scene().filter(|l| l.source.is_some()).chain(of_scene().filter(|l| l.source.is_none()));
+        for line in ordered {
+            let size = if line.downscale > 1 { format!(" 1/{}", line.downscale) } else { String::new() };
+            // writing to a String cannot fail
+            let _ = writeln!(
+                text,
+                "| {}{size} | {} | {} | {:.2} | {} | {} | {} | {} | {} | {} |",
+                cell(scene),
+                cell(&line.label),
+                cell(&line.backend),
+                line.psnr,
+                number(line.ssim, 3),
+                number(line.perceptual, 1),
+                seconds(line.cpu_seconds),
+                reference.map_or("–".into(), |reference| to_best(line, reference)),
+                line.splats.map_or("–".into(), thousands),
+                number(line.peak_memory_bytes.map(|bytes| bytes as f64 / 1e6), 0),
+            );
+        }
+    }
+    text
+}
+
+/// The document with the text between its markers `<!-- bench:begin -->` and `<!-- bench:end -->` replaced; `None`
+/// where a marker is missing.
+pub fn replace_table(document: &str, table: &str) -> Option<String> {
+    let from = document.find(BEGIN)? + BEGIN.len();
+    let to = from + document[from..].find(END)?;
+    Some(format!("{}\n{}\n{}", &document[..from], table.trim_end(), &document[to..]))
+}
+
+fn to_best(line: &ResultLine, reference: &ResultLine) -> String {
+    let best = reference.best_psnr();
+    match (line.cpu_seconds_to(best), reference.cpu_seconds_to(best)) {
+        (Some(ours), _) if line.source.is_some() => seconds(ours),
+        (Some(ours), Some(theirs)) if ours > 0.0 => format!("{} ({:.1}×)", seconds(ours), theirs / ours),
+        (Some(ours), _) => seconds(ours),
+        (None, _) => "not reached".into(),
+    }
+}
+
+fn seconds(value: f64) -> String {
+    if value < 100.0 { format!("{value:.1}") } else { format!("{value:.0}") }
+}
+
+fn number(value: Option<f64>, digits: usize) -> String {
+    value.map_or("–".into(), |v| format!("{v:.digits$}"))
+}
+
+fn thousands(value: u64) -> String {
+    let digits = value.to_string();
+    let mut text = String::new();
+    for (i, digit) in digits.chars().enumerate() {
+        if i > 0 && (digits.len() - i).is_multiple_of(3) {
+            text.push(',');
+        }
+        text.push(digit);
+    }
+    text
+}
+
+fn cell(text: &str) -> String {
+    text.replace('|', "\\|").replace('\n', " ")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::tests::line;
+
+    #[test]
+    fn rows_say_how_much_sooner() {
+        let mut reference = line("OpenSplat", "fox", &[(100.0, 20.0), (1000.0, 28.0)]);
+        reference.source = Some("measured".into());
+        let ours = line("plat tree", "fox", &[(10.0, 26.0), (30.0, 30.0)]);
+        let worse = line("plat | flat", "fox", &[(10.0, 26.0)]);
+        let text = table(&[ours, reference, worse]);
+        let rows: Vec<&str> = text.lines().skip(2).collect();
+        assert!(rows[0].contains("OpenSplat") && rows[0].contains("| 1000 | 1000 |"), "{}", rows[0]);
+        assert!(rows[1].contains("| 20.0 (50.0×) | 12,010 |"), "{}", rows[1]);
+        assert!(rows[2].contains("plat \\| flat") && rows[2].contains("not reached"), "{}", rows[2]);
+    }
+
+    #[test]
+    fn only_what_lies_between_the_markers_changes() {
+        let document = "a\n<!-- bench:begin -->\nold\n<!-- bench:end -->\nb\n";
+        let new = replace_table(document, "| new |\n").unwrap();
+        assert_eq!(new, "a\n<!-- bench:begin -->\n| new |\n<!-- bench:end -->\nb\n");
+        assert_eq!(replace_table(&new, "| new |\n").unwrap(), new);
+        assert_eq!(replace_table("<!-- bench:end --> <!-- bench:begin -->", "x"), None);
+    }
+}

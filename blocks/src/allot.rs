@@ -1,0 +1,200 @@
+//! Allots means to tasks: splats where there is most to model, steps so that plans of all modes cost the same, and
+//! the memory that a task will take.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use scene::{BlockId, Capture};
+
+use crate::ground::{Ground, HALO_SCALE};
+use crate::plan::{PlanSettings, Task};
+use crate::select::Sightings;
+
+/// Splats of all blocks of a level, against the level below it.
+const INNER_BUDGET_RATIO: f64 = 1.0 / 2.5;
+/// Splats that a task gets at least, where the whole budget allows it.
+const MIN_BUDGET: u32 = 500;
+/// Work of all blocks of a level, against the level below it: leaves get 60 % of a deep tree.
+const INNER_WORK_RATIO: f64 = 0.4;
+/// A step costs its pixels and, for the projection and the optimiser, this many pixels for each splat.
+pub(crate) const PIXELS_PER_SPLAT: f64 = 0.25;
+/// Steps of a task at least.
+const MIN_STEPS: u32 = 50;
+/// Levels below the leaves of the cells in which ground is counted as seen: 16 a side (see [`Needs`]).
+const CELL_LEVELS: u8 = 4;
+
+/// How much there is to model in each block, as a share of the scene: half by sparse points, half by the number of
+/// distinct finest pixels of the ground that the views see. Cells are the same for all levels, so a block needs
+/// exactly what its children need.
+pub(crate) struct Needs(BTreeMap<BlockId, f64>);
+
+impl Needs {
+    pub(crate) fn of(
+        capture: &Capture,
+        sightings: &Sightings,
+        ground: &Ground,
+        levels: u8,
+        finest_metres: f64,
+    ) -> Self {
+        let cell_level = (levels + CELL_LEVELS).min(BlockId::MAX_LEVEL);
+        // Per cell: its points, and the finest pixel that falls on it.
+        let mut cells: BTreeMap<BlockId, (f64, f64)> = BTreeMap::new();
+        let cell_of = |p: usize| ground.block_at(cell_level, capture.points.positions[p]);
+        for (i, _) in capture.points.positions.iter().enumerate().filter(|(_, p)| p.is_finite()) {
+            cells.entry(cell_of(i)).or_insert((0.0, f64::INFINITY)).0 += 1.0;
+        }
+        for s in &sightings.all {
+            if let Some((_, finest)) = cells.get_mut(&cell_of(s.point as usize)) {
+                *finest = finest.min(s.footprint_metres(capture));
+            }
+        }
+        let pixels = |finest: f64| (finest_metres / finest.max(finest_metres)).powi(2);
+        let (all_points, all_pixels) =
+            cells.values().fold((0.0, 0.0), |(n, p), &(points, finest)| (n + points, p + pixels(finest)));
+        let mut needs: BTreeMap<BlockId, f64> = BTreeMap::new();
+        for (cell, (points, finest)) in cells {
+            let share = 0.5 * points / f64::max(all_points, 1.0) + 0.5 * pixels(finest) / f64::max(all_pixels, 1e-300);
+            for level in 0..=levels {
+                *needs.entry(cell.ancestor(level)).or_default() += share;
+            }
+        }
+        Self(needs)
+    }
+
+    fn of_block(&self, block: BlockId) -> f64 {
+        self.0.get(&block).copied().unwrap_or(0.0)
+    }
+}
+
+/// Splits `settings.budget` so that the merged model has that many splats, where there is most to model. The parts of
+/// a block that its children take over get [`INNER_BUDGET_RATIO`] per level above the leaves; those that stay with it
+/// (children without a task) get what a leaf would.
+pub(crate) fn set_budgets(tasks: &mut [Task], needs: &Needs, settings: &PlanSettings, levels: u8) {
+    let blocks: BTreeSet<BlockId> = tasks.iter().map(|t| t.block).collect();
+    let total = f64::from(settings.budget);
+    let mut kept = 0.0;
+    for level in 0..=levels {
+        let of_level: Vec<&mut Task> = tasks.iter_mut().filter(|t| t.block.level == level).collect();
+        let ratio = INNER_BUDGET_RATIO.powi(i32::from(levels - level));
+        let need = |task: &Task| -> f64 {
+            if level == levels {
+                return needs.of_block(task.block);
+            }
+            let weight = |child: &BlockId| if blocks.contains(child) { ratio } else { 1.0 };
+            task.block.children().iter().map(|child| weight(child) * needs.of_block(*child)).sum()
+        };
+        let shares: Vec<f64> = of_level.iter().map(|t| need(t)).collect();
+        let pool = if level == levels { total - kept } else { total * shares.iter().sum::<f64>() };
+        kept += (of_level.iter().filter(|_| level < levels))
+            .flat_map(|t| t.block.children())
+            .filter(|child| !blocks.contains(child))
+            .map(|child| total * needs.of_block(child))
+            .sum::<f64>();
+        for (task, budget) in of_level.into_iter().zip(split(pool.round(), &shares, MIN_BUDGET)) {
+            task.budget = budget;
+        }
+    }
+}
+
+/// Splits a pool into whole numbers in proportion to the shares: each at least `minimum` (or a quarter of an equal
+/// part, if that is less, or 1), and together the pool, but for the rounding up of a pool smaller than its parts.
+fn split(pool: f64, shares: &[f64], minimum: u32) -> Vec<u32> {
+    let n = shares.len() as f64;
+    let least = f64::from(minimum).min((pool / (4.0 * n)).floor()).max(1.0);
+    let rest = (pool - least * n).max(0.0);
+    let total: f64 = shares.iter().sum();
+    // Differences of a rounded running sum add up exactly, in whatever order the shares come.
+    let (mut before, mut sum) = (0.0, 0.0);
+    (shares.iter())
+        .map(|share| {
+            sum += if total > 0.0 { share / total } else { 1.0 / n };
+            let upto = (rest * sum).round();
+            let part = least + upto - before;
+            before = upto;
+            part as u32
+        })
+        .collect()
+}
+
+/// Shares out the work of `settings.steps` full images of the whole scene: over levels by [`INNER_WORK_RATIO`], within
+/// a level so that every window is seen equally often.
+pub(crate) fn set_steps(tasks: &mut [Task], settings: &PlanSettings, levels: u8, mean_pixels: f64) {
+    if let [task] = tasks
+        && task.views.iter().all(|v| v.mip == 0)
+    {
+        task.steps = settings.steps;
+        return;
+    }
+    let work = f64::from(settings.steps) * (mean_pixels + PIXELS_PER_SPLAT * f64::from(settings.budget));
+    let present: BTreeSet<u8> = tasks.iter().map(|t| t.block.level).collect();
+    let weight = |level: u8| INNER_WORK_RATIO.powi(i32::from(levels - level));
+    let weights: f64 = present.iter().map(|&l| weight(l)).sum();
+    for &level in &present {
+        let of_level = |t: &&mut Task| t.block.level == level;
+        // One visit to every window of the level.
+        let visit: f64 = (tasks.iter().filter(|t| t.block.level == level))
+            .map(|t| t.window_pixels() as f64 + PIXELS_PER_SPLAT * f64::from(t.budget) * t.views.len() as f64)
+            .sum();
+        let visits = work * weight(level) / weights / visit.max(1.0);
+        for task in tasks.iter_mut().filter(of_level) {
+            task.steps = ((visits * task.views.len() as f64).round() as u32).max(MIN_STEPS.min(settings.steps));
+        }
+    }
+}
+
+/// Columns of a splat of SH degree 3.
+const COLUMNS: [u64; 4] = [14, 23, 38, 59];
+/// Halo splats come on top of the core's: the area of halo over core.
+const HALO_AREA: f64 = HALO_SCALE * HALO_SCALE;
+/// Parameter, gradient and two moments, f32 each.
+const BYTES_PER_TRAINED_COLUMN: u64 = 16;
+/// A frozen parameter.
+const BYTES_PER_FROZEN_COLUMN: u64 = 4;
+/// Projected splat, its gradient, its growth statistics, and its entries in about eight tiles.
+const BYTES_PER_PROJECTED: u64 = 320;
+/// The same for a frozen splat: no gradient, no statistics.
+const BYTES_PER_FROZEN_PROJECTED: u64 = 112;
+/// Per window pixel: colour, depth, alpha, their gradients, the photo, weights and the eleven SSIM planes, f32 each.
+const BYTES_PER_PIXEL: u64 = 160;
+/// Windows of photos kept decoded at most; a pixel is four bytes.
+const IMAGE_CACHE_BYTES: u64 = 128 << 20;
+/// The program itself and its threads.
+const BASE_BYTES: u64 = 48 << 20;
+
+/// Estimates each task's peak memory: splats in core and halo under training, context frozen, one window's buffers,
+/// and the image cache.
+pub(crate) fn set_memory(tasks: &mut [Task], settings: &PlanSettings) {
+    let columns = COLUMNS[usize::from(settings.sh_degree.min(3))];
+    let budgets: BTreeMap<BlockId, u64> = tasks.iter().map(|t| (t.block, u64::from(t.budget))).collect();
+    for task in tasks {
+        let halo = if task.block.level == 0 { 1.0 } else { HALO_AREA };
+        let trained = (f64::from(task.budget) * halo) as u64;
+        let frozen: u64 = task.context.iter().chain(&task.parent).filter_map(|b| budgets.get(b)).sum();
+        let window = task.views.iter().map(|v| v.window.area()).max().unwrap_or(0);
+        task.memory_bytes = BASE_BYTES
+            + trained * (columns * BYTES_PER_TRAINED_COLUMN + BYTES_PER_PROJECTED)
+            + frozen * (columns * BYTES_PER_FROZEN_COLUMN + BYTES_PER_FROZEN_PROJECTED)
+            + window * BYTES_PER_PIXEL
+            + (task.window_pixels() * 4).min(IMAGE_CACHE_BYTES);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn splits_add_up() {
+        for (pool, shares, minimum) in [
+            (1000.0, vec![1.0, 2.0, 0.0, 7.0], 50),
+            (10.0, vec![0.0; 7], 500),
+            (3.0, vec![1.0; 5], 500),
+            (1e9, vec![1e-9, 3.0], 1),
+        ] {
+            let parts = split(pool, &shares, minimum);
+            let sum: u64 = parts.iter().map(|&p| u64::from(p)).sum();
+            assert_eq!(sum, (pool as u64).max(shares.len() as u64));
+            assert!(parts.iter().all(|&p| p >= 1));
+        }
+        assert_eq!(split(1000.0, &[1.0, 0.0], 50), [950, 50]);
+    }
+}

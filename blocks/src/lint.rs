@@ -1,0 +1,236 @@
+//! Checks a plan against its capture before anything is spent on it.
+
+use std::collections::BTreeSet;
+use std::fmt;
+
+use scene::{BlockId, Capture};
+
+use crate::plan::{Mode, Plan, Task, ViewUse};
+use crate::planner::MIN_VIEWS;
+use crate::select::max_mip;
+
+/// How bad a finding is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Severity {
+    /// The plan works, but somebody should look.
+    Warning,
+    /// The plan must not run.
+    Error,
+}
+
+/// Something found in a plan.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Finding {
+    /// How bad it is.
+    pub severity: Severity,
+    /// Where, unless it is the plan as a whole.
+    pub block: Option<BlockId>,
+    /// What is wrong.
+    pub what: String,
+}
+
+impl fmt::Display for Finding {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let word = if self.severity == Severity::Error { "error" } else { "warning" };
+        match self.block {
+            Some(block) => write!(f, "{word}: block {block}: {}", self.what),
+            None => write!(f, "{word}: {}", self.what),
+        }
+    }
+}
+
+/// Everything wrong with a plan for this capture, errors first; empty for a good plan.
+pub fn lint(plan: &Plan, capture: &Capture) -> Vec<Finding> {
+    let mut findings = Findings(Vec::new());
+    if let Err(error) = plan.check() {
+        findings.error(None, error.to_string());
+        return findings.0;
+    }
+    if let Some(asked) = plan.settings.levels.filter(|&asked| asked != plan.levels && plan.settings.mode == Mode::Tree)
+    {
+        let what = format!("{} of {asked} levels: views and points do not fill more", plan.levels);
+        findings.warning(None, what);
+    }
+    ownership(plan, capture, &mut findings);
+    let mut earlier: BTreeSet<BlockId> = BTreeSet::new();
+    for task in &plan.tasks {
+        order(plan, task, &earlier, &mut findings);
+        views(plan, task, capture, &mut findings);
+        means(plan, task, &mut findings);
+        earlier.insert(task.block);
+    }
+    let finest: u64 = plan.leaves().blocks().iter().filter_map(|&b| plan.task(b)).map(|t| u64::from(t.budget)).sum();
+    let deepest: u64 = plan.tasks.iter().filter(|t| t.block.level == plan.levels).map(|t| u64::from(t.budget)).sum();
+    let (budget, parts) = (u64::from(plan.settings.budget), plan.tasks.len() as u64);
+    if deepest > budget + parts || finest < budget.saturating_sub(parts) {
+        let what = format!("the leaves' {deepest} splats (with all that fills in: {finest}) do not add up to {budget}");
+        findings.error(None, what);
+    }
+    findings.0.sort_by_key(|f| std::cmp::Reverse(f.severity));
+    findings.0
+}
+
+struct Findings(Vec<Finding>);
+
+impl Findings {
+    fn error(&mut self, block: impl Into<Option<BlockId>>, what: String) {
+        self.0.push(Finding { severity: Severity::Error, block: block.into(), what });
+    }
+
+    fn warning(&mut self, block: impl Into<Option<BlockId>>, what: String) {
+        self.0.push(Finding { severity: Severity::Warning, block: block.into(), what });
+    }
+}
+
+/// Every sparse point has one owner; most are in the halo of theirs.
+fn ownership(plan: &Plan, capture: &Capture, findings: &mut Findings) {
+    let (leaves, tasks) = (plan.leaves(), plan.tasks.iter().map(|t| t.block).collect::<BTreeSet<_>>());
+    let (mut finite, mut coarse, mut outside) = (0usize, 0usize, 0usize);
+    for &point in capture.points.positions.iter().filter(|p| p.is_finite()) {
+        finite += 1;
+        match leaves.owner_of(&plan.ground, point) {
+            Some(owner) if tasks.contains(&owner) => {
+                coarse += usize::from(owner.level < plan.levels);
+                outside += usize::from(!plan.ground.in_halo(owner, point));
+            }
+            _ => {
+                findings.error(None, format!("the sparse point at {point} has no owner"));
+                return;
+            }
+        }
+    }
+    let percent = |n: usize| 100 * n / finite.max(1);
+    if finite < capture.points.len() {
+        findings.warning(None, format!("{} sparse points are not finite", capture.points.len() - finite));
+    }
+    if percent(coarse) >= 5 {
+        let what =
+            format!("{} % of the sparse points stay at a coarser level: too few views or points", percent(coarse));
+        findings.warning(None, what);
+    }
+    if percent(outside) >= 1 {
+        findings.warning(None, format!("{} % of the sparse points lie outside their owner's halo", percent(outside)));
+    }
+}
+
+/// Parent and context exist and come earlier; a tree's child has its parent.
+fn order(plan: &Plan, task: &Task, earlier: &BTreeSet<BlockId>, findings: &mut Findings) {
+    for needed in task.context.iter().chain(&task.parent) {
+        if !earlier.contains(needed) {
+            findings.error(task.block, format!("needs block {needed}, which does not come before it"));
+        }
+        if needed.level >= task.block.level {
+            findings.error(task.block, format!("needs block {needed}, which is not coarser"));
+        }
+    }
+    if plan.settings.mode == Mode::Tree && task.parent != task.block.parent() {
+        findings.error(task.block, "is not initialised from its parent".into());
+    }
+}
+
+/// Train and test views are kept apart, exist, and windows and mips are inside them.
+fn views(plan: &Plan, task: &Task, capture: &Capture, findings: &mut Findings) {
+    let is_test = |v: &ViewUse| Capture::is_test(v.view as usize, plan.settings.test_every);
+    if let Some(v) = task.views.iter().find(|v| is_test(v)) {
+        findings.error(task.block, format!("trains on held-out view {}", v.view));
+    }
+    if let Some(v) = task.test_views.iter().find(|v| !is_test(v)) {
+        findings.error(task.block, format!("is tested on view {}, which others train on", v.view));
+    }
+    for used in [&task.views, &task.test_views] {
+        if !used.is_sorted_by(|a, b| a.view < b.view) {
+            findings.error(task.block, "lists a view twice or out of order".into());
+        }
+    }
+    for v in task.views.iter().chain(&task.test_views) {
+        let Some(view) = capture.views.get(v.view as usize) else {
+            findings.error(task.block, format!("uses view {}, the capture has {}", v.view, capture.views.len()));
+            continue;
+        };
+        let (full, window) = (view.camera.full(), v.window);
+        if v.mip > max_mip(full.width, full.height) {
+            findings.error(task.block, format!("uses mip {} of '{}', which has none", v.mip, view.name));
+            continue;
+        }
+        let image = view.camera.mip(v.mip).full();
+        let ends = |from: u32, length: u32, size: u32| u64::from(from) + u64::from(length) <= u64::from(size);
+        if !ends(window.x, window.width, image.width) || !ends(window.y, window.height, image.height) {
+            findings.error(task.block, format!("uses a window outside mip {} of '{}'", v.mip, view.name));
+        }
+    }
+    match task.views.len() {
+        0 => findings.error(task.block, "has no view to train on".into()),
+        n if n < MIN_VIEWS => findings.warning(task.block, format!("is seen by {n} views, {MIN_VIEWS} are wanted")),
+        _ => {}
+    }
+}
+
+/// Budget, steps and memory make sense.
+fn means(plan: &Plan, task: &Task, findings: &mut Findings) {
+    if task.budget == 0 || task.steps == 0 {
+        findings.error(task.block, format!("has {} splats and {} steps", task.budget, task.steps));
+    }
+    if task.points == 0 {
+        findings.error(task.block, "has no sparse point".into());
+    }
+    let (needed, limit) = (task.memory_bytes, plan.settings.memory_limit_bytes);
+    if needed > limit {
+        let mib = |bytes: u64| bytes.div_ceil(1 << 20);
+        findings.error(
+            task.block,
+            format!("needs {} MiB, the limit is {}: lower --budget or raise --levels", mib(needed), mib(limit)),
+        );
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use scene::ArtefactId;
+
+    use super::*;
+    use crate::plan::PlanSettings;
+    use crate::testing::aerial;
+
+    /// Each damage is found, at the block where it was done.
+    #[test]
+    fn finds_what_was_broken() {
+        let capture = aerial(6, 200.0, 4000);
+        let settings = PlanSettings { levels: Some(1), ..PlanSettings::default() };
+        let good = crate::plan(&capture, ArtefactId::of(b""), &settings, "cpu").unwrap();
+        assert!(lint(&good, &capture).is_empty());
+        type Damage = fn(&mut Plan);
+        let damages: [(&str, Damage); 10] = [
+            ("trains on held-out view 0", |p| p.tasks[2].views[0].view = 0),
+            ("which others train on", |p| p.tasks[2].test_views[0].view = 1),
+            ("window outside", |p| p.tasks[2].views[0].window.x = u32::MAX),
+            ("which has none", |p| p.tasks[2].views[0].mip = 9),
+            ("lists a view twice", |p| p.tasks[2].views[1] = p.tasks[2].views[0]),
+            ("has no view", |p| p.tasks[2].views.clear()),
+            ("not initialised from its parent", |p| p.tasks[2].parent = None),
+            ("not coarser", |p| p.tasks[2].context = vec![BlockId { level: 1, x: 1, y: 1 }]),
+            ("MiB, the limit is", |p| p.tasks[2].memory_bytes = u64::MAX),
+            ("has 0 splats", |p| p.tasks[2].budget = 0),
+        ];
+        for (what, damage) in damages {
+            let mut plan = good.clone();
+            damage(&mut plan);
+            let findings = lint(&plan, &capture);
+            let found = findings.iter().find(|f| f.what.contains(what));
+            assert_eq!(
+                found.map(|f| (f.severity, f.block)),
+                Some((Severity::Error, Some(good.tasks[2].block))),
+                "{what}: {findings:?}"
+            );
+            assert!(findings.is_sorted_by_key(|f| std::cmp::Reverse(f.severity)));
+        }
+        let mut lost = good.clone();
+        lost.tasks.remove(0);
+        assert!(lint(&lost, &capture).iter().any(|f| f.what.contains("does not come before it")));
+        let mut poor = good.clone();
+        poor.tasks[1].budget += 90_000;
+        assert!(lint(&poor, &capture).iter().any(|f| f.what.contains("do not add up")));
+        let mut fewer = capture.clone();
+        fewer.views.truncate(20);
+        assert!(lint(&good, &fewer).iter().any(|f| f.what.contains("the capture has 20")));
+    }
+}

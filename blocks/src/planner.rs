@@ -1,0 +1,398 @@
+//! Makes the plan: how deep, which blocks, on which views and against which context.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use scene::{ArtefactId, BlockId, Capture};
+
+use crate::allot::{Needs, set_budgets, set_memory, set_steps};
+use crate::ground::{Ground, quantile};
+use crate::lod::context_of;
+use crate::plan::{MAX_LEVELS, Mode, Plan, PlanError, PlanSettings, Task, VERSION};
+use crate::select::{Selection, Sightings, full_views, select_level, usable};
+
+/// The finest resolution: this quantile of depth / focal over all sightings. The median would send half of the views
+/// of a street to their second mip.
+const FINE_QUANTILE: f64 = 0.25;
+/// Leaves chosen by `levels: None` have a core of at least this many finest pixels a side.
+const LEAF_EDGE_PIXELS: f64 = 768.0;
+/// They are trained on this many views, on average ...
+const MEAN_VIEWS: usize = 24;
+/// ... hold this many sparse points, on average ...
+const MEAN_POINTS: usize = 500;
+/// ... and together this share of all of them.
+const MIN_COVERED: f64 = 0.9;
+/// A block with fewer views has no task (unless it is the root) ...
+pub const MIN_VIEWS: usize = 6;
+/// ... nor has one with fewer sparse points in its core.
+pub const MIN_POINTS: u32 = 10;
+
+/// Plans the training of a capture on a backend. Test views ([`Capture::is_test`]) never train.
+///
+/// # Errors
+/// Settings out of range, or a capture that has nothing to train on: see [`PlanError`].
+pub fn plan(
+    capture: &Capture,
+    capture_id: ArtefactId,
+    settings: &PlanSettings,
+    backend: &str,
+) -> Result<Plan, PlanError> {
+    check(settings)?;
+    let finite = capture.points.positions.iter().filter(|p| p.is_finite()).count();
+    let test = |view: usize| Capture::is_test(view, settings.test_every);
+    let (views, all_test) = (capture.views.len(), (0..capture.views.len()).filter(|&v| test(v)).count());
+    let usable_views: Vec<usize> = (0..views).filter(|&v| usable(&capture.views[v].camera)).collect();
+    if usable_views.iter().all(|&v| test(v)) {
+        return Err(PlanError::NoTrainViews { views, usable: usable_views.len(), test: all_test });
+    }
+    if finite == 0 {
+        return Err(PlanError::NoPoints);
+    }
+    let sightings = Sightings::of(capture);
+    let mut footprints: Vec<f64> =
+        (sightings.all.iter()).filter(|s| !test(s.view as usize)).map(|s| s.footprint_metres(capture)).collect();
+    let finest_metres = quantile(&mut footprints, FINE_QUANTILE);
+    if !(finest_metres.is_finite() && finest_metres > 0.0) {
+        return Err(PlanError::NothingSeen { points: finite });
+    }
+
+    let ground = Ground::of(capture);
+    let survey = Survey { capture, sightings: &sightings, ground: &ground, test_every: settings.test_every };
+    let levels = match (settings.mode, settings.levels) {
+        (Mode::Whole, _) => 0,
+        (_, Some(levels)) => levels,
+        (_, None) => survey.choose_levels(finest_metres),
+    };
+    let (levels, mut tasks) = survey.lay_out(settings.mode, levels, finest_metres)?;
+
+    let needs = Needs::of(capture, &sightings, &ground, levels, finest_metres);
+    set_budgets(&mut tasks, &needs, settings, levels);
+    let train_views = usable_views.iter().filter(|&&v| !test(v));
+    let pixels: Vec<f64> = train_views.map(|&v| capture.views[v].camera.full().area() as f64).collect();
+    let mean_pixels = pixels.iter().sum::<f64>() / pixels.len() as f64;
+    set_steps(&mut tasks, settings, levels, mean_pixels);
+    set_memory(&mut tasks, settings);
+    Ok(Plan {
+        version: VERSION,
+        capture: capture_id,
+        settings: settings.clone(),
+        backend: backend.to_owned(),
+        ground,
+        levels,
+        rho_metres: (0..=levels).map(|level| rho_of(finest_metres, levels, level)).collect(),
+        tasks,
+    })
+}
+
+/// Metres per pixel of a level: the finest at the deepest, twice as much with every level up.
+fn rho_of(finest_metres: f64, levels: u8, level: u8) -> f64 {
+    finest_metres * f64::from(1u32 << (levels - level))
+}
+
+fn check(settings: &PlanSettings) -> Result<(), PlanError> {
+    let bad = |setting, problem: String, advice| Err(PlanError::Setting { setting, problem, advice });
+    if settings.steps == 0 {
+        return bad("--steps", "no steps".into(), "give at least 1");
+    }
+    if settings.budget == 0 {
+        return bad("--budget", "no splats".into(), "give at least 1");
+    }
+    if settings.sh_degree > 3 {
+        return bad("sh_degree", format!("{} is not supported", settings.sh_degree), "give 0 to 3");
+    }
+    match settings.levels {
+        Some(levels) if levels > MAX_LEVELS => {
+            bad("--levels", format!("{levels} are too many"), "give 0 to 16, or auto")
+        }
+        _ => Ok(()),
+    }
+}
+
+/// The capture, and what its views see.
+struct Survey<'a> {
+    capture: &'a Capture,
+    sightings: &'a Sightings,
+    ground: &'a Ground,
+    test_every: u32,
+}
+
+impl Survey<'_> {
+    /// The blocks of a level that can be trained.
+    fn tasks_of(&self, level: u8, rho_metres: f64) -> BTreeMap<BlockId, Selection> {
+        let mut selections =
+            select_level(self.capture, self.sightings, self.ground, level, rho_metres, self.test_every);
+        selections.retain(|_, s| level == 0 || s.views.len() >= MIN_VIEWS && s.core_points >= MIN_POINTS);
+        selections
+    }
+
+    /// The deepest level that resolution allows and whose blocks have enough views and points.
+    fn choose_levels(&self, finest_metres: f64) -> u8 {
+        let points = self.capture.points.len();
+        let by_resolution = (self.ground.edge_metres / (LEAF_EDGE_PIXELS * finest_metres)).log2().floor();
+        let deepest = (by_resolution.max(0.0) as u8).min(MAX_LEVELS);
+        (1..=deepest)
+            .rev()
+            .find(|&level| {
+                let tasks = self.tasks_of(level, finest_metres);
+                let views: usize = tasks.values().map(|s| s.views.len()).sum();
+                let covered: usize = tasks.values().map(|s| s.core_points as usize).sum();
+                covered as f64 >= MIN_COVERED * points as f64
+                    && views >= MEAN_VIEWS * tasks.len()
+                    && covered >= MEAN_POINTS * tasks.len()
+            })
+            .unwrap_or(0)
+    }
+
+    /// The tasks, without budgets and steps, and the depth they really reach: a tree that asks for more levels than
+    /// views and points can fill is laid out anew with fewer.
+    fn lay_out(&self, mode: Mode, levels: u8, finest_metres: f64) -> Result<(u8, Vec<Task>), PlanError> {
+        let tree = mode == Mode::Tree;
+        let first = if tree { 0 } else { levels };
+        let mut tasks: Vec<Task> = Vec::new();
+        let mut existing: BTreeSet<BlockId> = BTreeSet::new();
+        for level in first..=levels {
+            let rho_metres = rho_of(finest_metres, levels, level);
+            let mut selections = self.tasks_of(level, rho_metres);
+            selections.retain(|block, _| !tree || block.parent().is_none_or(|p| existing.contains(&p)));
+            if let (Mode::Whole, Some(root)) = (mode, selections.get_mut(&BlockId::ROOT)) {
+                // Mip 0 for all: no pixel is finer than this.
+                (root.test_views, root.views) = full_views(self.capture, self.sightings, 0.0)
+                    .into_iter()
+                    .partition(|u| Capture::is_test(u.view as usize, self.test_every));
+            }
+            let context = |block| if tree { context_of(self.ground, block, &existing) } else { Vec::new() };
+            let mut of_level: Vec<Task> = (selections.into_iter())
+                .map(|(block, selection)| Task {
+                    block,
+                    parent: block.parent().filter(|_| tree),
+                    context: context(block),
+                    views: selection.views,
+                    test_views: selection.test_views,
+                    points: selection.halo_points,
+                    budget: 0,
+                    steps: 0,
+                    rho_metres,
+                    memory_bytes: 0,
+                })
+                .collect();
+            of_level.sort_by_key(|t| (t.block.y, t.block.x));
+            existing.extend(of_level.iter().map(|t| t.block));
+            tasks.append(&mut of_level);
+        }
+        match tasks.last().map(|t| t.block.level) {
+            None => Err(PlanError::NoBlocks { levels, needed: MIN_VIEWS }),
+            Some(reached) if reached < levels => self.lay_out(mode, reached, finest_metres),
+            Some(_) => Ok((levels, tasks)),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::DVec3;
+    use scene::Camera;
+
+    use super::*;
+    use crate::allot::PIXELS_PER_SPLAT;
+    use crate::lint::{Severity, lint};
+    use crate::testing::{aerial, capture, look, noise, street};
+
+    fn settings(mode: Mode, levels: Option<u8>) -> PlanSettings {
+        PlanSettings { mode, levels, steps: 4000, budget: 50_000, ..PlanSettings::default() }
+    }
+
+    fn plan_of(capture: &Capture, mode: Mode, levels: Option<u8>) -> Plan {
+        let plan = plan(capture, ArtefactId::of(b"capture"), &settings(mode, levels), "cpu").unwrap();
+        let errors: Vec<String> =
+            (lint(&plan, capture).iter()).filter(|f| f.severity == Severity::Error).map(ToString::to_string).collect();
+        assert!(errors.is_empty(), "{errors:?}");
+        plan
+    }
+
+    #[test]
+    fn a_tree_is_complete_and_ordered() {
+        let capture = aerial(8, 300.0, 8000);
+        let plan = plan_of(&capture, Mode::Tree, Some(2));
+        assert_eq!((plan.levels, plan.tasks.len()), (2, 1 + 4 + 16));
+        assert_eq!(plan.tasks[0].block, BlockId::ROOT);
+        assert!(plan.tasks[0].parent.is_none() && plan.tasks[0].context.is_empty());
+        for (coarse, fine) in plan.rho_metres.iter().zip(&plan.rho_metres[1..]) {
+            assert!((coarse / fine - 2.0).abs() < 1e-12);
+        }
+        for task in &plan.tasks[1..] {
+            assert_eq!(task.parent, task.block.parent());
+            assert!(task.views.iter().all(|v| !Capture::is_test(v.view as usize, 8)));
+            assert_eq!(plan.task(task.block), Some(task));
+        }
+        let mips: Vec<u8> = [0, 1, 5].map(|i: usize| plan.tasks[i].views[0].mip).to_vec();
+        assert_eq!(mips, [2, 1, 0]);
+        assert!(lint(&plan, &capture).is_empty(), "{:?}", lint(&plan, &capture));
+    }
+
+    #[test]
+    fn levels_fit_resolution_views_and_points() {
+        // 300 m at 0.12 m a pixel are 2,500 pixels: room for 768 a leaf once halved.
+        assert_eq!(plan_of(&aerial(12, 300.0, 20_000), Mode::Tree, None).levels, 1);
+        assert_eq!(plan_of(&aerial(12, 300.0, 1000), Mode::Tree, None).levels, 0, "too few points");
+        assert_eq!(plan_of(&aerial(4, 300.0, 20_000), Mode::Tree, None).levels, 0, "too few views");
+        assert_eq!(plan_of(&aerial(8, 60.0, 20_000), Mode::Tree, None).levels, 0, "too small");
+    }
+
+    #[test]
+    fn budgets_add_up_to_the_merged_model() {
+        for (levels, mode) in [(0, Mode::Whole), (0, Mode::Tree), (1, Mode::Tree), (2, Mode::Tree), (2, Mode::Flat)] {
+            let plan = plan_of(&aerial(8, 300.0, 8000), mode, Some(levels));
+            let finest: u64 =
+                plan.tasks.iter().filter(|t| t.block.level == plan.levels).map(|t| u64::from(t.budget)).sum();
+            assert_eq!(plan.tasks.iter().filter(|t| t.block.level == levels).count(), 1 << (2 * levels));
+            assert_eq!(finest, 50_000, "{mode:?} {levels}");
+            assert!(plan.tasks.iter().all(|t| t.budget > 0 && t.steps > 0 && t.memory_bytes > 0));
+        }
+    }
+
+    #[test]
+    fn all_modes_cost_about_the_same() {
+        let capture = aerial(8, 300.0, 8000);
+        let work = |plan: &Plan| -> f64 {
+            let step =
+                |t: &Task| t.window_pixels() as f64 / t.views.len() as f64 + PIXELS_PER_SPLAT * f64::from(t.budget);
+            plan.tasks.iter().map(|t| f64::from(t.steps) * step(t)).sum()
+        };
+        let whole = plan_of(&capture, Mode::Whole, None);
+        assert_eq!(whole.tasks[0].steps, 4000);
+        for (mode, levels) in [(Mode::Tree, 0), (Mode::Tree, 1), (Mode::Tree, 2), (Mode::Flat, 1), (Mode::Flat, 2)] {
+            let ratio = work(&plan_of(&capture, mode, Some(levels))) / work(&whole);
+            assert!((0.95..1.10).contains(&ratio), "{mode:?} {levels}: {ratio}");
+        }
+    }
+
+    #[test]
+    fn whole_and_flat_are_what_they_say() {
+        let capture = street(40, 4000);
+        let whole = plan_of(&capture, Mode::Whole, Some(3));
+        assert_eq!((whole.levels, whole.tasks.len()), (0, 1));
+        let root = &whole.tasks[0];
+        assert_eq!((root.views.len(), root.test_views.len()), (35, 5));
+        assert!(root.views.iter().all(|v| v.mip == 0 && (v.window.width, v.window.height) == (640, 480)));
+        let flat = plan_of(&capture, Mode::Flat, Some(2));
+        assert!(flat.tasks.iter().all(|t| t.block.level == 2 && t.parent.is_none() && t.context.is_empty()));
+        // A street crosses only some of the leaves; the others' ground still has an owner.
+        assert!(flat.tasks.len() < 16);
+        assert!(flat.leaves().owner_of(&flat.ground, DVec3::new(-1e6, 1e6, 0.0)).is_some());
+    }
+
+    #[test]
+    fn areas_without_a_task_stay_with_their_ancestor() {
+        let capture = street(40, 4000);
+        let plan = plan_of(&capture, Mode::Tree, Some(3));
+        let (leaves, tasks) = (plan.leaves(), plan.tasks.iter().map(|t| t.block).collect::<BTreeSet<_>>());
+        for i in 0..2000 {
+            let at = DVec3::new(noise(2 * i) * 300.0 - 100.0, noise(2 * i + 1) * 300.0 - 150.0, 0.0);
+            let cell = plan.ground.block_at(plan.levels, at);
+            let deepest = (0..=plan.levels).rev().map(|l| cell.ancestor(l)).find(|b| tasks.contains(b));
+            assert_eq!(leaves.owner_of(&plan.ground, at), deepest);
+        }
+        let owned: u64 = leaves.blocks().iter().filter_map(|&b| plan.task(b)).map(|t| u64::from(t.budget)).sum();
+        assert!(owned >= 50_000);
+    }
+
+    #[test]
+    fn a_tree_too_deep_for_its_capture_is_cut_short() {
+        let capture = aerial(4, 100.0, 600);
+        let plan = plan_of(&capture, Mode::Tree, Some(9));
+        assert!(plan.levels < 5);
+        assert!(
+            lint(&plan, &capture).iter().any(|f| f.severity == Severity::Warning && f.what.contains("of 9 levels"))
+        );
+    }
+
+    #[test]
+    fn plans_are_pure_and_round_trip() {
+        let capture = aerial(5, 150.0, 3000);
+        let plan = plan_of(&capture, Mode::Tree, Some(1));
+        assert_eq!(plan, plan_of(&capture, Mode::Tree, Some(1)));
+        assert_eq!(Plan::from_frame(&plan.to_frame()).unwrap(), plan);
+        let json = serde_json::to_string(&plan).unwrap();
+        let back: Plan = serde_json::from_str(&json).unwrap();
+        assert_eq!(back.id(), plan.id());
+        assert!(Plan::from_frame(&plan.to_frame()[..99]).is_err());
+        let mut other = plan.clone();
+        other.settings.seed = 1;
+        assert_ne!(other.id(), plan.id());
+        let mut broken = plan.clone();
+        broken.tasks.swap(0, 1);
+        assert!(Plan::from_frame(&broken.to_frame()).is_err());
+        broken = plan;
+        broken.ground.edge_metres = f64::NAN;
+        assert!(Plan::from_frame(&broken.to_frame()).is_err());
+    }
+
+    /// Every capture gives a plan without errors or a reason, for every mode and depth.
+    #[test]
+    fn strange_captures_give_a_plan_or_a_reason() {
+        let grid = |n: usize| (0..n).map(move |i| DVec3::new((i % 30) as f64, (i / 30) as f64, noise(i as u64)));
+        let above = |x: f64, y: f64| {
+            let eye = DVec3::new(x, y, 20.0);
+            look(eye, eye - DVec3::Z, DVec3::Y)
+        };
+        let line: Vec<Camera> = (0..30).map(|i| above(f64::from(i), 15.0)).collect();
+        let corner: Vec<Camera> = (0..30).map(|_| above(0.0, 0.0)).collect();
+        let islands: Vec<Camera> = (0..40).map(|i| above(f64::from(i % 2) * 5e4 + f64::from(i), 0.0)).collect();
+        let island_points = (0..2000)
+            .map(|i| DVec3::new(f64::from(i % 2) * 5e4 + noise(i as u64) * 40.0, noise(i as u64 + 9) * 20.0, 0.0));
+        let strange = [
+            ("line", capture(&line, grid(900).collect(), true)),
+            ("corner", capture(&corner, grid(900).collect(), true)),
+            ("islands", capture(&islands, island_points.collect(), true)),
+            ("one view", capture(&line[..1], grid(900).collect(), true)),
+            ("two views", capture(&line[..2], grid(900).collect(), true)),
+            ("one spot", capture(&line, vec![DVec3::new(3.0, 15.0, 1.0); 500], true)),
+            ("one point", capture(&line, vec![DVec3::new(3.0, 15.0, 1.0)], true)),
+            ("no tracks", capture(&line, grid(900).collect(), false)),
+            ("no points", capture(&line, Vec::new(), false)),
+            ("nothing finite", capture(&line, vec![DVec3::NAN; 9], false)),
+            ("nothing seen", capture(&line, vec![DVec3::Z * 500.0; 9], false)),
+            ("huge", capture(&line, grid(900).map(|p| p * 1e300).collect(), false)),
+            ("nothing", Capture::default()),
+        ];
+        for (name, capture) in &strange {
+            for mode in [Mode::Tree, Mode::Flat, Mode::Whole] {
+                for levels in [None, Some(0), Some(1), Some(3), Some(MAX_LEVELS)] {
+                    let id = ArtefactId::of(b"capture");
+                    match plan(capture, id, &settings(mode, levels), "cpu") {
+                        Ok(plan) => {
+                            let findings = lint(&plan, capture);
+                            let error = findings.iter().find(|f| f.severity == Severity::Error);
+                            assert!(error.is_none(), "{name} {mode:?} {levels:?}: {}", findings[0]);
+                            assert!(plan.tasks.iter().all(|t| !t.views.is_empty() && t.steps < 1_000_000));
+                            let svg = crate::draw(&plan, capture);
+                            assert!(!svg.contains("NaN") && !svg.contains("inf"), "{name}: {svg}");
+                        }
+                        Err(error) => assert!(
+                            ["one view", "no points", "nothing finite", "nothing seen", "huge", "nothing"]
+                                .contains(name)
+                                || mode == Mode::Flat,
+                            "{name} {mode:?} {levels:?}: {error}"
+                        ),
+                    }
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn settings_out_of_range_are_refused() {
+        let capture = aerial(3, 60.0, 300);
+        for bad in [
+            PlanSettings { steps: 0, ..PlanSettings::default() },
+            PlanSettings { budget: 0, ..PlanSettings::default() },
+            PlanSettings { sh_degree: 4, ..PlanSettings::default() },
+            PlanSettings { levels: Some(17), ..PlanSettings::default() },
+        ] {
+            let error = plan(&capture, ArtefactId::of(b""), &bad, "cpu").unwrap_err();
+            assert!(matches!(error, PlanError::Setting { .. }), "{error}");
+        }
+        let all_test = PlanSettings { test_every: 1, ..PlanSettings::default() };
+        let error = plan(&capture, ArtefactId::of(b""), &all_test, "cpu").unwrap_err();
+        assert_eq!(error, PlanError::NoTrainViews { views: 9, usable: 9, test: 9 });
+    }
+}

@@ -1,0 +1,175 @@
+//! The calls of the wire: checks what came in, asks the owner of the state, answers.
+
+use std::collections::BTreeMap;
+use std::pin::Pin;
+
+use blocks::Plan;
+use cluster::{FailureKind, TaskIndex, TaskNode};
+use proto::coordinator_server::Coordinator;
+use proto::{
+    AttemptReply, CancelReply, CancelRequest, CompleteRequest, FailRequest, LeaseReply, LeaseRequest, ReportReply,
+    ReportRequest, StatusReply, StatusRequest, SubmitReply, SubmitRequest, WatchEvent, WatchRequest,
+};
+use scene::{ArtefactId, BlockId, CodecError};
+use store::{Store, StoreError};
+use tokio::sync::{mpsc, oneshot};
+use tokio_stream::wrappers::ReceiverStream;
+use tokio_stream::{Stream, StreamExt};
+use tonic::{Request, Response, Status};
+
+use crate::Call;
+use crate::jobs::Jobs;
+
+/// The largest plan that is read, in bytes: 100,000 tasks with 300 windows each fit twice.
+const PLAN_BYTES_LIMIT: u64 = 1 << 30;
+
+/// The wire's side of the coordinator.
+pub(crate) struct Service {
+    store: Store,
+    calls: mpsc::Sender<Call>,
+}
+
+type Answer<T> = Result<Response<T>, Status>;
+
+impl Service {
+    pub(crate) fn new(store: Store, calls: mpsc::Sender<Call>) -> Self {
+        Self { store, calls }
+    }
+
+    /// Has the owner of the state do this, and waits for its answer.
+    async fn ask<T: Send + 'static>(
+        &self,
+        what: impl FnOnce(&mut Jobs, u64) -> Result<T, Status> + Send + 'static,
+    ) -> Result<T, Status> {
+        let gone = || Status::unavailable("the coordinator is shutting down");
+        let (reply, answer) = oneshot::channel();
+        let call: Call = Box::new(move |jobs, now| {
+            // The caller may have hung up; what it asked for is done all the same.
+            let _ = reply.send(what(jobs, now));
+        });
+        self.calls.send(call).await.map_err(|_| gone())?;
+        answer.await.map_err(|_| gone())?
+    }
+
+    /// Reads a plan: its backend and its tasks' dependencies.
+    async fn read_plan(&self, id: ArtefactId) -> Result<(String, Vec<TaskNode>), Status> {
+        match self.store.size(id).await.map_err(store_status)? {
+            Some(bytes) if bytes > PLAN_BYTES_LIMIT => {
+                return Err(Status::invalid_argument(format!("artefact {id} is too large for a plan: {bytes} bytes")));
+            }
+            _ => {}
+        }
+        let bytes = self.store.get(id).await.map_err(store_status)?;
+        let read = tokio::task::spawn_blocking(move || {
+            let plan = Plan::from_frame(&bytes)?;
+            Ok((plan.backend.clone(), dag_of(&plan)?))
+        });
+        read.await
+            .map_err(|_| Status::internal("the plan could not be read"))?
+            .map_err(|error: CodecError| Status::invalid_argument(format!("artefact {id}: {error}")))
+    }
+}
+
+/// A task depends on its parent's and its context's tasks.
+fn dag_of(plan: &Plan) -> Result<Vec<TaskNode>, CodecError> {
+    let index: BTreeMap<BlockId, u32> = plan.tasks.iter().map(|task| task.block).zip(0..).collect();
+    let node = |task: &blocks::Task| {
+        let needed = task.parent.iter().chain(&task.context);
+        let found = needed.map(|block| {
+            let missing = || CodecError::new(format!("task {} needs block {block}, which has no task", task.block));
+            index.get(block).copied().map(TaskIndex).ok_or_else(missing)
+        });
+        Ok(TaskNode { dependencies: found.collect::<Result<_, CodecError>>()? })
+    };
+    plan.tasks.iter().map(node).collect()
+}
+
+fn store_status(error: StoreError) -> Status {
+    match error {
+        StoreError::Missing { .. } => Status::not_found(error.to_string()),
+        StoreError::Corrupt { .. } => Status::data_loss(error.to_string()),
+        _ => Status::unavailable(error.to_string()),
+    }
+}
+
+fn attempt_of(attempt: Option<proto::Attempt>) -> Result<proto::Attempt, Status> {
+    attempt.ok_or_else(|| Status::invalid_argument("the call names no attempt"))
+}
+
+#[tonic::async_trait]
+impl Coordinator for Service {
+    async fn submit(&self, request: Request<SubmitRequest>) -> Answer<SubmitReply> {
+        let request = request.into_inner();
+        if request.store_url != self.store.url() {
+            let (theirs, ours) = (proto::one_line(&request.store_url), self.store.url());
+            let problem = format!("the plan lies in the store '{theirs}', this coordinator works on '{ours}'");
+            return Err(Status::failed_precondition(problem));
+        }
+        let plan = proto::artefact_id(&request.plan)?;
+        let (backend, dag) = self.read_plan(plan).await?;
+        let tasks = dag.len() as u32;
+        let job = self.ask(move |jobs, now| jobs.submit(now, plan, backend, dag)).await?;
+        Ok(Response::new(SubmitReply { job, tasks }))
+    }
+
+    async fn lease(&self, request: Request<LeaseRequest>) -> Answer<LeaseReply> {
+        let LeaseRequest { worker, backend } = request.into_inner();
+        proto::check_name("worker", &worker)?;
+        proto::check_name("backend", &backend)?;
+        let reply = self.ask(move |jobs, now| jobs.lease(now, &worker, &backend)).await?;
+        Ok(Response::new(LeaseReply { reply: Some(reply) }))
+    }
+
+    async fn report(&self, request: Request<ReportRequest>) -> Answer<ReportReply> {
+        let ReportRequest { attempt, reports } = request.into_inner();
+        let attempt = attempt_of(attempt)?;
+        if reports.len() > proto::REPORTS_LIMIT || !reports.iter().all(proto::Report::is_finite) {
+            let advice = format!("a call carries at most {} reports, of finite numbers", proto::REPORTS_LIMIT);
+            return Err(Status::invalid_argument(advice));
+        }
+        let accepted = self.ask(move |jobs, now| jobs.report(now, attempt, reports)).await?;
+        Ok(Response::new(ReportReply { cancelled: !accepted }))
+    }
+
+    async fn complete(&self, request: Request<CompleteRequest>) -> Answer<AttemptReply> {
+        let CompleteRequest { attempt, artefact } = request.into_inner();
+        let (attempt, artefact) = (attempt_of(attempt)?, proto::artefact_id(&artefact)?);
+        let accepted = self.ask(move |jobs, now| jobs.complete(now, attempt, artefact)).await?;
+        Ok(Response::new(AttemptReply { accepted }))
+    }
+
+    async fn fail(&self, request: Request<FailRequest>) -> Answer<AttemptReply> {
+        let request = request.into_inner();
+        let kind = match request.kind() {
+            proto::FailureKind::Work => FailureKind::Work,
+            proto::FailureKind::Input => FailureKind::Input,
+            proto::FailureKind::GivenBack => FailureKind::GivenBack,
+        };
+        let (attempt, message) = (attempt_of(request.attempt)?, proto::one_line(&request.message));
+        let accepted = self.ask(move |jobs, now| jobs.fail(now, attempt, kind, message)).await?;
+        Ok(Response::new(AttemptReply { accepted }))
+    }
+
+    type WatchStream = Pin<Box<dyn Stream<Item = Result<WatchEvent, Status>> + Send>>;
+
+    async fn watch(&self, request: Request<WatchRequest>) -> Answer<Self::WatchStream> {
+        let job = request.into_inner().job;
+        let watched = self.ask(move |jobs, _| jobs.watch(job)).await?;
+        let snapshot = tokio_stream::iter(watched.snapshot);
+        Ok(Response::new(match watched.rest {
+            Some(rest) => Box::pin(snapshot.chain(ReceiverStream::new(rest)).map(Ok)),
+            None => Box::pin(snapshot.map(Ok)),
+        }))
+    }
+
+    async fn status(&self, request: Request<StatusRequest>) -> Answer<StatusReply> {
+        let job = request.into_inner().job;
+        Ok(Response::new(self.ask(move |jobs, _| jobs.status(job)).await?))
+    }
+
+    async fn cancel(&self, request: Request<CancelRequest>) -> Answer<CancelReply> {
+        let job = request.into_inner().job;
+        self.ask(move |jobs, now| jobs.cancel(now, job)).await?;
+        Ok(Response::new(CancelReply {}))
+    }
+}

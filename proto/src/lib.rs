@@ -1,0 +1,103 @@
+//! The wire between coordinator, workers and command line: the types and the service of `proto/plat.proto`, the limits
+//! of a message, and checked conversions.
+//!
+//! Architecture invariant: bulk data never goes through here, and generated types never enter floors 0 to 2.
+
+#[allow(missing_docs, unreachable_pub, clippy::all)]
+mod generated {
+    tonic::include_proto!("plat.v1");
+}
+
+pub use generated::*;
+
+use scene::ArtefactId;
+use tonic::Status;
+use tonic::transport::Channel;
+
+/// The longest message that either side accepts, in bytes. The longest that is meant to occur is a grant: 40 bytes for
+/// each block of its context.
+pub const MESSAGE_BYTES_LIMIT: usize = 4 << 20;
+/// The longest name of a worker or of a backend, in bytes.
+pub const NAME_BYTES_LIMIT: usize = 128;
+/// The longest error message that is kept, in bytes; longer ones are cut.
+pub const ERROR_BYTES_LIMIT: usize = 4096;
+/// The most reports in one call.
+pub const REPORTS_LIMIT: usize = 1024;
+
+/// A client whose messages are limited.
+pub fn client(channel: Channel) -> coordinator_client::CoordinatorClient<Channel> {
+    coordinator_client::CoordinatorClient::new(channel)
+        .max_decoding_message_size(MESSAGE_BYTES_LIMIT)
+        .max_encoding_message_size(MESSAGE_BYTES_LIMIT)
+}
+
+/// A server whose messages are limited.
+pub fn server<S: coordinator_server::Coordinator>(service: S) -> coordinator_server::CoordinatorServer<S> {
+    coordinator_server::CoordinatorServer::new(service)
+        .max_decoding_message_size(MESSAGE_BYTES_LIMIT)
+        .max_encoding_message_size(MESSAGE_BYTES_LIMIT)
+}
+
+/// An artefact's name off the wire.
+///
+/// # Errors
+/// `InvalidArgument` if it is not 32 bytes.
+pub fn artefact_id(bytes: &[u8]) -> Result<ArtefactId, Status> {
+    let id = bytes.try_into().map_err(|_| {
+        Status::invalid_argument(format!("an artefact's name has 32 bytes, this one has {}", bytes.len()))
+    })?;
+    Ok(ArtefactId(id))
+}
+
+/// A worker's or a backend's name off the wire: 1 to [`NAME_BYTES_LIMIT`] printable ASCII characters, so that it may
+/// stand in a log as it is.
+///
+/// # Errors
+/// `InvalidArgument` otherwise.
+pub fn check_name(what: &str, name: &str) -> Result<(), Status> {
+    if name.is_empty() || name.len() > NAME_BYTES_LIMIT || !name.bytes().all(|byte| byte.is_ascii_graphic()) {
+        let advice = format!("a {what}'s name has 1 to {NAME_BYTES_LIMIT} printable ASCII characters and no space");
+        return Err(Status::invalid_argument(advice));
+    }
+    Ok(())
+}
+
+/// An error message as one printable line of at most [`ERROR_BYTES_LIMIT`] bytes.
+pub fn one_line(message: &str) -> String {
+    let mut line = String::new();
+    for character in message.chars() {
+        let printable = if character.is_control() { ' ' } else { character };
+        if line.len() + printable.len_utf8() > ERROR_BYTES_LIMIT {
+            break;
+        }
+        line.push(printable);
+    }
+    line
+}
+
+impl Report {
+    /// Whether all numbers are finite, as the wire demands.
+    pub fn is_finite(&self) -> bool {
+        let optional = |value: Option<f64>| value.is_none_or(f64::is_finite);
+        self.cpu_seconds.is_finite() && self.wall_seconds.is_finite() && optional(self.loss) && optional(self.psnr)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_comes_off_the_wire_is_checked() {
+        assert_eq!(artefact_id(&[7; 32]).unwrap(), ArtefactId([7; 32]));
+        assert!(artefact_id(&[7; 31]).is_err());
+        assert!(check_name("worker", "local-0").is_ok());
+        for bad in ["", "two words", "line\nbreak", "ümlaut", &"x".repeat(129)] {
+            assert!(check_name("worker", bad).is_err(), "{bad}");
+        }
+        assert_eq!(one_line("no\nway\u{1b}[0m"), "no way [0m");
+        assert!(one_line(&"ü".repeat(ERROR_BYTES_LIMIT)).len() <= ERROR_BYTES_LIMIT);
+        assert!(Report { loss: Some(0.5), ..Report::default() }.is_finite());
+        assert!(!Report { psnr: Some(f64::NAN), ..Report::default() }.is_finite());
+    }
+}

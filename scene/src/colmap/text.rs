@@ -1,0 +1,123 @@
+//! The text files: a line for each thing, two for an image; `#` starts a comment.
+
+use std::collections::BTreeMap;
+use std::str::FromStr;
+
+use glam::DVec3;
+
+use super::{ColmapCamera, ColmapImage, ColmapPoints};
+use crate::error::CodecError;
+
+/// Reads `cameras.txt`.
+///
+/// # Errors
+/// A line that is no camera, a lens model that plat does not know, or numbers that no camera has.
+pub fn read_cameras_txt(bytes: &[u8]) -> Result<BTreeMap<u32, ColmapCamera>, CodecError> {
+    let mut cameras = BTreeMap::new();
+    for (number, line) in lines(bytes)?.filter(|(_, line)| is_content(line)) {
+        let mut words = Words { number, words: line.split_ascii_whitespace() };
+        let (id, model) = (words.next()?, words.word()?);
+        let (width, height) = (words.next()?, words.next()?);
+        let parameters = words.rest()?;
+        super::insert(&mut cameras, id, super::camera(id, model, width, height, &parameters)?)?;
+    }
+    Ok(cameras)
+}
+
+/// Reads `images.txt`.
+///
+/// # Errors
+/// A line that is no image, or an image without a name or a finite pose.
+pub fn read_images_txt(bytes: &[u8]) -> Result<Vec<ColmapImage>, CodecError> {
+    let mut images = Vec::new();
+    let mut lines = lines(bytes)?;
+    while let Some((number, line)) = lines.next() {
+        if !is_content(line) {
+            continue;
+        }
+        let mut words = Words { number, words: line.split_ascii_whitespace() };
+        let id = words.next()?;
+        let mut pose = [0.0; 7];
+        for value in &mut pose {
+            *value = words.next()?;
+        }
+        let camera_id = words.next()?;
+        // The name is the rest of the line: it may contain spaces.
+        let mut name = line.trim_start();
+        for _ in 0..9 {
+            name = name.trim_start_matches(|c: char| !c.is_ascii_whitespace()).trim_start();
+        }
+        images.push(super::image(id, pose, camera_id, name.trim_end())?);
+        // Then x, y and point of each observation, often none.
+        if let Some((number, line)) = lines.next()
+            && !line.split_ascii_whitespace().count().is_multiple_of(3)
+        {
+            return Err(CodecError::new(format!("line {number} is no list of x, y and point id of observations")));
+        }
+    }
+    super::each_once(images)
+}
+
+/// Reads `points3D.txt`.
+///
+/// # Errors
+/// A line that is no point, or a position that is not finite.
+pub fn read_points_txt(bytes: &[u8]) -> Result<ColmapPoints, CodecError> {
+    let mut points = ColmapPoints::default();
+    for (number, line) in lines(bytes)?.filter(|(_, line)| is_content(line)) {
+        let mut words = Words { number, words: line.split_ascii_whitespace() };
+        let id = words.next()?;
+        let position = DVec3::new(words.next()?, words.next()?, words.next()?);
+        let colour = [words.next()?, words.next()?, words.next()?];
+        let _reprojection_error: f64 = words.next()?;
+        let track: Vec<u32> = words.rest()?;
+        let (pairs, odd) = track.as_chunks::<2>();
+        if !odd.is_empty() {
+            return Err(CodecError::new(format!("line {number} ends within a track")));
+        }
+        points.push(id, position, colour, pairs.iter().map(|pair| pair[0]))?;
+    }
+    Ok(points)
+}
+
+/// Numbered lines, from 1.
+fn lines(bytes: &[u8]) -> Result<impl Iterator<Item = (usize, &str)>, CodecError> {
+    let text = std::str::from_utf8(bytes).map_err(|_| CodecError::new("is not UTF-8 text"))?;
+    Ok(text.lines().enumerate().map(|(i, line)| (i + 1, line)))
+}
+
+fn is_content(line: &str) -> bool {
+    let line = line.trim_start();
+    !line.is_empty() && !line.starts_with('#')
+}
+
+struct Words<'a> {
+    number: usize,
+    words: std::str::SplitAsciiWhitespace<'a>,
+}
+
+impl<'a> Words<'a> {
+    fn word(&mut self) -> Result<&'a str, CodecError> {
+        self.words.next().ok_or_else(|| CodecError::new(format!("line {} is cut short", self.number)))
+    }
+
+    fn next<T: FromStr>(&mut self) -> Result<T, CodecError> {
+        let word = self.word()?;
+        self.parse(word)
+    }
+
+    fn rest<T: FromStr>(mut self) -> Result<Vec<T>, CodecError> {
+        let mut values = Vec::new();
+        while let Some(word) = self.words.next() {
+            values.push(self.parse(word)?);
+        }
+        Ok(values)
+    }
+
+    fn parse<T: FromStr>(&self, word: &str) -> Result<T, CodecError> {
+        word.parse().map_err(|_| {
+            let word: String = word.escape_debug().take(40).collect();
+            CodecError::new(format!("line {}: '{word}' is not a number that belongs there", self.number))
+        })
+    }
+}

@@ -1,0 +1,84 @@
+//! What can go wrong with a store, one line each.
+
+use std::error::Error;
+use std::io;
+
+use scene::ArtefactId;
+
+/// A store that did not do what was asked.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum StoreError {
+    /// No such artefact.
+    #[error("artefact {id} is not in the store {store}; run the step that makes it again")]
+    Missing {
+        /// The artefact.
+        id: ArtefactId,
+        /// The store's URL.
+        store: String,
+    },
+    /// Bytes that are not those of the id.
+    #[error("artefact {id} in the store {store} is damaged; delete it and run the step that makes it again")]
+    Corrupt {
+        /// The artefact.
+        id: ArtefactId,
+        /// The store's URL.
+        store: String,
+    },
+    /// A record name that the store does not take.
+    #[error(
+        "'{0}' is not a name for a record: up to {limit} ASCII letters, digits and ._-/, no part empty or hidden",
+        limit = crate::NAME_LIMIT
+    )]
+    BadName(String),
+    /// The place itself failed.
+    #[error("cannot {action} {path} in the store {store}: {reason}")]
+    Failed {
+        /// read, write, look for
+        action: &'static str,
+        /// The object's path below the store's URL.
+        path: String,
+        /// The store's URL.
+        store: String,
+        /// What the place said, and what to do where that is known.
+        reason: String,
+    },
+}
+
+/// The root of an error in one line; plain words where the operating system's are known.
+pub(crate) fn reason(error: &(dyn Error + 'static)) -> String {
+    let mut root = error;
+    loop {
+        if let Some(io) = root.downcast_ref::<io::Error>() {
+            match io.kind() {
+                io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded => {
+                    return "the disk is full; free some space and run again".into();
+                }
+                io::ErrorKind::ReadOnlyFilesystem => return "the file system is read-only; choose another".into(),
+                io::ErrorKind::PermissionDenied => return "permission denied; choose a folder you may write to".into(),
+                _ => {}
+            }
+        }
+        match root.source() {
+            Some(source) => root = source,
+            None => return root.to_string().replace('\n', " "),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn known_failures_are_said_in_plain_words() {
+        for (kind, words) in [
+            (io::ErrorKind::StorageFull, "the disk is full"),
+            (io::ErrorKind::ReadOnlyFilesystem, "read-only"),
+            (io::ErrorKind::PermissionDenied, "permission denied"),
+        ] {
+            let source = Box::new(io::Error::from(kind));
+            let error = object_store::Error::Generic { store: "x", source };
+            assert!(reason(&error).starts_with(words) || reason(&error).contains(words), "{}", reason(&error));
+        }
+    }
+}

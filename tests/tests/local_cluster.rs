@@ -1,0 +1,353 @@
+//! Coordinator and workers in one process, over real gRPC on the loopback, with an executor that trains nothing.
+
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+
+use blocks::{Ground, Plan, PlanSettings, Task};
+use coordinator::{LocalError, Options, ServeError, run_local, serve};
+use glam::{DQuat, DVec2};
+use proto::coordinator_client::CoordinatorClient;
+use proto::lease_reply::Reply;
+use proto::watch_event::Event as News;
+use scene::{ArtefactId, BlockId};
+use store::Store;
+use tokio::net::TcpListener;
+use tokio_util::sync::CancellationToken;
+use tonic::Code;
+use tonic::transport::{Channel, Endpoint};
+use worker::{Execute, ExecuteError, Flow, Report, TaskOrder};
+
+const BACKEND: &str = "cpu-none";
+
+/// Seven blocks: the root, its four children, and two grandchildren with their neighbours as context.
+fn plan() -> Plan {
+    let task = |block: &str, context: &[&str]| {
+        let block: BlockId = block.parse().unwrap();
+        Task {
+            block,
+            parent: block.parent(),
+            context: context.iter().map(|block| block.parse().unwrap()).collect(),
+            views: Vec::new(),
+            test_views: Vec::new(),
+            points: 0,
+            budget: 1,
+            steps: 1,
+            rho_metres: 1.0,
+            memory_bytes: 0,
+        }
+    };
+    Plan {
+        version: blocks::plan::VERSION,
+        capture: ArtefactId([1; 32]),
+        settings: PlanSettings::default(),
+        backend: BACKEND.into(),
+        ground: Ground { ground_from_world: DQuat::IDENTITY, min: DVec2::ZERO, edge_metres: 100.0 },
+        levels: 2,
+        rho_metres: vec![4.0, 2.0, 1.0],
+        tasks: vec![
+            task("0/0/0", &[]),
+            task("1/0/0", &[]),
+            task("1/1/0", &[]),
+            task("1/0/1", &[]),
+            task("1/1/1", &[]),
+            task("2/0/0", &["1/1/0", "1/0/1"]),
+            task("2/3/3", &["1/1/0"]),
+        ],
+    }
+}
+
+async fn stored_plan() -> (Store, ArtefactId) {
+    let store = Store::open("memory://").unwrap();
+    let plan = store.put(plan().to_frame().into()).await.unwrap();
+    (store, plan)
+}
+
+type Work =
+    dyn Fn(&TaskOrder, &mut (dyn FnMut(Report) -> Flow + Send)) -> Result<ArtefactId, ExecuteError> + Send + Sync;
+
+/// Does what the test says and remembers what it was asked.
+struct Fake {
+    work: Box<Work>,
+    orders: Mutex<Vec<TaskOrder>>,
+}
+
+impl Execute for Fake {
+    fn execute(
+        &self,
+        order: &TaskOrder,
+        report: &mut (dyn FnMut(Report) -> Flow + Send),
+    ) -> Result<ArtefactId, ExecuteError> {
+        self.orders.lock().unwrap().push(order.clone());
+        (self.work)(order, report)
+    }
+}
+
+fn fake(
+    work: impl Fn(&TaskOrder, &mut (dyn FnMut(Report) -> Flow + Send)) -> Result<ArtefactId, ExecuteError>
+    + Send
+    + Sync
+    + 'static,
+) -> Arc<Fake> {
+    Arc::new(Fake { work: Box::new(work), orders: Mutex::default() })
+}
+
+/// What a task's result is: a function of the plan and its inputs alone, as in training.
+fn result_of(order: &TaskOrder) -> ArtefactId {
+    ArtefactId::of(format!("{} {} {:?}", order.plan, order.task, order.inputs).as_bytes())
+}
+
+fn broken(message: &str, is_input: bool) -> ExecuteError {
+    ExecuteError { message: message.into(), is_input }
+}
+
+/// Runs the plan on workers of this fake; quick retries, a patient lease.
+async fn run(
+    workers: usize,
+    fake: &Arc<Fake>,
+    stop: CancellationToken,
+) -> (Result<Vec<ArtefactId>, LocalError>, Vec<News>) {
+    let (store, plan) = stored_plan().await;
+    let options = Options { wait_millis: 5, ..Options::new(store) };
+    let mut news = Vec::new();
+    let start = |coordinator_url, number, shutdown| {
+        let worker_id = format!("local-{number}");
+        worker::run(worker::Options { coordinator_url, worker_id, backend: BACKEND.into() }, fake.clone(), shutdown)
+    };
+    let result = run_local(options, plan, workers, start, |event| news.push(event.clone()), stop).await;
+    (result, news)
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn two_workers_train_the_tree_in_the_order_of_its_dependencies() {
+    let fake = fake(|order, report| {
+        for step in 1..=3 {
+            let psnr = (step == 3).then_some(20.0 + f64::from(order.task));
+            let flow = report(Report { step, steps: 3, loss: f64::NAN, psnr, ..Report::default() });
+            assert_eq!(flow, Flow::Continue);
+        }
+        Ok(result_of(order))
+    });
+    let (result, news) = run(2, &fake, CancellationToken::new()).await;
+    let results = result.unwrap();
+    let (_, plan_id) = stored_plan().await;
+    let plan = plan();
+    let mut expected: Vec<ArtefactId> = Vec::new();
+    for (index, task) in (0..).zip(&plan.tasks) {
+        let place = |block: &BlockId| plan.tasks.iter().position(|task| task.block == *block).unwrap() as u32;
+        let needed = task.parent.iter().chain(&task.context).map(place);
+        let inputs: BTreeMap<u32, ArtefactId> = needed.map(|place| (place, expected[place as usize])).collect();
+        expected.push(result_of(&TaskOrder { job: 1, plan: plan_id, task: index, attempt: 1, inputs }));
+    }
+    assert_eq!(results, expected);
+    let mut tasks: Vec<u32> = fake.orders.lock().unwrap().iter().map(|order| order.task).collect();
+    assert_eq!(tasks[0], 0);
+    tasks.sort_unstable();
+    assert_eq!(tasks, [0, 1, 2, 3, 4, 5, 6], "each task is carried out once");
+    // Every report arrives, in order, before its task is done; a loss that is no number is left out.
+    for task in 0..7 {
+        let line = |event: &News| match event {
+            News::Reported(reported) if reported.task == task => Some(reported.report.unwrap()),
+            _ => None,
+        };
+        let lines: Vec<proto::Report> = news.iter().filter_map(line).collect();
+        assert_eq!(lines.iter().map(|line| line.step).collect::<Vec<_>>(), [1, 2, 3]);
+        assert!(lines.iter().all(|line| line.loss.is_none()));
+        assert_eq!(lines[2].psnr, Some(20.0 + f64::from(task)));
+    }
+    assert!(matches!(news.last(), Some(News::Finished(_))));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_panicking_task_is_retried_then_quarantined_and_the_rest_goes_on() {
+    let fake = fake(|order, _| match (order.task, order.attempt) {
+        (3, attempt) => panic!("block 3 broke, attempt {attempt}"),
+        (4, 1) => Err(broken("the disk was full", false)),
+        _ => Ok(result_of(order)),
+    });
+    let (result, _) = run(2, &fake, CancellationToken::new()).await;
+    let line = "task 3 failed in attempt 3: panicked: block 3 broke, attempt 3; 1 that depend on such were not started";
+    assert_eq!(result, Err(LocalError::Failed(line.into())));
+    let count = |task| fake.orders.lock().unwrap().iter().filter(|order| order.task == task).count();
+    assert_eq!([0, 1, 2, 3, 4, 5, 6].map(count), [1, 1, 1, 3, 2, 0, 1]);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn wrong_input_fails_the_job_at_once() {
+    let fake = fake(|_, _| Err(broken("photo 7 is no photo", true)));
+    let (result, _) = run(1, &fake, CancellationToken::new()).await;
+    let line = "task 0 failed in attempt 1: photo 7 is no photo; 6 that depend on such were not started";
+    assert_eq!(result, Err(LocalError::Input(line.into())));
+    assert_eq!(fake.orders.lock().unwrap().len(), 1);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_cancelled_job_stops_the_work_in_hand() {
+    let stop = CancellationToken::new();
+    let cancel = stop.clone();
+    let fake = fake(move |_, report| {
+        cancel.cancel();
+        while report(Report::default()) == Flow::Continue {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        Err(broken("stopped", false))
+    });
+    let (result, _) = run(1, &fake, stop).await;
+    assert_eq!(result, Err(LocalError::Cancelled));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_job_whose_workers_all_fail_to_start_ends() {
+    let (store, plan) = stored_plan().await;
+    let start = |_, _, _| async { Err::<(), _>("no such device") };
+    let result = run_local(Options::new(store), plan, 2, start, |_| {}, CancellationToken::new()).await;
+    assert_eq!(result, Err(LocalError::Failed("no worker is left: no such device".into())));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn what_is_not_a_plan_is_refused() {
+    let store = Store::open("memory://").unwrap();
+    let note = store.put(b"not a plan".to_vec().into()).await.unwrap();
+    for (plan, why) in [(note, "not a plat 'plan' frame"), (ArtefactId([9; 32]), "is not in the store")] {
+        let start = |_, _, _| async { Ok::<(), String>(()) };
+        let result = run_local(Options::new(store.clone()), plan, 1, start, |_| {}, CancellationToken::new()).await;
+        assert!(matches!(&result, Err(LocalError::Input(line)) if line.contains(why)), "{result:?}");
+    }
+}
+
+/// A coordinator with one job, and a client; they end with the token.
+async fn host(lease_millis: u64) -> (CoordinatorClient<Channel>, String, u64, CancellationToken) {
+    let (store, plan) = stored_plan().await;
+    let mut options = Options { wait_millis: 5, ..Options::new(store.clone()) };
+    options.settings.lease_millis = lease_millis;
+    let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let url = format!("http://{}", listener.local_addr().unwrap());
+    let stop = CancellationToken::new();
+    tokio::spawn(serve(listener, options, stop.clone().cancelled_owned()));
+    let mut client = proto::client(Endpoint::from_shared(url.clone()).unwrap().connect_lazy());
+    let request = proto::SubmitRequest { plan: plan.0.to_vec(), store_url: store.url().into() };
+    let job = client.submit(request).await.unwrap().into_inner();
+    assert_eq!(job.tasks, 7);
+    (client, url, job.job, stop)
+}
+
+/// Asks until there is a grant, though not for ever.
+async fn lease(client: &mut CoordinatorClient<Channel>, worker: &str) -> proto::Attempt {
+    for _ in 0..10_000 {
+        let request = proto::LeaseRequest { worker: worker.into(), backend: BACKEND.into() };
+        match client.lease(request).await.unwrap().into_inner().reply.unwrap() {
+            Reply::Grant(grant) => return grant.attempt.unwrap(),
+            Reply::WaitMillis(millis) => tokio::time::sleep(Duration::from_millis(millis.into())).await,
+            Reply::Drained(_) => panic!("drained"),
+        }
+    }
+    panic!("no grant came");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_stale_attempt_is_refused() {
+    let (mut client, _, job, stop) = host(50).await;
+    let zombie = lease(&mut client, "zombie").await;
+    // The zombie is silent, its lease runs out, and the root is granted anew. (On a slow machine it may run out more
+    // than once, so nothing is assumed of the attempt's number.)
+    let heir = lease(&mut client, "heir").await;
+    assert_eq!((zombie.task, zombie.number, heir.task), (0, 1, 0));
+    assert!(heir.number > zombie.number);
+    let artefact = ArtefactId::of(b"zombie's").0.to_vec();
+    let complete = proto::CompleteRequest { attempt: Some(zombie), artefact };
+    assert!(!client.complete(complete).await.unwrap().into_inner().accepted);
+    let report = proto::ReportRequest { attempt: Some(zombie), reports: vec![proto::Report::default()] };
+    assert!(client.report(report).await.unwrap().into_inner().cancelled);
+    let status = client.status(proto::StatusRequest { job }).await.unwrap().into_inner();
+    assert_eq!((status.done, status.waiting), (0, 6));
+    stop.cancel();
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_leaving_worker_gives_its_task_back() {
+    let (mut client, url, job, stop) = host(3_600_000).await;
+    // More often than failures would be forgiven.
+    for _ in 0..4 {
+        let leave = CancellationToken::new();
+        let go = leave.clone();
+        let slow = fake(move |_, report| {
+            go.cancel();
+            while report(Report::default()) == Flow::Continue {
+                std::thread::sleep(Duration::from_millis(1));
+            }
+            Err(broken("stopped", false))
+        });
+        let coordinator_url = url.clone();
+        let options = worker::Options { coordinator_url, worker_id: "leaving".into(), backend: BACKEND.into() };
+        worker::run(options, slow, leave).await.unwrap();
+    }
+    // The leases were for an hour, and the next worker need not wait for their end.
+    let next = lease(&mut client, "next").await;
+    assert_eq!((next.task, next.number), (0, 5));
+    let status = client.status(proto::StatusRequest { job }).await.unwrap().into_inner();
+    assert_eq!((status.leased, status.quarantined, status.outcome), (1, 0, None));
+    stop.cancel();
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_quiet_executor_keeps_its_lease() {
+    let (mut client, url, job, stop) = host(1000).await;
+    let quiet = fake(|order, _| {
+        if order.task == 0 {
+            std::thread::sleep(Duration::from_millis(2500));
+        }
+        Ok(result_of(order))
+    });
+    let options = worker::Options { coordinator_url: url, worker_id: "quiet".into(), backend: BACKEND.into() };
+    let run = tokio::spawn(worker::run(options, quiet.clone(), stop.clone()));
+    let mut news = client.watch(proto::WatchRequest { job }).await.unwrap().into_inner();
+    while let Some(event) = news.message().await.unwrap() {
+        if let Some(News::Finished(finished)) = event.event {
+            assert_eq!(finished.outcome(), proto::Outcome::Done);
+        }
+    }
+    assert_eq!(quiet.orders.lock().unwrap().iter().filter(|order| order.task == 0).count(), 1);
+    stop.cancel();
+    run.await.unwrap().unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn what_comes_off_the_wire_is_checked() {
+    let (mut client, _, job, stop) = host(3_600_000).await;
+    let code = |result: Result<(), tonic::Status>| result.unwrap_err().code();
+
+    let other = proto::LeaseRequest { worker: "other".into(), backend: "gpu".into() };
+    let reply = client.lease(other).await.unwrap().into_inner().reply;
+    assert_eq!(reply, Some(Reply::WaitMillis(5)), "a job pins its backend");
+
+    let nameless = proto::LeaseRequest { worker: String::new(), backend: BACKEND.into() };
+    assert_eq!(code(client.lease(nameless).await.map(|_| ())), Code::InvalidArgument);
+    let elsewhere = proto::SubmitRequest { plan: vec![0; 32], store_url: "file:///elsewhere".into() };
+    assert_eq!(code(client.submit(elsewhere).await.map(|_| ())), Code::FailedPrecondition);
+    assert_eq!(code(client.watch(proto::WatchRequest { job: 77 }).await.map(|_| ())), Code::NotFound);
+    assert_eq!(code(client.report(proto::ReportRequest::default()).await.map(|_| ())), Code::InvalidArgument);
+
+    let attempt = Some(lease(&mut client, "honest").await);
+    let short = proto::CompleteRequest { attempt, artefact: vec![0; 31] };
+    assert_eq!(code(client.complete(short).await.map(|_| ())), Code::InvalidArgument);
+    let reports = vec![proto::Report { wall_seconds: f64::INFINITY, ..proto::Report::default() }];
+    assert_eq!(code(client.report(proto::ReportRequest { attempt, reports }).await.map(|_| ())), Code::InvalidArgument);
+    let huge = proto::SubmitRequest { plan: vec![0; 2 * proto::MESSAGE_BYTES_LIMIT], store_url: String::new() };
+    assert!(client.submit(huge).await.is_err());
+
+    // None of this did any harm.
+    let complete = proto::CompleteRequest { attempt, artefact: vec![0; 32] };
+    assert!(client.complete(complete).await.unwrap().into_inner().accepted);
+    client.cancel(proto::CancelRequest { job }).await.unwrap();
+    let status = client.status(proto::StatusRequest { job }).await.unwrap().into_inner();
+    assert_eq!((status.done, status.outcome()), (1, proto::Outcome::Cancelled));
+    stop.cancel();
+}
+
+#[tokio::test]
+async fn an_address_beyond_this_machine_is_refused() {
+    let (store, _) = stored_plan().await;
+    let listener = TcpListener::bind("0.0.0.0:0").await.unwrap();
+    let result = serve(listener, Options::new(store), std::future::pending()).await;
+    assert!(matches!(result, Err(ServeError::Input(_))));
+}

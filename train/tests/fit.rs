@@ -1,0 +1,444 @@
+//! Training from end to end on a scene of a few hundred splats, whose photos the renderer itself takes.
+
+use std::sync::Arc;
+
+use glam::{DMat3, DQuat, DVec3, Vec3};
+use render::Options;
+use render::cpu::Renderer;
+use scene::{Camera, Pinhole, Pixels, Rect, Rigid, SH_C0, Splat, Splats, column};
+use train::{Flow, Job, Recipe, TrainError, TrainView, WindowSource, metrics, random, train};
+
+const WIDTH: u32 = 64;
+const HEIGHT: u32 = 48;
+const AREA: usize = (WIDTH * HEIGHT) as usize;
+
+/// Photos in memory; coarser mips are means of 2^m × 2^m pixels.
+#[derive(Clone)]
+struct Photos(Vec<Pixels>);
+
+impl WindowSource for Photos {
+    fn window(&self, view: u32, mip: u8, rect: Rect) -> Result<Arc<Pixels>, String> {
+        let photo = self.0.get(view as usize).ok_or_else(|| format!("view {view} is missing"))?;
+        let side = 1u32 << mip;
+        let mut rgb = Vec::new();
+        let mut mask = photo.mask.as_ref().map(|_| Vec::new());
+        let mean = |plane: &[u8], x: u32, y: u32| {
+            let pixels = (0..side * side).map(|k| (x * side + k % side, y * side + k / side));
+            let sum: u32 = pixels.map(|(x, y)| u32::from(plane[(y * photo.width + x) as usize])).sum();
+            ((sum + side * side / 2) / (side * side)) as u8
+        };
+        let window = || (rect.y..rect.y + rect.height).flat_map(|y| (rect.x..rect.x + rect.width).map(move |x| (x, y)));
+        for plane in photo.rgb.chunks(photo.area()) {
+            rgb.extend(window().map(|(x, y)| mean(plane, x, y)));
+        }
+        if let (Some(mask), Some(plane)) = (&mut mask, &photo.mask) {
+            // A coarse pixel is used only if all of it is.
+            mask.extend(window().map(|(x, y)| if mean(plane, x, y) == 255 { 255 } else { 0 }));
+        }
+        Ok(Arc::new(Pixels { width: rect.width, height: rect.height, rgb, mask }))
+    }
+}
+
+/// Twelve cameras on a ring around the origin, looking at it from changing heights.
+fn views() -> Vec<TrainView> {
+    (0..12)
+        .map(|n| {
+            let (sin, cos) = (f64::from(n) / 12.0 * std::f64::consts::TAU).sin_cos();
+            let centre = DVec3::new(5.0 * cos, 5.0 * sin, f64::from(n % 3) - 0.5);
+            let forward = -centre.normalize();
+            let right = forward.cross(DVec3::Z).normalize();
+            // Rows are the camera's axes: x right, y down, z forward.
+            let axes = DMat3::from_cols(right, forward.cross(right), forward).transpose();
+            let rotation = DQuat::from_mat3(&axes);
+            let pinhole = Pinhole { width: WIDTH, height: HEIGHT, fx: 70.0, fy: 70.0, cx: 32.0, cy: 24.0 };
+            let camera = Camera { pinhole, camera_from_world: Rigid { rotation, translation: rotation * -centre } };
+            TrainView { view: n, mip: 0, rect: camera.full(), camera }
+        })
+        .collect()
+}
+
+/// `count` coloured splats in a ball; every number from `key`.
+fn cloud(key: u64, count: usize, opacity: f32) -> Splats {
+    let mut splats = Splats::new(1);
+    for i in 0..count as u64 {
+        let number = |k: u64| random::uniform(key, 16 * i + k);
+        let position = Vec3::new(number(0), number(1), number(2)) * 2.0 - 1.0;
+        let colour = Vec3::new(number(3), number(4), number(5));
+        let mut splat = Splat::round(position * 1.2, 0.14f32.ln(), colour, opacity);
+        splat.log_scale += Vec3::new(number(6), number(7), number(8)) - 0.5;
+        splat.quat = [number(9) + 0.1, number(10), number(11), number(12)];
+        splats.push(&splat);
+    }
+    splats
+}
+
+/// As a sparse cloud knows them: places a little off, round, all of one size and opacity, colours half grey.
+fn perturbed(splats: &Splats) -> Splats {
+    let mut out = Splats::new(splats.sh_degree());
+    for i in 0..splats.len() {
+        let noise = |k: u64| random::uniform(99, 4 * i as u64 + k) - 0.5;
+        let colour = Vec3::from_array(splats.get(i).sh[0]) * (0.5 * SH_C0) + 0.5;
+        let position = splats.mean(i) + 0.1 * Vec3::new(noise(0), noise(1), noise(2));
+        out.push(&Splat::round(position, 0.14f32.ln(), colour, 0.3));
+    }
+    out
+}
+
+fn photo(splats: &Splats, view: &TrainView) -> Vec<f32> {
+    let options = Options { sh_degree: 1, ..Options::default() };
+    Renderer::default().forward(splats, None, &view.camera, &options).colour.clone()
+}
+
+fn photos(splats: &Splats) -> Photos {
+    let bytes = |planes: Vec<f32>| planes.iter().map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u8).collect();
+    let photo = |view| Pixels { width: WIDTH, height: HEIGHT, rgb: bytes(photo(splats, view)), mask: None };
+    Photos(views().iter().map(photo).collect())
+}
+
+/// Mean PSNR over the views, where `mask` (a function of the pixel) lets it count.
+fn psnr(splats: &Splats, photos: &Photos, used: impl Fn(usize) -> bool) -> f64 {
+    let mask: Vec<u8> = (0..AREA).map(|i| if used(i) { 255 } else { 0 }).collect();
+    let views = views();
+    let total: f64 = (views.iter().zip(&photos.0))
+        .map(|(view, expected)| {
+            let expected: Vec<f32> = expected.rgb.iter().map(|&b| f32::from(b) / 255.0).collect();
+            metrics::psnr(&photo(splats, view), &expected, Some(&mask)).expect("equal sizes")
+        })
+        .sum();
+    total / views.len() as f64
+}
+
+struct Setup<'a> {
+    initial: Splats,
+    photos: &'a Photos,
+    context: Option<&'a Splats>,
+    budget: usize,
+    steps: u32,
+    recipe: Recipe,
+}
+
+impl<'a> Setup<'a> {
+    /// No growth, no context.
+    fn new(initial: Splats, photos: &'a Photos) -> Self {
+        let budget = initial.len();
+        Self { initial, photos, context: None, budget, steps: 240, recipe: Recipe::default() }
+    }
+
+    fn run(self) -> Splats {
+        self.try_run(&|_| true, &mut |_| Flow::Continue).expect("training goes well")
+    }
+
+    fn try_run(
+        self,
+        counts: &(dyn Fn(Vec3) -> bool + Sync),
+        report: &mut dyn FnMut(train::Progress) -> Flow,
+    ) -> Result<Splats, TrainError> {
+        let views = views();
+        let job = Job {
+            initial: self.initial,
+            context: self.context,
+            views: &views,
+            counts,
+            budget: self.budget,
+            steps: self.steps,
+            antialiased: false,
+            seed: 5,
+            size_bounds_metres: [1e-3, 2.0],
+            recipe: &self.recipe,
+            source: self.photos,
+        };
+        train(job, report)
+    }
+}
+
+/// A recipe that neither adds nor removes splats, so that rows keep their places.
+fn no_growth() -> Recipe {
+    let mut recipe = Recipe::default();
+    recipe.growth.every = u32::MAX / 2;
+    recipe
+}
+
+fn all_finite(splats: &Splats) -> bool {
+    (0..splats.len()).all(|i| splats.is_finite(i))
+}
+
+#[test]
+fn perturbed_points_are_fitted_beyond_30_db() {
+    let truth = cloud(1, 200, 0.8);
+    let photos = photos(&truth);
+    let initial = perturbed(&truth);
+    let before = psnr(&initial, &photos, |_| true);
+    let mut losses = Vec::new();
+    let mut report = |p: train::Progress| {
+        assert_eq!((p.steps, p.skipped), (600, 0));
+        losses.push(p.loss);
+        Flow::Continue
+    };
+    let fitted = Setup { steps: 600, ..Setup::new(initial, &photos) }.try_run(&|_| true, &mut report).unwrap();
+    let after = psnr(&fitted, &photos, |_| true);
+    println!("{before:.2} dB before, {after:.2} dB after, {} splats", fitted.len());
+    assert!(before < 22.0, "the start must not be the solution: {before}");
+    assert!(after > 30.0, "{after}");
+    let mean = |losses: &[f64]| losses.iter().sum::<f64>() / losses.len() as f64;
+    assert!(mean(&losses[588..]) < 0.3 * mean(&losses[..12]));
+    assert!(all_finite(&fitted));
+}
+
+#[test]
+fn threads_do_not_change_a_bit() {
+    let truth = cloud(2, 150, 0.8);
+    let photos = photos(&truth);
+    let context = cloud(3, 40, 0.5);
+    let run = |threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        let setup = Setup { context: Some(&context), budget: 250, ..Setup::new(perturbed(&truth), &photos) };
+        pool.install(|| setup.run())
+    };
+    let one = run(1);
+    assert!(one.len() > 200, "growth must have happened");
+    for threads in [2, 5] {
+        let many = run(threads);
+        assert_eq!(one.len(), many.len());
+        let bits = |splats: &Splats| -> Vec<u32> { splats.columns().iter().flatten().map(|v| v.to_bits()).collect() };
+        assert!(bits(&one) == bits(&many), "{threads} threads give other splats than one");
+    }
+}
+
+/// Masks out the right third; what is under the mask becomes `content(i)`.
+fn masked(photos: &Photos, content: impl Fn(usize) -> u8) -> Photos {
+    let mut out = photos.clone();
+    let hidden = |i: usize| i % AREA % WIDTH as usize >= 43;
+    for photo in &mut out.0 {
+        photo.mask = Some((0..AREA).map(|i| if hidden(i) { 0 } else { 255 }).collect());
+        for (i, byte) in photo.rgb.iter_mut().enumerate().filter(|(i, _)| hidden(*i)) {
+            *byte = content(i);
+        }
+    }
+    out
+}
+
+/// What two contents under a mask make of the same start, and without a mask.
+fn mask_differences(recipe: &Recipe) -> (f32, f32) {
+    let truth = cloud(4, 120, 0.8);
+    let photos = photos(&truth);
+    let black = masked(&photos, |_| 0);
+    let noise = masked(&photos, |i| random::bits(8, i as u64) as u8);
+    let bare = |photos: &Photos| Photos(photos.0.iter().map(|p| Pixels { mask: None, ..p.clone() }).collect());
+    let run = |photos: &Photos| {
+        Setup { steps: 60, recipe: recipe.clone(), ..Setup::new(perturbed(&truth), photos) }.run()
+    };
+    let largest = |a: &Splats, b: &Splats| {
+        let pairs = a.columns().iter().flatten().zip(b.columns().iter().flatten());
+        pairs.map(|(a, b)| (a - b).abs()).fold(0.0, f32::max)
+    };
+    let with = largest(&run(&black), &run(&noise));
+    (with, largest(&run(&bare(&black)), &run(&bare(&noise))))
+}
+
+#[test]
+fn what_is_under_a_mask_does_not_matter_to_l1() {
+    let (with, without) = mask_differences(&Recipe { lambda: 0.0, coarse: Vec::new(), ..no_growth() });
+    assert_eq!(with, 0.0);
+    assert!(without > 0.1, "without the mask it must matter: {without}");
+}
+
+#[test]
+fn what_is_under_a_mask_does_not_matter_at_all() {
+    // SSIM windows reach five pixels: they must not carry hidden pixels over the mask's edge.
+    let (with, without) = mask_differences(&no_growth());
+    assert!(without > 0.1, "without the mask it must matter: {without}");
+    assert_eq!(with, 0.0, "hidden pixels moved parameters by up to this");
+}
+
+#[test]
+fn broken_numbers_at_the_start_are_survived() {
+    let truth = cloud(5, 150, 0.8);
+    let photos = photos(&truth);
+    let good = perturbed(&truth);
+    let healthy = psnr(&Setup::new(good.clone(), &photos).run(), &photos, |_| true);
+    for value in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
+        let mut initial = good.clone();
+        let wanted = [
+            column::MEAN,
+            column::MEAN + 2,
+            column::LOG_SCALE + 1,
+            column::QUAT,
+            column::QUAT + 3,
+            column::OPACITY,
+            column::SH,
+            column::SH + 5,
+        ];
+        for (n, k) in wanted.into_iter().enumerate() {
+            initial.columns_mut()[k][7 + 16 * n] = value;
+        }
+        let mut skipped = 0;
+        let mut report = |p: train::Progress| {
+            skipped = p.skipped;
+            Flow::Continue
+        };
+        let fitted = Setup::new(initial, &photos).try_run(&|_| true, &mut report).unwrap();
+        let after = psnr(&fitted, &photos, |_| true);
+        println!("{value}: {after:.2} dB instead of {healthy:.2}, {skipped} steps left out, {} splats", fitted.len());
+        assert!(all_finite(&fitted), "{value}: broken rows are left");
+        assert!(after > healthy - 2.0, "{value}: {after} dB instead of {healthy}");
+        assert!(skipped < 120, "{value}: {skipped} steps were left out");
+    }
+}
+
+#[test]
+fn growth_meets_the_budget() {
+    let truth = cloud(6, 200, 0.8);
+    let photos = photos(&truth);
+    let initial = perturbed(&truth).filter(|i| i % 3 == 0);
+    for budget in [67, 100, 200, 300] {
+        let setup = Setup { budget, steps: 600, ..Setup::new(initial.clone(), &photos) };
+        let fitted = setup.run();
+        println!("budget {budget}: {} splats, {:.2} dB", fitted.len(), psnr(&fitted, &photos, |_| true));
+        assert!(fitted.len() <= budget, "{} splats exceed the budget of {budget}", fitted.len());
+        assert!(fitted.len() * 100 >= budget * 97, "{} splats of {budget}", fitted.len());
+    }
+}
+
+#[test]
+fn only_what_counts_counts_against_the_budget() {
+    let truth = cloud(6, 200, 0.8);
+    let photos = photos(&truth);
+    let core = |p: Vec3| p.x < 0.0;
+    let setup = Setup { budget: 160, steps: 600, ..Setup::new(perturbed(&truth), &photos) };
+    let fitted = setup.try_run(&core, &mut |_| Flow::Continue).unwrap();
+    let inside = (0..fitted.len()).filter(|&i| core(fitted.mean(i))).count();
+    println!("{inside} inside, {} in all", fitted.len());
+    assert!((144..=176).contains(&inside), "{inside} splats instead of 160 (splats move across the border)");
+    assert!(fitted.len() > inside + 80, "the halo is there too: {}", fitted.len());
+}
+
+#[test]
+fn more_splats_fit_better() {
+    let truth = cloud(6, 200, 0.8);
+    let photos = photos(&truth);
+    let initial = perturbed(&truth).filter(|i| i % 4 == 0);
+    let run = |budget| {
+        psnr(&Setup { budget, steps: 400, ..Setup::new(initial.clone(), &photos) }.run(), &photos, |_| true)
+    };
+    let (few, many) = (run(50), run(200));
+    assert!(many > few + 1.0, "{many} dB with four times the splats, {few} dB without");
+}
+
+/// Splats on one side of the plane x = 0, with a gap.
+fn side(splats: &Splats, sign: f32) -> Splats {
+    splats.filter(|i| splats.mean(i).x * sign > 0.15)
+}
+
+/// Share of each pixel, over all views, that `own` explains when it is drawn with `context`.
+fn shares(own: &Splats, context: &Splats) -> Vec<f32> {
+    let options = Options { sh_degree: 1, extras: true, ..Options::default() };
+    let draw = |view: &TrainView| Renderer::default().forward(own, Some(context), &view.camera, &options).own.clone();
+    views().iter().flat_map(draw).collect()
+}
+
+#[test]
+fn splats_that_explain_nothing_keep_every_bit() {
+    let truth = cloud(7, 160, 0.8);
+    let photos = photos(&truth);
+    // In the core: what is to be trained. Behind the cameras, far above: never in view. In the middle of an opaque ball
+    // of context: in view, but hidden in every pixel.
+    let mut initial = perturbed(&side(&truth, -1.0));
+    let trained = initial.len();
+    initial.push(&Splat::round(Vec3::new(0.0, 0.0, 40.0), -2.0, Vec3::X, 0.5));
+    initial.push(&Splat::round(Vec3::new(0.7, 0.0, 0.0), -5.0, Vec3::Y, 0.9));
+    let mut ball = side(&truth, 1.0);
+    for _ in 0..4 {
+        ball.push(&Splat::round(Vec3::new(0.7, 0.0, 0.0), -1.5, Vec3::splat(0.5), 0.995));
+    }
+    let shell = ball.clone();
+    for (n, direction) in (0..96u64).map(|n| (n, [0, 1, 2].map(|k| random::uniform(31, 3 * n + k) - 0.5))) {
+        let direction = Vec3::from_array(direction).normalize();
+        let layer = 0.4 + 0.05 * (n % 3) as f32;
+        ball.push(&Splat::round(Vec3::new(0.7, 0.0, 0.0) + layer * direction, -1.6, Vec3::splat(0.4), 0.995));
+    }
+    assert!(shell.len() < ball.len());
+    let weight = |i: u32| shares(&initial.select(&[i]), &ball).iter().sum::<f32>();
+    assert_eq!((weight(trained as u32), weight(trained as u32 + 1)), (0.0, 0.0), "the test's splats must be hidden");
+    assert!(weight(0) > 1.0);
+
+    let setup = Setup { context: Some(&ball), steps: 120, recipe: no_growth(), ..Setup::new(initial.clone(), &photos) };
+    let fitted = setup.run();
+    assert_eq!(fitted.len(), initial.len());
+    for i in trained..trained + 2 {
+        assert_eq!(fitted.get(i), initial.get(i), "splat {i} explains nothing and must not move");
+    }
+    let moved = (0..trained).filter(|&i| fitted.get(i) != initial.get(i)).count();
+    assert!(moved * 10 > trained * 9, "only {moved} of {trained} splats were trained");
+}
+
+#[test]
+fn a_block_does_not_repair_its_neighbours_region() {
+    // The photos show on the right something else than the context draws there: the neighbour's error, not ours.
+    let truth = cloud(8, 300, 0.97);
+    let (left, right) = (side(&truth, -1.0), side(&truth, 1.0));
+    let mut elsewhere = right.clone();
+    for k in 0..3 {
+        elsewhere.columns_mut()[column::SH + k].iter_mut().for_each(|v| *v = 1.2 - *v);
+    }
+    let with = |right: &Splats| {
+        let mut both = left.clone();
+        both.append(right);
+        photos(&both)
+    };
+    let (agreeing, contradicting) = (with(&right), with(&elsewhere));
+    let run = |photos: &Photos, context: Option<&Splats>| {
+        let budget = 2 * left.len();
+        Setup { context, budget, steps: 360, ..Setup::new(perturbed(&left), photos) }.run()
+    };
+    // Pixels of the neighbour: opaque there, and none of the block's true splats shows.
+    let mut theirs = shares(&left, &right);
+    for (share, other) in theirs.iter_mut().zip(shares(&right, &left)) {
+        *share = if *share < 0.003 && other > 0.9 { 1.0 } else { 0.0 };
+    }
+    let count = theirs.iter().sum::<f32>();
+    assert!(count > 500.0, "{count}");
+    let spill = |own: &Splats| shares(own, &right).iter().zip(&theirs).map(|(s, t)| s * t).sum::<f32>() / count;
+
+    let quiet = spill(&run(&agreeing, Some(&right)));
+    let provoked = spill(&run(&contradicting, Some(&right)));
+    let unguarded = spill(&run(&contradicting, None));
+    println!("own share of the neighbour's pixels: {quiet:.4} in peace, {provoked:.4} provoked, {unguarded:.4} without context");
+    assert!(unguarded > 0.1, "without a context the block must try to repair: {unguarded}");
+    assert!(provoked < 0.1 * unguarded, "{provoked} of the neighbour's pixels are the block's");
+}
+
+#[test]
+fn a_report_can_stop_and_errors_say_why() {
+    let truth = cloud(9, 60, 0.8);
+    let photos = photos(&truth);
+    let mut calls = 0;
+    let mut report = |p: train::Progress| {
+        calls += 1;
+        assert_eq!(p.step, calls);
+        if p.step == 10 { Flow::Stop } else { Flow::Continue }
+    };
+    assert!(Setup::new(perturbed(&truth), &photos).try_run(&|_| true, &mut report).is_ok());
+    assert_eq!(calls, 10);
+
+    let run = |initial: Splats, photos: &Photos| Setup::new(initial, photos).try_run(&|_| true, &mut |_| Flow::Continue);
+    let missing = Photos(photos.0[..6].to_vec());
+    assert!(matches!(run(perturbed(&truth), &missing), Err(TrainError::Source(line)) if line.contains("is missing")));
+    assert_eq!(run(Splats::new(1), &photos), Err(TrainError::Empty(0)));
+    let mut transparent = perturbed(&truth);
+    transparent.columns_mut()[column::OPACITY].fill(-12.0);
+    assert!(matches!(run(transparent, &photos), Err(TrainError::Empty(50))));
+    let job = Job {
+        initial: perturbed(&truth),
+        context: None,
+        views: &[],
+        counts: &|_| true,
+        budget: 10,
+        steps: 10,
+        antialiased: false,
+        seed: 0,
+        size_bounds_metres: [1e-3, 1.0],
+        recipe: &Recipe::default(),
+        source: &photos,
+    };
+    assert_eq!(train(job, &mut |_| Flow::Continue), Err(TrainError::NoViews));
+}

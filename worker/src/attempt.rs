@@ -1,0 +1,170 @@
+//! One attempt: the compute on a blocking thread, the heartbeat beside it, and the last word to the coordinator.
+
+use std::any::Any;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use proto::coordinator_client::CoordinatorClient;
+use proto::{FailureKind, REPORTS_LIMIT};
+use tokio::sync::mpsc;
+use tokio::time::{Instant, MissedTickBehavior};
+use tokio_util::sync::CancellationToken;
+use tonic::transport::Channel;
+use tonic::{Code, Status};
+
+use crate::{Backoff, Execute, ExecuteError, Flow, Report, TaskOrder, is_passing};
+
+/// News go out this often, if there are any.
+const NEWS_PERIOD: Duration = Duration::from_millis(250);
+/// Signs of life per lease.
+const BEATS_PER_LEASE: u32 = 4;
+/// Tries to deliver the last word before the lease is left to expire: about half a minute.
+const LAST_WORD_TRIES: u32 = 10;
+
+type Client = CoordinatorClient<Channel>;
+
+/// Carries out what was granted and says how it ended. Troubles on the wire are logged, not returned: the lease expires
+/// and the coordinator grants the task anew.
+pub(crate) async fn run(
+    client: &mut Client,
+    grant: proto::Grant,
+    executor: Arc<dyn Execute>,
+    shutdown: &CancellationToken,
+) {
+    let lease = Duration::from_millis(grant.lease_millis.into());
+    let Some((key, order)) = order_of(grant) else {
+        tracing::error!("a grant that makes no sense was dropped");
+        return tokio::time::sleep(NEWS_PERIOD).await;
+    };
+    let stop = Arc::new(AtomicBool::new(false));
+    let (sender, mut news) = mpsc::channel(REPORTS_LIMIT);
+    let mut work = {
+        let (order, stop) = (order.clone(), stop.clone());
+        tokio::task::spawn_blocking(move || {
+            let mut report = |report: Report| {
+                // A full channel means that the coordinator is away: the line is lost, the compute goes on.
+                let _ = sender.try_send(to_wire(report));
+                if stop.load(Ordering::Relaxed) { Flow::Stop } else { Flow::Continue }
+            };
+            executor.execute(&order, &mut report)
+        })
+    };
+
+    let longest_silence = lease / BEATS_PER_LEASE;
+    let mut beat = tokio::time::interval(NEWS_PERIOD.min(longest_silence).max(Duration::from_millis(1)));
+    beat.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    let mut last_call = Instant::now();
+    let (mut void, mut leaving) = (false, false);
+    let result = loop {
+        tokio::select! {
+            biased;
+            result = &mut work => break result,
+            () = shutdown.cancelled(), if !leaving => {
+                leaving = true;
+                stop.store(true, Ordering::Relaxed);
+            }
+            _ = beat.tick(), if !void => {
+                if !news.is_empty() || last_call.elapsed() >= longest_silence {
+                    void = !tell(client, key, &mut news).await;
+                    last_call = Instant::now();
+                    if void {
+                        tracing::warn!(task = order.task, attempt = order.attempt, "the attempt is void, stopping");
+                        stop.store(true, Ordering::Relaxed);
+                    }
+                }
+            }
+        }
+    };
+    if !void {
+        while !news.is_empty() && tell(client, key, &mut news).await {}
+    }
+    if !void {
+        let result = result.unwrap_or_else(|error| {
+            let message = if error.is_panic() { panic_text(&*error.into_panic()) } else { error.to_string() };
+            Err(ExecuteError { message, is_input: false })
+        });
+        say_last_word(client, key, result, leaving).await;
+    }
+}
+
+fn order_of(grant: proto::Grant) -> Option<(proto::Attempt, TaskOrder)> {
+    let key = grant.attempt?;
+    let input = |input: &proto::Input| Some((input.task, proto::artefact_id(&input.artefact).ok()?));
+    let order = TaskOrder {
+        job: key.job,
+        plan: proto::artefact_id(&grant.plan).ok()?,
+        task: key.task,
+        attempt: key.number,
+        inputs: grant.inputs.iter().map(input).collect::<Option<_>>()?,
+    };
+    Some((key, order))
+}
+
+fn to_wire(report: Report) -> proto::Report {
+    let finite = |value: f64| if value.is_finite() { value } else { 0.0 };
+    proto::Report {
+        step: report.step,
+        steps: report.steps,
+        loss: Some(report.loss).filter(|loss| loss.is_finite()),
+        splats: report.splats,
+        cpu_seconds: finite(report.cpu_seconds),
+        wall_seconds: finite(report.wall_seconds),
+        psnr: report.psnr.filter(|psnr| psnr.is_finite()),
+    }
+}
+
+/// Sends the waiting news, or a mere sign of life. False if the attempt is void.
+async fn tell(client: &mut Client, key: proto::Attempt, news: &mut mpsc::Receiver<proto::Report>) -> bool {
+    let reports = std::iter::from_fn(|| news.try_recv().ok()).take(REPORTS_LIMIT).collect();
+    match client.report(proto::ReportRequest { attempt: Some(key), reports }).await {
+        Ok(reply) => !reply.into_inner().cancelled,
+        Err(status) => {
+            tracing::warn!(task = key.task, attempt = key.number, "no answer to a report: {}", status.message());
+            // A coordinator that does not know the job has forgotten it; any other trouble may pass.
+            status.code() != Code::NotFound
+        }
+    }
+}
+
+async fn say_last_word(
+    client: &mut Client,
+    key: proto::Attempt,
+    result: Result<scene::ArtefactId, ExecuteError>,
+    leaving: bool,
+) {
+    let mut backoff = Backoff::default();
+    for _ in 0..LAST_WORD_TRIES {
+        let answer = match &result {
+            Ok(artefact) => {
+                let artefact = artefact.0.to_vec();
+                client.complete(proto::CompleteRequest { attempt: Some(key), artefact }).await
+            }
+            Err(error) => {
+                let kind = match (leaving, error.is_input) {
+                    (true, _) => FailureKind::GivenBack,
+                    (false, true) => FailureKind::Input,
+                    (false, false) => FailureKind::Work,
+                };
+                let message = proto::one_line(&error.message);
+                client.fail(proto::FailRequest { attempt: Some(key), message, kind: kind.into() }).await
+            }
+        };
+        match answer {
+            Ok(reply) if reply.get_ref().accepted => return,
+            Ok(_) => return log(key, "the coordinator refuses the result of a stale attempt"),
+            Err(status) if is_passing(&status) => tokio::time::sleep(backoff.next()).await,
+            Err(status) => return log(key, status.message()),
+        }
+    }
+    log(key, Status::unavailable("the coordinator could not be told how it ended").message());
+}
+
+fn log(key: proto::Attempt, what: &str) {
+    tracing::warn!(job = key.job, task = key.task, attempt = key.number, "{what}");
+}
+
+fn panic_text(panic: &(dyn Any + Send)) -> String {
+    let text = panic.downcast_ref::<&str>().copied().or_else(|| panic.downcast_ref::<String>().map(String::as_str));
+    format!("panicked: {}", text.unwrap_or("without a message"))
+}

@@ -1,0 +1,286 @@
+//! Carries out a task: trains a block.
+//!
+//! ```text
+//! plan, capture, results of parent and context ──from the store──▶ initial splats and frozen context
+//!   ──train──▶ splats of the block, halo included ──to the store──▶ artefact
+//! ```
+//! Everything here follows from the plan and its inputs, so an attempt anywhere gives the same bytes.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use blocks::{Mode, Plan, Task, ViewUse};
+use dataset::windows::WindowReader;
+use glam::Vec3;
+use rayon::prelude::*;
+use render::Options;
+use render::cpu::{Isa, Renderer};
+use scene::{ArtefactId, BlockId, Capture, SparsePoints, Splats, frame};
+use store::BlockingStore;
+use train::{Recipe, TrainError, TrainView, metrics};
+
+use crate::clock::Stopwatch;
+use crate::{Execute, ExecuteError, Flow, Report, TaskOrder};
+
+/// Steps between two reports.
+const REPORT_EVERY: u32 = 10;
+
+/// What a worker may use, and what it is asked to measure.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct TrainerOptions {
+    /// Threads of the compute pool, at least 1.
+    pub threads: usize,
+    /// Steps between two evaluations on the task's test views; 0 = only at its end.
+    pub eval_every: u32,
+    /// Bound on the windows kept in memory.
+    pub cache_bytes: usize,
+}
+
+/// Trains blocks on the CPU backend.
+pub struct BlockTrainer {
+    store: BlockingStore,
+    options: TrainerOptions,
+    pool: rayon::ThreadPool,
+}
+
+/// The name of the backend that [`BlockTrainer`] runs on, instruction set included.
+pub fn backend() -> String {
+    format!("cpu-{}", Isa::detect().name())
+}
+
+impl BlockTrainer {
+    /// A trainer over this store.
+    ///
+    /// # Errors
+    /// The operating system refused the threads.
+    pub fn new(store: BlockingStore, options: TrainerOptions) -> Result<Self, String> {
+        let pool = rayon::ThreadPoolBuilder::new()
+            .num_threads(options.threads.max(1))
+            .build()
+            .map_err(|error| format!("cannot start {} threads: {error}", options.threads))?;
+        Ok(Self { store, options, pool })
+    }
+}
+
+impl Execute for BlockTrainer {
+    fn execute(
+        &self,
+        order: &TaskOrder,
+        report: &mut (dyn FnMut(Report) -> Flow + Send),
+    ) -> Result<ArtefactId, ExecuteError> {
+        let mut stopwatch = Stopwatch::start();
+        let plan = self.store.get(order.plan).map_err(failed)?;
+        let plan = Plan::from_frame(&plan).map_err(failed)?;
+        let task = plan.tasks.get(order.task as usize).ok_or_else(|| failed("the plan has no such task"))?;
+        let capture = Arc::new(dataset::ingest::load_capture(&self.store, plan.capture).map_err(failed)?);
+        let reader = WindowReader::new(capture.clone(), self.store.clone(), self.options.cache_bytes);
+        let results = self.results(&plan, task, order)?;
+        let block = Block { plan: &plan, task, capture: &capture, reader: &reader };
+        let splats = self.pool.install(|| block.train(results, self.options.eval_every, &mut stopwatch, report))?;
+        self.store.put(frame::encode_splats(&splats)).map_err(failed)
+    }
+}
+
+impl BlockTrainer {
+    /// The splats of the blocks that the task needs.
+    fn results(&self, plan: &Plan, task: &Task, order: &TaskOrder) -> Result<BTreeMap<BlockId, Splats>, ExecuteError> {
+        let mut results = BTreeMap::new();
+        for block in task.context_cut().blocks() {
+            let index = plan.tasks.iter().position(|t| t.block == block);
+            let id = index.and_then(|i| order.inputs.get(&(i as u32)));
+            let id = id.ok_or_else(|| failed(format!("the result of block {block} was not handed over")))?;
+            let bytes = self.store.get(*id).map_err(failed)?;
+            results.insert(block, frame::decode_splats(&bytes).map_err(failed)?);
+        }
+        Ok(results)
+    }
+}
+
+/// A block about to be trained.
+struct Block<'a> {
+    plan: &'a Plan,
+    task: &'a Task,
+    capture: &'a Capture,
+    reader: &'a WindowReader,
+}
+
+impl Block<'_> {
+    fn train(
+        &self,
+        results: BTreeMap<BlockId, Splats>,
+        eval_every: u32,
+        stopwatch: &mut Stopwatch,
+        report: &mut (dyn FnMut(Report) -> Flow + Send),
+    ) -> Result<Splats, ExecuteError> {
+        let task = self.task;
+        let recipe = self.recipe();
+        let views = self.windows(&task.views)?;
+        let test_views = self.windows(&task.test_views)?;
+        let (initial, context) = self.start(results, &views, &recipe)?;
+        let mut renderer = Renderer::default();
+        let counts = |p: Vec3| self.plan.ground.owns(task.block, p.as_dvec3());
+        let job = train::Job {
+            initial,
+            context: context.as_ref(),
+            views: &views,
+            counts: &counts,
+            budget: task.budget as usize,
+            steps: task.steps,
+            antialiased: self.plan.antialiased(),
+            seed: self.seed(),
+            size_bounds_metres: self.size_bounds_metres(),
+            recipe: &recipe,
+            source: self.reader,
+        };
+        let mut stopped = false;
+        let splats = train::train(job, &mut |now| {
+            let last = now.step == now.steps;
+            let evaluate = last || (eval_every > 0 && now.step.is_multiple_of(eval_every));
+            if !evaluate && !now.step.is_multiple_of(REPORT_EVERY) {
+                return train::Flow::Continue;
+            }
+            let (cpu_seconds, wall_seconds) = (stopwatch.cpu_seconds(), stopwatch.wall_seconds());
+            let measure = || self.psnr(&test_views, now.splats, context.as_ref(), &mut renderer);
+            let psnr = if evaluate { stopwatch.paused(measure) } else { None };
+            let flow = report(Report {
+                step: now.step.into(),
+                steps: now.steps.into(),
+                loss: now.loss,
+                splats: now.splats.len() as u64,
+                cpu_seconds,
+                wall_seconds,
+                psnr,
+            });
+            stopped |= flow == Flow::Stop && !last;
+            if stopped { train::Flow::Stop } else { train::Flow::Continue }
+        })
+        .map_err(|error| match error {
+            TrainError::NoViews | TrainError::Empty(_) => {
+                ExecuteError { message: format!("block {}: {error}", task.block), is_input: true }
+            }
+            TrainError::Source(_) => failed(error),
+        })?;
+        if stopped {
+            return Err(failed("stopped before its end, as asked"));
+        }
+        Ok(splats)
+    }
+
+    /// The recipe of the block's level: a child starts from splats that fit already, one mip coarser, so it needs no
+    /// coarse beginning, and moves less.
+    fn recipe(&self) -> Recipe {
+        if self.task.parent.is_some() { Recipe::refinement() } else { Recipe::default() }
+    }
+
+    fn seed(&self) -> u64 {
+        let BlockId { level, x, y } = self.task.block;
+        let place = u64::from(level) << 58 | u64::from(x) << 29 | u64::from(y);
+        train::random::bits(self.plan.settings.seed, place)
+    }
+
+    /// From a twentieth of a pixel of the block's level to twice the edge of the scene, which the backdrop needs.
+    fn size_bounds_metres(&self) -> [f32; 2] {
+        [self.task.rho_metres as f32 * 0.05, 2.0 * self.plan.ground.edge_metres as f32]
+    }
+
+    fn windows(&self, uses: &[ViewUse]) -> Result<Vec<TrainView>, ExecuteError> {
+        let window = |use_: &ViewUse| {
+            let view = self.capture.views.get(use_.view as usize);
+            let view = view.ok_or_else(|| failed(format!("the capture has no view {}", use_.view)))?;
+            Ok(TrainView { view: use_.view, mip: use_.mip, rect: use_.window, camera: view.camera })
+        };
+        uses.iter().map(window).collect()
+    }
+
+    /// The splats to train, and those to draw around them: from the parent and its neighbours, or from the points.
+    fn start(
+        &self,
+        results: BTreeMap<BlockId, Splats>,
+        views: &[TrainView],
+        recipe: &Recipe,
+    ) -> Result<(Splats, Option<Splats>), ExecuteError> {
+        let Self { plan, task, capture, .. } = self;
+        let sh_degree = plan.settings.sh_degree;
+        if results.is_empty() {
+            let all = plan.settings.mode != Mode::Flat;
+            let keep = |p: glam::DVec3| all || views.iter().any(|view| sees(view, p, 0.0));
+            let points = &capture.points;
+            let rows: Vec<usize> = (0..points.len()).filter(|&i| keep(points.positions[i])).collect();
+            let points = SparsePoints {
+                positions: rows.iter().map(|&i| points.positions[i]).collect(),
+                colours: rows.iter().map(|&i| points.colours[i]).collect(),
+                ..SparsePoints::default()
+            };
+            let sizes = self.size_bounds_metres();
+            let mut initial = train::init::from_points(&points, sh_degree, recipe.initial_opacity, sizes);
+            let (centre, radius) = self.surroundings(views);
+            initial.append(&train::init::backdrop(views, self.reader, sh_degree, centre, radius).map_err(failed)?);
+            return Ok((initial, None));
+        }
+        let cut = task.context_cut();
+        let mut initial = Splats::new(sh_degree);
+        let mut context = Splats::new(sh_degree);
+        for (block, splats) in results {
+            let splats = cut.keep(&splats, &plan.ground, block);
+            let inside = |i: usize| plan.ground.in_halo(task.block, splats.mean(i).as_dvec3());
+            initial.append(&splats.filter(inside));
+            // Only what a window can show is worth keeping in memory.
+            let shown: Vec<bool> = (0..splats.len())
+                .into_par_iter()
+                .map(|i| !inside(i) && views.iter().any(|view| sees(view, splats.mean(i).as_dvec3(), 0.2)))
+                .collect();
+            context.append(&splats.filter(|i| shown[i]));
+        }
+        let context = (!context.is_empty()).then_some(context);
+        Ok((initial, context))
+    }
+
+    /// Where the backdrop stands: around the cameras, five times as far as all but the farthest points.
+    fn surroundings(&self, views: &[TrainView]) -> (glam::DVec3, f64) {
+        let cameras = views.iter().map(|view| view.camera.centre());
+        let centre = cameras.clone().sum::<glam::DVec3>() / views.len().max(1) as f64;
+        let points = self.capture.points.positions.iter().copied();
+        let mut distances: Vec<f64> = points.chain(cameras).map(|p| p.distance(centre)).filter(|d| d.is_finite()).collect();
+        distances.sort_by(f64::total_cmp);
+        let far = distances.get(distances.len() * 98 / 100).copied().unwrap_or(1.0);
+        (centre, 5.0 * far.max(self.plan.ground.edge_metres * 0.5))
+    }
+
+    /// Mean PSNR over the test windows, dB; `None` without any, or where one cannot be read (training will say why).
+    fn psnr(
+        &self,
+        views: &[TrainView],
+        splats: &Splats,
+        context: Option<&Splats>,
+        renderer: &mut Renderer,
+    ) -> Option<f64> {
+        let options = Options { antialiased: self.plan.antialiased(), ..Options::default() };
+        let mut total = 0.0;
+        let mut count = 0;
+        for view in views {
+            let (mip, rect, camera) = view.at(0)?;
+            let photo = self.reader.window(view.view, mip, rect).ok()?;
+            let frame = renderer.forward(splats, context, &camera, &options);
+            let photo_values: Vec<f32> = photo.rgb.iter().map(|&v| f32::from(v) / 255.0).collect();
+            let render: Vec<f32> = frame.colour.iter().map(|v| v.clamp(0.0, 1.0)).collect();
+            if let Some(psnr) = metrics::psnr(&render, &photo_values, photo.mask.as_deref()) {
+                total += psnr;
+                count += 1;
+            }
+        }
+        (count > 0).then(|| total / f64::from(count))
+    }
+}
+
+/// Does a point project into the window, grown by `margin` of its size on every side?
+fn sees(view: &TrainView, point: glam::DVec3, margin: f64) -> bool {
+    let camera = view.camera.mip(view.mip).window(view.rect);
+    let (pixel, depth) = camera.project(point);
+    let (width, height) = (f64::from(view.rect.width), f64::from(view.rect.height));
+    let inside = |v: f64, size: f64| v >= -margin * size && v < size * (1.0 + margin);
+    depth > 0.0 && inside(pixel.x, width) && inside(pixel.y, height)
+}
+
+fn failed(error: impl ToString) -> ExecuteError {
+    ExecuteError { message: error.to_string(), is_input: false }
+}
