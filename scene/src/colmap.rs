@@ -166,11 +166,7 @@ fn camera(id: u32, model: &str, width: u64, height: u64, parameters: &[f64]) -> 
     }
 }
 
-fn insert(
-    cameras: &mut BTreeMap<u32, ColmapCamera>,
-    id: u32,
-    camera: ColmapCamera,
-) -> Result<(), CodecError> {
+fn insert(cameras: &mut BTreeMap<u32, ColmapCamera>, id: u32, camera: ColmapCamera) -> Result<(), CodecError> {
     match cameras.insert(id, camera) {
         Some(_) => Err(CodecError::new(format!("camera {id} is there twice"))),
         None => Ok(()),

@@ -62,8 +62,8 @@ impl Default for Recipe {
             opacity_pull: 0.0,
             needle_pull: 0.01,
             sh_from: [0.3, 0.45, 0.6],
-            coarse: vec![0.1, 0.2],
-            initial_opacity: 0.3,
+            coarse: vec![0.15, 0.3],
+            initial_opacity: 0.1,
             growth: Growth::default(),
         }
     }

@@ -5,7 +5,8 @@ use std::sync::Arc;
 use glam::{DMat3, DQuat, DVec3, Vec3};
 use render::Options;
 use render::cpu::Renderer;
-use scene::{Camera, Pinhole, Pixels, Rect, Rigid, SH_C0, Splat, Splats, column};
+use scene::{Camera, Pinhole, Pixels, Rect, Rigid, Splat, Splats, column};
+use scene::splats::SH_C0;
 use train::{Flow, Job, Recipe, TrainError, TrainView, WindowSource, metrics, random, train};
 
 const WIDTH: u32 = 64;
@@ -255,19 +256,22 @@ fn broken_numbers_at_the_start_are_survived() {
     let truth = cloud(5, 150, 0.8);
     let photos = photos(&truth);
     let good = perturbed(&truth);
-    let healthy = psnr(&Setup::new(good.clone(), &photos).run(), &photos, |_| true);
+    let wanted = [
+        column::MEAN,
+        column::MEAN + 2,
+        column::LOG_SCALE + 1,
+        column::QUAT,
+        column::QUAT + 3,
+        column::OPACITY,
+        column::SH,
+        column::SH + 5,
+    ];
+    // As if the broken rows had never been there.
+    let without = good.filter(|i| i % 16 != 7 || i / 16 >= wanted.len());
+    assert_eq!(without.len(), good.len() - wanted.len());
+    let healthy = psnr(&Setup { budget: good.len(), ..Setup::new(without, &photos) }.run(), &photos, |_| true);
     for value in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
         let mut initial = good.clone();
-        let wanted = [
-            column::MEAN,
-            column::MEAN + 2,
-            column::LOG_SCALE + 1,
-            column::QUAT,
-            column::QUAT + 3,
-            column::OPACITY,
-            column::SH,
-            column::SH + 5,
-        ];
         for (n, k) in wanted.into_iter().enumerate() {
             initial.columns_mut()[k][7 + 16 * n] = value;
         }
@@ -280,8 +284,9 @@ fn broken_numbers_at_the_start_are_survived() {
         let after = psnr(&fitted, &photos, |_| true);
         println!("{value}: {after:.2} dB instead of {healthy:.2}, {skipped} steps left out, {} splats", fitted.len());
         assert!(all_finite(&fitted), "{value}: broken rows are left");
-        assert!(after > healthy - 2.0, "{value}: {after} dB instead of {healthy}");
-        assert!(skipped < 120, "{value}: {skipped} steps were left out");
+        assert!(after > healthy - 3.0, "{value}: {after} dB instead of {healthy}");
+        // A row that makes the image infinite costs the steps up to the first refinement, no more.
+        assert!(skipped <= 50, "{value}: {skipped} steps were left out");
     }
 }
 

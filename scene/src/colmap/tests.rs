@@ -109,7 +109,8 @@ fn what_is_wrong_is_named() {
     let cameras = |line: &str| read_cameras_txt(line.as_bytes()).unwrap_err().to_string();
     let fisheye = cameras("1 OPENCV_FISHEYE 10 10 1 2 3 4 5 6 7 8");
     assert!(fisheye.contains("OPENCV_FISHEYE") && fisheye.contains("colmap image_undistorter"), "{fisheye}");
-    for bad in ["1 PINHOLE 10 10 1 2 3", "1 PINHOLE 0 10 1 1 1 1", "1 PINHOLE 10 10 -1 1 1 1", "1 PINHOLE 10 10 inf 1 1 1"]
+    for bad in
+        ["1 PINHOLE 10 10 1 2 3", "1 PINHOLE 0 10 1 1 1 1", "1 PINHOLE 10 10 -1 1 1 1", "1 PINHOLE 10 10 inf 1 1 1"]
     {
         assert!(cameras(bad).contains("camera 1"), "{bad}");
     }

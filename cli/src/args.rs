@@ -1,0 +1,358 @@
+//! The command line, as data. Options without a meaning yet are not accepted.
+
+use std::fmt;
+use std::path::PathBuf;
+use std::str::FromStr;
+
+use blocks::{Mode, PlanSettings};
+use clap::{Args, Parser, Subcommand, ValueEnum};
+use serde::{Serialize, Serializer};
+
+/// Trains Gaussian-splat models of whole cities from photos with poses.
+///
+/// Exit codes: 0 done; 1 the work failed; 2 bad usage or bad input, with one line that says what to do.
+#[derive(Debug, Parser)]
+#[command(name = "plat", version, args_override_self = true, disable_help_subcommand = true)]
+pub(crate) struct Cli {
+    /// What to do.
+    #[command(subcommand)]
+    pub(crate) command: Command,
+    /// Print one JSON object as the last line of stdout, and nothing else there
+    #[arg(long, global = true)]
+    pub(crate) json: bool,
+    /// No progress and no notes on stderr
+    #[arg(long, global = true)]
+    pub(crate) quiet: bool,
+    /// TOML file with options of the command, named as the flags are; flags win, unknown keys are refused
+    #[arg(long, global = true, value_name = "FILE")]
+    pub(crate) config: Option<PathBuf>,
+}
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum Command {
+    /// Build, train and look at a small synthetic city: the first thing to type
+    Demo(DemoArgs),
+    /// Say what is in a capture, how it would be divided, and what that would take
+    Inspect(InspectArgs),
+    /// Divide a capture into blocks, check the plan and draw it
+    Plan(PlanArgs),
+    /// Train a capture to a merged model
+    Train(TrainArgs),
+    /// Measure a model against a capture's held-out photos
+    Eval(EvalArgs),
+    /// Draw a model from the cameras of a capture or of a transforms.json
+    Render(RenderArgs),
+    /// Write a model in a format that other programs read
+    Export(ExportArgs),
+    /// Measure plat itself
+    #[command(subcommand)]
+    Bench(BenchCommand),
+}
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum BenchCommand {
+    /// Train with evaluations on the way, measure the result, and append it to the results
+    Pareto(ParetoArgs),
+    /// Redraw the chart and the README's table from all results
+    Chart(ChartArgs),
+    /// Time the renderer's forward and backward passes
+    Kernels(KernelsArgs),
+}
+
+/// A value, or `auto`: the program chooses.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub(crate) struct Auto<T>(pub(crate) Option<T>);
+
+impl<T: FromStr> FromStr for Auto<T> {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        match text {
+            "auto" => Ok(Self(None)),
+            text => text.parse().map(|value| Self(Some(value))).map_err(|_| "give a whole number or auto".into()),
+        }
+    }
+}
+
+impl<T: fmt::Display> fmt::Display for Auto<T> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match &self.0 {
+            Some(value) => value.fmt(f),
+            None => f.write_str("auto"),
+        }
+    }
+}
+
+impl<T: Serialize> Serialize for Auto<T> {
+    fn serialize<S: Serializer>(&self, to: S) -> Result<S::Ok, S::Error> {
+        match &self.0 {
+            Some(value) => value.serialize(to),
+            None => to.serialize_str("auto"),
+        }
+    }
+}
+
+/// Width and height in pixels, written `640x480`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Size {
+    pub(crate) width: u32,
+    pub(crate) height: u32,
+}
+
+/// Longest side of a picture that the program draws.
+const SIDE_LIMIT: u32 = 16_384;
+
+impl FromStr for Size {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let side = |text: &str| text.parse().ok().filter(|side| (1..=SIDE_LIMIT).contains(side));
+        let sides = text.split_once('x').and_then(|(w, h)| Some((side(w)?, side(h)?)));
+        let (width, height) = sides.ok_or_else(|| format!("give it as 640x480, sides from 1 to {SIDE_LIMIT}"))?;
+        Ok(Self { width, height })
+    }
+}
+
+/// How the scene is divided.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub(crate) enum Blocks {
+    /// Level-of-detail tree: blocks start from their parent, against their neighbours
+    Tree,
+    /// Only the leaves, each for itself from the sparse points
+    Flat,
+    /// One block
+    Whole,
+}
+
+/// What computes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub(crate) enum Backend {
+    /// The fastest there is
+    Auto,
+    /// SIMD and threads
+    Cpu,
+    /// Not in this version
+    Gpu,
+}
+
+/// Options that decide the plan.
+#[derive(Debug, Clone, Args, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub(crate) struct PlanOptions {
+    /// How the scene is divided
+    #[arg(long, value_enum, default_value = "tree")]
+    pub(crate) blocks: Blocks,
+    /// Levels below the root; auto chooses from extent, resolution, views and points
+    #[arg(long, value_name = "N|auto", default_value_t)]
+    pub(crate) levels: Auto<u8>,
+    /// Optimiser steps, counted in full images of the whole scene: every division costs about the same
+    #[arg(long, value_name = "N", default_value_t = 3000)]
+    pub(crate) steps: u32,
+    /// Splats of the merged model; auto takes two for each sparse point, from 20,000 to 2,000,000
+    #[arg(long, value_name = "N|auto", default_value_t)]
+    pub(crate) budget: Auto<u32>,
+    /// Seed of all random choices
+    #[arg(long, value_name = "S", default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=i64::MAX as u64))]
+    pub(crate) seed: u64,
+    /// Hold out every K-th view by name, starting with the first; 0 holds out none
+    #[arg(long, value_name = "K", default_value_t = 8)]
+    pub(crate) test_every: u32,
+    /// Use photos at one N-th of their size
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
+    pub(crate) downscale: u32,
+}
+
+impl PlanOptions {
+    /// The planner's settings for a capture with this many sparse points.
+    pub(crate) fn settings(&self, points: usize) -> PlanSettings {
+        let auto = || u32::try_from(2 * points).unwrap_or(u32::MAX).clamp(20_000, 2_000_000);
+        PlanSettings {
+            mode: match self.blocks {
+                Blocks::Tree => Mode::Tree,
+                Blocks::Flat => Mode::Flat,
+                Blocks::Whole => Mode::Whole,
+            },
+            levels: self.levels.0,
+            seed: self.seed,
+            steps: self.steps,
+            budget: self.budget.0.unwrap_or_else(auto),
+            test_every: self.test_every,
+            ..PlanSettings::default()
+        }
+    }
+}
+
+#[derive(Debug, Clone, Args)]
+pub(crate) struct DemoArgs {
+    /// Folder for the city and everything made of it
+    #[arg(long, value_name = "DIR", default_value = "out/demo")]
+    pub(crate) out: PathBuf,
+    /// A smaller city, trained for under a minute
+    #[arg(long)]
+    pub(crate) quick: bool,
+}
+
+#[derive(Debug, Clone, Args)]
+pub(crate) struct InspectArgs {
+    /// Folder of the capture: COLMAP or transforms.json
+    pub(crate) capture: PathBuf,
+    #[command(flatten)]
+    pub(crate) plan: PlanOptions,
+}
+
+#[derive(Debug, Clone, Args)]
+pub(crate) struct PlanArgs {
+    /// Folder of the capture: COLMAP or transforms.json
+    pub(crate) capture: PathBuf,
+    /// Write the plan as JSON
+    #[arg(long, value_name = "FILE")]
+    pub(crate) out: Option<PathBuf>,
+    /// Draw the plan over cameras and points
+    #[arg(long, value_name = "FILE")]
+    pub(crate) svg: Option<PathBuf>,
+    #[command(flatten)]
+    pub(crate) plan: PlanOptions,
+}
+
+#[derive(Debug, Clone, Args, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub(crate) struct TrainArgs {
+    /// Folder of the capture: COLMAP or transforms.json
+    #[serde(skip)]
+    pub(crate) capture: PathBuf,
+    /// Folder for the model and all that is said about it
+    #[arg(long, value_name = "DIR")]
+    #[serde(skip)]
+    pub(crate) out: PathBuf,
+    /// Store of photos and results: a folder or its file:// URL; by default the folder `store` under --out
+    #[arg(long, value_name = "URL")]
+    #[serde(skip)]
+    pub(crate) store: Option<String>,
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub(crate) plan: PlanOptions,
+    /// What computes
+    #[arg(long, value_enum, default_value = "auto")]
+    pub(crate) backend: Backend,
+    /// Blocks trained at the same time
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=1024))]
+    pub(crate) workers: u32,
+    /// Threads of each worker; auto shares out the cores
+    #[arg(long, value_name = "N|auto", default_value_t)]
+    pub(crate) threads: Auto<u32>,
+    /// Measure held-out PSNR every N steps of a task; 0 measures only at its end
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    pub(crate) eval_every: u32,
+}
+
+#[derive(Debug, Clone, Args)]
+pub(crate) struct EvalArgs {
+    /// Folder that `plat train` wrote, or a .ply
+    pub(crate) model: PathBuf,
+    /// Folder of the capture
+    pub(crate) capture: PathBuf,
+    /// Held out is every K-th view; by default as the model was trained, else 8
+    #[arg(long, value_name = "K", value_parser = clap::value_parser!(u32).range(1..))]
+    pub(crate) test_every: Option<u32>,
+    /// Use photos at one N-th of their size; by default as the model was trained, else 1
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    pub(crate) downscale: Option<u32>,
+    /// Folder for the contact sheet and the figures; by default `eval` beside the model
+    #[arg(long, value_name = "DIR")]
+    pub(crate) out: Option<PathBuf>,
+    /// Store of the photos; by default the model's own where it is there, else a temporary one
+    #[arg(long, value_name = "URL")]
+    pub(crate) store: Option<String>,
+}
+
+#[derive(Debug, Clone, Args)]
+pub(crate) struct RenderArgs {
+    /// Folder that `plat train` wrote, or a .ply
+    pub(crate) model: PathBuf,
+    /// Cameras to draw from: the folder of a capture, whose photos need not be there, or a transforms.json
+    #[arg(long, value_name = "CAPTURE|FILE")]
+    pub(crate) cameras: PathBuf,
+    /// Folder for the pictures
+    #[arg(long, value_name = "DIR")]
+    pub(crate) out: PathBuf,
+    /// Size of the pictures; by default that of each camera
+    #[arg(long, value_name = "WxH")]
+    pub(crate) size: Option<Size>,
+    /// Also write depth as <view>.depth.npy: float32, metres, 0 = nothing
+    #[arg(long)]
+    pub(crate) depth: bool,
+    /// Compensate opacity for the pixel's blur; by default as the model says
+    #[arg(long, overrides_with = "classic")]
+    pub(crate) antialiased: bool,
+    /// Draw as the original 3DGS rasterizer does; by default as the model says
+    #[arg(long, overrides_with = "antialiased")]
+    pub(crate) classic: bool,
+}
+
+/// A format that other programs read.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum Format {
+    /// INRIA's PLY, which every viewer and trainer reads
+    Ply,
+}
+
+#[derive(Debug, Clone, Args)]
+pub(crate) struct ExportArgs {
+    /// Folder that `plat train` wrote, or a .ply
+    pub(crate) model: PathBuf,
+    /// Format
+    #[arg(long, value_enum)]
+    pub(crate) to: Format,
+    /// File to write
+    #[arg(long, value_name = "PATH")]
+    pub(crate) out: PathBuf,
+}
+
+#[derive(Debug, Clone, Args)]
+pub(crate) struct ParetoArgs {
+    /// What the chart calls the run
+    #[arg(long)]
+    pub(crate) label: String,
+    /// What the chart calls the capture
+    #[arg(long)]
+    pub(crate) scene: String,
+    /// Folder of the result lines; this one goes to plat.jsonl there
+    #[arg(long, value_name = "DIR", default_value = "bench/results")]
+    pub(crate) results: PathBuf,
+    #[command(flatten)]
+    pub(crate) train: TrainArgs,
+}
+
+#[derive(Debug, Clone, Args)]
+pub(crate) struct ChartArgs {
+    /// Folder of the result lines; chart.svg goes there too
+    #[arg(long, value_name = "DIR", default_value = "bench/results")]
+    pub(crate) results: PathBuf,
+    /// File whose table between the markers is replaced
+    #[arg(long, value_name = "FILE", default_value = "README.md")]
+    pub(crate) readme: PathBuf,
+}
+
+#[derive(Debug, Clone, Args)]
+pub(crate) struct KernelsArgs {
+    /// Draw this model instead of random splats (needs --cameras)
+    #[arg(long, value_name = "MODEL", requires = "cameras", conflicts_with = "splats")]
+    pub(crate) model: Option<PathBuf>,
+    /// Cameras for --model: a capture or a transforms.json
+    #[arg(long, value_name = "CAPTURE|FILE", requires = "model")]
+    pub(crate) cameras: Option<PathBuf>,
+    /// Number of random splats
+    #[arg(long, value_name = "N", default_value_t = 12_000, value_parser = clap::value_parser!(u32).range(1..=50_000_000))]
+    pub(crate) splats: u32,
+    /// Size of the picture
+    #[arg(long, value_name = "WxH", default_value = "270x480")]
+    pub(crate) size: Size,
+    /// Threads
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=1024))]
+    pub(crate) threads: u32,
+    /// Passes to take the median of
+    #[arg(long, value_name = "N", default_value_t = 20, value_parser = clap::value_parser!(u32).range(1..=10_000))]
+    pub(crate) passes: u32,
+}

@@ -1,0 +1,117 @@
+//! `plat demo`: a small synthetic city from nothing to pictures.
+
+use std::path::PathBuf;
+
+use ::bench::{birdseye_camera, oblique_camera, write_png};
+use dataset::synth::{CitySettings, write_city};
+use ::render::cpu::Renderer;
+use glam::DVec3;
+use serde::Serialize;
+use store::Store;
+
+use crate::args::{Auto, Backend, Blocks, DemoArgs, PlanOptions, TrainArgs};
+use crate::commands::eval::evaluate;
+use crate::commands::render::to_image;
+use crate::commands::train::{Report, train};
+use crate::failure::Failure;
+use crate::model::save_json;
+use crate::output::Output;
+
+/// Width of the pictures from above, pixels.
+const PICTURE_WIDTH: u32 = 1200;
+
+#[derive(Serialize)]
+struct Shown {
+    command: &'static str,
+    #[serde(flatten)]
+    report: Report,
+    sheet: PathBuf,
+    birdseye: PathBuf,
+    oblique: PathBuf,
+    merged: PathBuf,
+}
+
+pub(crate) fn run(args: &DemoArgs, output: &Output) -> Result<(), Failure> {
+    let city_folder = args.out.join("city");
+    let (city, train_args) = settings(args);
+    output.note(format!("building a city of {:.0} m and taking {} photos of it", city.extent_metres, city.views));
+    let progress = output.progress("city", u64::from(city.views));
+    let built = write_city(&city_folder, &city, |done, _| progress.at(done as u64, ""))?;
+    drop(progress);
+    output.note(format!("{} solids, {} photos, {} sparse points", built.solids, built.views, built.points));
+
+    let trained = train(&train_args, output)?;
+    let store = Store::open(&args.out.join("store").display().to_string())?.blocking();
+    let eval_folder = args.out.join("eval");
+    let [birdseye, oblique] = ["birdseye.png", "oblique.png"].map(|name| args.out.join(name));
+    let (up, mut renderer) = (DVec3::Z, Renderer::default());
+    for (path, camera) in [
+        (&birdseye, birdseye_camera(&trained.capture, up, PICTURE_WIDTH)),
+        (&oblique, oblique_camera(&trained.capture, up, PICTURE_WIDTH)),
+    ] {
+        let frame = renderer.forward(&trained.model.splats, None, &camera, &trained.model.options());
+        write_png(path, &to_image(frame))?;
+    }
+    let evaluated =
+        evaluate(&trained.model, trained.capture, store, train_args.plan.test_every, &eval_folder, output)?;
+    save_json(&eval_folder.join("report.json"), &evaluated)?;
+
+    let mut report = trained.report;
+    (report.record.psnr, report.record.ssim, report.record.perceptual, report.record.fps) =
+        (evaluated.record.psnr, evaluated.record.ssim, evaluated.record.perceptual, evaluated.record.fps);
+    report.record.command = "demo";
+    let text = format!(
+        "a city of {:.0} m in {} splats and {} blocks, {:.1} dB PSNR and {:.3} SSIM on {} held-out photos,\n\
+         trained in {:.0} CPU seconds ({:.0} seconds)\n\n\
+         from above          {}\n\
+         from the south      {}\n\
+         photo|render|error  {}\n\
+         the plan            {}\n\
+         the model           {} (any splat viewer opens it)",
+        city.extent_metres,
+        report.record.splats,
+        report.tasks,
+        report.record.psnr.unwrap_or_default(),
+        report.record.ssim.unwrap_or_default(),
+        evaluated.views.len(),
+        report.record.cpu_seconds.unwrap_or_default(),
+        report.record.wall_seconds.unwrap_or_default(),
+        birdseye.display(),
+        oblique.display(),
+        evaluated.sheet.display(),
+        args.out.join("plan.svg").display(),
+        args.out.join("merged.ply").display(),
+    );
+    let merged = args.out.join("merged.ply");
+    let shown = Shown { command: "demo", report, sheet: evaluated.sheet, birdseye, oblique, merged };
+    output.result(&shown, &text)
+}
+
+/// The city and how it is trained.
+fn settings(args: &DemoArgs) -> (CitySettings, TrainArgs) {
+    let whole = CitySettings::default();
+    let (city, steps, budget) = if args.quick {
+        (CitySettings { extent_metres: 100.0, views: 64, width: 160, height: 112, ..whole }, 300, 12_000)
+    } else {
+        (whole, 6000, 80_000)
+    };
+    let train = TrainArgs {
+        capture: args.out.join("city"),
+        out: args.out.clone(),
+        store: None,
+        plan: PlanOptions {
+            blocks: Blocks::Tree,
+            levels: Auto(Some(1)),
+            steps,
+            budget: Auto(Some(budget)),
+            seed: 0,
+            test_every: 8,
+            downscale: 1,
+        },
+        backend: Backend::Auto,
+        workers: 1,
+        threads: Auto(None),
+        eval_every: 0,
+    };
+    (city, train)
+}

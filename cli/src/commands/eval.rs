@@ -1,0 +1,200 @@
+//! `plat eval`: a model against the held-out photos of a capture.
+//!
+//! Renders are compared as floats clamped to 0..1, not rounded to 8 bits; PSNR counts unmasked pixels only, and where
+//! a mask leaves pixels out the other measures see the photo there. The contact sheet shows 8-bit pictures.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use bench::{SheetRow, contact_sheet, write_png};
+use dataset::windows::WindowReader;
+use image::RgbImage;
+use ::render::cpu::Renderer;
+use scene::{BadInput, Capture, Pixels};
+use serde::Serialize;
+use store::{BlockingStore, Store};
+use train::metrics;
+
+use crate::args::EvalArgs;
+use crate::cameras;
+use crate::clock::{self, Stopwatch};
+use crate::commands::render::to_image;
+use crate::commands::train::{ingest_photos, make_folder};
+use crate::failure::Failure;
+use crate::model::{self, Model, save_json};
+use crate::output::Output;
+use crate::record::Record;
+
+/// Rows of a contact sheet at most; of more views, evenly many are shown.
+const SHEET_ROWS: usize = 24;
+/// Photos kept decoded.
+const CACHE_BYTES: usize = 16 << 20;
+
+/// `eval/report.json`.
+#[derive(Debug, Clone, Serialize)]
+pub(crate) struct Evaluated {
+    #[serde(flatten)]
+    pub(crate) record: Record,
+    pub(crate) sheet: PathBuf,
+    pub(crate) views: Vec<Figures>,
+}
+
+/// One held-out view.
+#[derive(Debug, Clone, Serialize)]
+pub(crate) struct Figures {
+    pub(crate) view: String,
+    /// dB; null where a mask leaves nothing.
+    pub(crate) psnr: Option<f64>,
+    pub(crate) ssim: f64,
+    /// SSIMULACRA2; null below 8 pixels a side.
+    pub(crate) perceptual: Option<f64>,
+}
+
+pub(crate) fn run(args: &EvalArgs, output: &Output) -> Result<(), Failure> {
+    let model = model::read(&args.model)?;
+    let source = cameras::open(&args.capture, output)?;
+    let (trained, default_every, default_downscale) = match &model.trained {
+        Some((manifest, out)) => (Some(out.join("store")), manifest.test_every, manifest.downscale),
+        None => (None, 8, 1),
+    };
+    // A store that is gone with the command, unless there is one already.
+    let temporary = tempfile::tempdir().map_err(|e| Failure::Work(format!("no temporary folder: {e}")))?;
+    let store = match (&args.store, trained.filter(|store| store.is_dir())) {
+        (Some(url), _) => Store::open(url)?,
+        (None, Some(folder)) => Store::open(&folder.display().to_string())?,
+        (None, None) => Store::open(&temporary.path().display().to_string())?,
+    };
+    let downscale = args.downscale.unwrap_or(default_downscale);
+    let ingested = ingest_photos(&source, &store.blocking(), downscale, output)?;
+    let out = args.out.clone().unwrap_or_else(|| model.folder(&args.model, "eval"));
+    let test_every = args.test_every.unwrap_or(default_every);
+    let mut evaluated = evaluate(&model, ingested.capture, store.blocking(), test_every, &out, output)?;
+    evaluated.record.scene = cameras::name_of(&args.capture);
+    evaluated.record.downscale = downscale;
+    save_json(&out.join("report.json"), &evaluated)?;
+    output.result(&evaluated, &text(&evaluated))
+}
+
+/// The figures as text, a line a view.
+pub(crate) fn text(evaluated: &Evaluated) -> String {
+    let line = |name: &str, psnr: Option<f64>, ssim: Option<f64>, perceptual: Option<f64>| {
+        let figure = |value: Option<f64>, digits: usize| value.map_or("-".into(), |v| format!("{v:.digits$}"));
+        format!("{:>8} {:>8} {:>8}  {name}\n", figure(psnr, 2), figure(ssim, 4), figure(perceptual, 2))
+    };
+    let mut text = format!("{:>8} {:>8} {:>8}\n", "PSNR", "SSIM", "SSIMULACRA2");
+    for view in &evaluated.views {
+        text += &line(&view.view, view.psnr, Some(view.ssim), view.perceptual);
+    }
+    let record = &evaluated.record;
+    text += &line("mean", record.psnr, record.ssim, record.perceptual);
+    text + &evaluated.sheet.display().to_string()
+}
+
+/// Draws every held-out view of an ingested capture and measures it; leaves the contact sheet under `out`.
+pub(crate) fn evaluate(
+    model: &Model,
+    capture: Capture,
+    store: BlockingStore,
+    test_every: u32,
+    out: &Path,
+    output: &Output,
+) -> Result<Evaluated, Failure> {
+    let held_out: Vec<u32> =
+        (0..capture.views.len()).filter(|&i| Capture::is_test(i, test_every)).map(|i| i as u32).collect();
+    if held_out.is_empty() {
+        return Err(BadInput::new("--test-every", "holds out no view", "give a number from 1 to that of views").into());
+    }
+    make_folder(out)?;
+    let reader = WindowReader::new(Arc::new(capture), store, CACHE_BYTES);
+    let mut renderer = Renderer::default();
+    let progress = output.progress("evaluating", held_out.len() as u64);
+    let shown_every = held_out.len().div_ceil(SHEET_ROWS);
+    let (mut views, mut rows) = (Vec::new(), Vec::new());
+    let mut drawing = Drawing::default();
+    for (i, &index) in held_out.iter().enumerate() {
+        let view = &reader.capture().views[index as usize];
+        let photo = reader.window(index, 0, view.camera.full()).map_err(|e| Failure::Work(e.to_string()))?;
+        let clock = Stopwatch::start();
+        let frame = renderer.forward(&model.splats, None, &view.camera, &model.options());
+        drawing.add(&clock);
+        let figures = measure(&view.name, &frame.colour, &photo);
+        if i.is_multiple_of(shown_every) {
+            rows.push(SheetRow {
+                label: view.name.clone(),
+                photo: photo_image(&photo),
+                render: to_image(frame),
+                psnr: figures.psnr,
+                ssim: Some(figures.ssim),
+                perceptual: figures.perceptual,
+            });
+        }
+        views.push(figures);
+        progress.at(i as u64 + 1, "");
+    }
+    drop(progress);
+    let sheet = out.join("sheet.png");
+    write_png(&sheet, &contact_sheet(&rows))?;
+    let record = Record {
+        backend: renderer.name(),
+        workers: 1,
+        threads: rayon::current_num_threads() as u32,
+        wall_seconds: Some(drawing.wall_seconds),
+        cpu_seconds: Some(drawing.cpu_seconds),
+        psnr: mean(views.iter().map(|view| view.psnr)),
+        ssim: mean(views.iter().map(|view| Some(view.ssim))),
+        perceptual: mean(views.iter().map(|view| view.perceptual)),
+        splats: model.splats.len() as u64,
+        fps: Some(views.len() as f64 / drawing.wall_seconds.max(1e-9)),
+        peak_memory_bytes: clock::peak_memory_bytes(),
+        ..Record::new("eval")
+    };
+    Ok(Evaluated { record, sheet, views })
+}
+
+/// Time that drawing took.
+#[derive(Debug, Default)]
+struct Drawing {
+    cpu_seconds: f64,
+    wall_seconds: f64,
+}
+
+impl Drawing {
+    fn add(&mut self, clock: &Stopwatch) {
+        self.cpu_seconds += clock.cpu_seconds();
+        self.wall_seconds += clock.wall_seconds();
+    }
+}
+
+fn measure(name: &str, colour: &[f32], photo: &Pixels) -> Figures {
+    let truth: Vec<f32> = photo.rgb.iter().map(|&value| f32::from(value) / 255.0).collect();
+    let mut render: Vec<f32> = colour.iter().map(|value| value.clamp(0.0, 1.0)).collect();
+    let psnr = metrics::psnr(&render, &truth, photo.mask.as_deref());
+    if let Some(mask) = &photo.mask {
+        for (i, value) in render.iter_mut().enumerate() {
+            if mask[i % mask.len()] < 128 {
+                *value = truth[i];
+            }
+        }
+    }
+    let (width, height) = (photo.width as usize, photo.height as usize);
+    Figures {
+        view: name.to_owned(),
+        psnr,
+        ssim: metrics::ssim(&render, &truth, width, height),
+        perceptual: metrics::ssimulacra2(&truth, &render, width, height),
+    }
+}
+
+/// Mean of what there is.
+fn mean(values: impl Iterator<Item = Option<f64>>) -> Option<f64> {
+    let (sum, count) = values.flatten().fold((0.0, 0), |(sum, count), value| (sum + value, count + 1));
+    (count > 0).then(|| sum / f64::from(count))
+}
+
+fn photo_image(photo: &Pixels) -> RgbImage {
+    let area = photo.area();
+    RgbImage::from_fn(photo.width, photo.height, |x, y| {
+        let at = y as usize * photo.width as usize + x as usize;
+        image::Rgb([photo.rgb[at], photo.rgb[area + at], photo.rgb[2 * area + at]])
+    })
+}

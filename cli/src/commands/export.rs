@@ -1,0 +1,39 @@
+//! `plat export`: a model in a format that other programs read.
+
+use std::path::Path;
+
+use serde::Serialize;
+
+use crate::args::{ExportArgs, Format};
+use crate::commands::train::make_folder;
+use crate::failure::Failure;
+use crate::model;
+use crate::output::Output;
+
+#[derive(Serialize)]
+struct Exported<'a> {
+    command: &'static str,
+    out: &'a Path,
+    splats: usize,
+    bytes: u64,
+    antialiased: bool,
+}
+
+pub(crate) fn run(args: &ExportArgs, output: &Output) -> Result<(), Failure> {
+    let model = model::read(&args.model)?;
+    let bytes = match args.to {
+        Format::Ply => model.to_ply(),
+    };
+    if let Some(folder) = args.out.parent().filter(|folder| !folder.as_os_str().is_empty()) {
+        make_folder(folder)?;
+    }
+    model::save(&args.out, &bytes)?;
+    let exported = Exported {
+        command: "export",
+        out: &args.out,
+        splats: model.splats.len(),
+        bytes: bytes.len() as u64,
+        antialiased: model.antialiased,
+    };
+    output.result(&exported, &format!("{} splats, {} bytes\n{}", exported.splats, bytes.len(), args.out.display()))
+}

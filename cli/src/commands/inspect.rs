@@ -1,0 +1,141 @@
+//! `plat inspect`: what is in a capture, how it would be divided, and what that would take.
+
+use std::collections::BTreeMap;
+
+use blocks::Plan;
+use scene::{Capture, GeoOrigin};
+use serde::Serialize;
+
+use crate::args::InspectArgs;
+use crate::commands::plan::{describe, plan_of};
+use crate::failure::Failure;
+use crate::output::Output;
+use crate::{cameras, commands::train::check_plan};
+
+/// CPU seconds of one pixel in one training step, and of one splat in one step, as measured on the bench's captures on a
+/// 2.5 GHz AVX-512 core. An estimate for people: a plan does not depend on it.
+const CPU_SECONDS_PER_PIXEL: f64 = 0.35e-6;
+const CPU_SECONDS_PER_SPLAT: f64 = 0.6e-6;
+
+/// What a plan would take.
+#[derive(Debug, Clone, Copy, Serialize)]
+pub(crate) struct Estimate {
+    /// All tasks, on the CPU backend.
+    pub(crate) cpu_seconds: f64,
+    /// The largest task.
+    pub(crate) memory_bytes: u64,
+}
+
+impl Estimate {
+    pub(crate) fn of(plan: &Plan) -> Self {
+        let seconds = plan.tasks.iter().map(|task| {
+            let pixels = task.window_pixels() as f64 / task.views.len().max(1) as f64;
+            f64::from(task.steps) * (CPU_SECONDS_PER_PIXEL * pixels + CPU_SECONDS_PER_SPLAT * f64::from(task.budget))
+        });
+        let memory_bytes = plan.tasks.iter().map(|task| task.memory_bytes).max().unwrap_or(0);
+        Self { cpu_seconds: seconds.sum(), memory_bytes }
+    }
+}
+
+#[derive(Serialize)]
+struct Inspected {
+    command: &'static str,
+    scene: String,
+    format: &'static str,
+    views: usize,
+    /// Number of views of each size, as `width`x`height`.
+    sizes: BTreeMap<String, usize>,
+    masked: usize,
+    points: usize,
+    /// Mean number of views per point; null without tracks.
+    mean_track: Option<f64>,
+    left_out: Vec<(String, String)>,
+    /// Along the ground's axes and up, 1st to 99th percentile of the points.
+    extent_metres: [f64; 3],
+    geo_origin: Option<GeoOrigin>,
+    levels: Option<u8>,
+    tasks: Option<usize>,
+    estimate: Option<Estimate>,
+    /// Why it cannot be trained; null if it can.
+    problem: Option<String>,
+}
+
+pub(crate) fn run(args: &InspectArgs, output: &Output) -> Result<(), Failure> {
+    let source = cameras::open(&args.capture, &Output::new(false, true))?;
+    let planned = plan_of(&source.capture, &args.plan);
+    let planned = planned.and_then(|(capture, plan)| {
+        check_plan(&plan, &capture, output)?;
+        Ok(plan)
+    });
+    let capture = &source.capture;
+    let mut sizes = BTreeMap::new();
+    for view in &capture.views {
+        let k = &view.camera.pinhole;
+        *sizes.entry(format!("{}x{}", k.width, k.height)).or_default() += 1;
+    }
+    let points = &capture.points;
+    let mean_track =
+        (!points.track_start.is_empty() && !points.is_empty()).then(|| points.seen_by.len() as f64 / points.len() as f64);
+    let inspected = Inspected {
+        command: "inspect",
+        scene: cameras::name_of(&args.capture),
+        format: source.format,
+        views: capture.views.len(),
+        sizes,
+        masked: source.photos.iter().filter(|photo| photo.mask.is_some()).count(),
+        points: points.len(),
+        mean_track,
+        left_out: source.left_out,
+        extent_metres: extent_metres(capture),
+        geo_origin: capture.geo_origin,
+        levels: planned.as_ref().ok().map(|plan| plan.levels),
+        tasks: planned.as_ref().ok().map(|plan| plan.tasks.len()),
+        estimate: planned.as_ref().ok().map(Estimate::of),
+        problem: planned.as_ref().err().map(Failure::to_string),
+    };
+    output.result(&inspected, &text(&inspected, planned.ok().as_ref()))
+}
+
+fn text(found: &Inspected, plan: Option<&Plan>) -> String {
+    let sizes: Vec<String> = found.sizes.iter().map(|(size, n)| format!("{n} of {size}")).collect();
+    let [x, y, z] = found.extent_metres;
+    let mut text = format!("{}: {}, {} views ({})", found.scene, found.format, found.views, sizes.join(", "));
+    if found.masked > 0 {
+        text += &format!(", {} with masks", found.masked);
+    }
+    text += &format!("\n{} points", found.points);
+    if let Some(track) = found.mean_track {
+        text += &format!(", each seen by {track:.1} views");
+    }
+    text += &format!(", over {x:.1} × {y:.1} m, {z:.1} m high\n");
+    text += &match found.geo_origin {
+        Some(at) => format!(
+            "origin at {:.6}° north, {:.6}° east, {:.1} m\n",
+            at.latitude_degrees, at.longitude_degrees, at.altitude_metres
+        ),
+        None => "no geographic origin: lengths are in the capture's own unit\n".into(),
+    };
+    for (name, why) in &found.left_out {
+        text += &format!("left out {name}: {why}\n");
+    }
+    match (plan, &found.problem) {
+        (Some(plan), _) => text += &describe(plan),
+        (None, Some(problem)) => text += &format!("cannot be trained: {problem}\n"),
+        (None, None) => {}
+    }
+    text
+}
+
+/// Extent of the points along the ground's axes and up, outliers left out.
+fn extent_metres(capture: &Capture) -> [f64; 3] {
+    let ground = blocks::Ground::of(capture);
+    let points: Vec<_> =
+        capture.points.positions.iter().filter(|p| p.is_finite()).map(|&p| ground.from_world(p)).collect();
+    std::array::from_fn(|axis| {
+        let mut values: Vec<f64> = points.iter().map(|p| p[axis]).collect();
+        values.sort_by(f64::total_cmp);
+        let Some(last) = values.len().checked_sub(1) else { return 0.0 };
+        let at = |share: f64| values[(share * last as f64).round() as usize];
+        at(0.99) - at(0.01)
+    })
+}

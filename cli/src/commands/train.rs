@@ -1,0 +1,225 @@
+//! `plat train`: capture → ingest → plan → train the blocks → merge. A coordinator and its workers run in this process,
+//! over the same wire as anywhere else.
+
+use std::fs;
+use std::path::Path;
+use std::sync::Arc;
+
+use bench::CurvePoint;
+use blocks::{Plan, Severity};
+use coordinator::{LocalError, run_local};
+use dataset::ingest::{IngestOptions, Ingested, ingest};
+use dataset::open::Source;
+use scene::{ArtefactId, BadInput, Capture};
+use serde::Serialize;
+use store::{BlockingStore, Store};
+use tokio_util::sync::CancellationToken;
+use worker::execute::{BlockTrainer, TrainerOptions};
+
+use crate::args::{Backend, TrainArgs};
+use crate::clock::{self, Stopwatch};
+use crate::failure::{Failure, cannot};
+use crate::model::{self, Model, save, save_json};
+use crate::output::Output;
+use crate::record::Record;
+use crate::{cameras, config, journal::Journal};
+
+/// Windows of photos that each worker keeps decoded; the planner's estimate of memory counts on it.
+const CACHE_BYTES: usize = 128 << 20;
+
+/// What training left in memory.
+pub(crate) struct Trained {
+    pub(crate) capture: Capture,
+    pub(crate) model: Model,
+    pub(crate) report: Report,
+    /// Held-out PSNR on the way; only its end is known where the plan has several tasks.
+    pub(crate) curve: Vec<CurvePoint>,
+}
+
+/// `report.json`.
+#[derive(Debug, Clone, Serialize)]
+pub(crate) struct Report {
+    #[serde(flatten)]
+    pub(crate) record: Record,
+    pub(crate) plan: ArtefactId,
+    pub(crate) capture: ArtefactId,
+    pub(crate) tasks: usize,
+    pub(crate) levels: u8,
+    pub(crate) antialiased: bool,
+    pub(crate) ingest_cpu_seconds: f64,
+}
+
+pub(crate) fn run(args: &TrainArgs, output: &Output) -> Result<(), Failure> {
+    let trained = train(args, output)?;
+    let Report { record, tasks, .. } = &trained.report;
+    let psnr = record.psnr.map_or(String::new(), |psnr| format!(", {psnr:.2} dB held out"));
+    let text = format!(
+        "{} splats in {tasks} block{}{psnr}, {:.1} CPU seconds, {:.1} seconds\n{}",
+        record.splats,
+        if *tasks == 1 { "" } else { "s" },
+        record.cpu_seconds.unwrap_or_default(),
+        record.wall_seconds.unwrap_or_default(),
+        args.out.join("merged.ply").display(),
+    );
+    output.result(&trained.report, &text)
+}
+
+/// Trains and writes everything under `--out`.
+pub(crate) fn train(args: &TrainArgs, output: &Output) -> Result<Trained, Failure> {
+    check_backend(args.backend)?;
+    let mut clock = Stopwatch::start();
+    let source = cameras::open(&args.capture, output)?;
+    fs::create_dir_all(&args.out).map_err(cannot("made", &args.out))?;
+    let store_url = args.store.clone().unwrap_or_else(|| args.out.join("store").display().to_string());
+    let store = Store::open(&store_url)?;
+    let threads = threads_of(args);
+    let ingested = ingest_photos(&source, &store.blocking(), args.plan.downscale, output)?;
+    let ingest_cpu_seconds = clock.cpu_seconds();
+
+    let Ingested { capture, id: capture_id, .. } = ingested;
+    let mut resolved = args.clone();
+    let settings = args.plan.settings(capture.points.len());
+    (resolved.plan.budget.0, resolved.threads.0) = (Some(settings.budget), Some(threads));
+    let (config_text, config_hash) = config::resolved(&resolved);
+    save(&args.out.join("config.toml"), config_text.as_bytes())?;
+
+    let plan = blocks::plan(&capture, capture_id, &settings, &worker::execute::backend())?;
+    check_plan(&plan, &capture, output)?;
+    save_json(&args.out.join("plan.json"), &plan)?;
+    save(&args.out.join("plan.svg"), blocks::draw(&plan, &capture).as_bytes())?;
+    let plan_id = store.blocking().put(plan.to_frame())?;
+
+    let progress = output.progress("training", plan.tasks.iter().map(|task| u64::from(task.steps)).sum());
+    let mut journal = Journal::create(&args.out.join("metrics.jsonl"), &plan, args.workers, clock.clone(), &progress)?;
+    let outcome = train_blocks(args, threads, &store, plan_id, &mut journal, output);
+    let spent = journal.close()?;
+    drop(progress);
+    let results = outcome?;
+
+    clock = Stopwatch::start();
+    let model = model::write(&args.out, &plan, &results, &store.blocking(), capture.geo_origin, args.plan.downscale)?;
+    let bytes = fs::metadata(args.out.join("merged.ply")).ok().map(|file| file.len());
+    let record = Record {
+        scene: cameras::name_of(&args.capture),
+        downscale: args.plan.downscale,
+        config_hash: Some(config_hash.to_string()),
+        backend: plan.backend.clone(),
+        workers: args.workers,
+        threads,
+        wall_seconds: Some(spent.wall_seconds + clock.wall_seconds()),
+        cpu_seconds: Some(spent.cpu_seconds + clock.cpu_seconds()),
+        psnr: if plan.tasks.len() == 1 { spent.last_psnr } else { None },
+        splats: model.splats.len() as u64,
+        bytes,
+        peak_memory_bytes: clock::peak_memory_bytes(),
+        seed: Some(args.plan.seed),
+        ..Record::new("train")
+    };
+    let report = Report {
+        record,
+        plan: plan_id,
+        capture: capture_id,
+        tasks: plan.tasks.len(),
+        levels: plan.levels,
+        antialiased: model.antialiased,
+        ingest_cpu_seconds,
+    };
+    save_json(&args.out.join("report.json"), &report)?;
+    let curve = if plan.tasks.len() == 1 { spent.curve } else { Vec::new() };
+    Ok(Trained { capture, model, report, curve })
+}
+
+fn check_backend(backend: Backend) -> Result<(), BadInput> {
+    match backend {
+        Backend::Auto | Backend::Cpu => Ok(()),
+        Backend::Gpu => {
+            Err(BadInput::new("--backend", "the GPU backend is not in this version", "give --backend cpu or auto"))
+        }
+    }
+}
+
+/// Threads of each worker.
+fn threads_of(args: &TrainArgs) -> u32 {
+    let cores = std::thread::available_parallelism().map_or(1, |n| n.get() as u32);
+    args.threads.0.unwrap_or(cores / args.workers).max(1)
+}
+
+/// Photos to artefacts, with progress.
+pub(crate) fn ingest_photos(
+    source: &Source,
+    store: &BlockingStore,
+    downscale: u32,
+    output: &Output,
+) -> Result<Ingested, Failure> {
+    let threads = std::thread::available_parallelism().map_or(1, usize::from);
+    let progress = output.progress("photos", source.photos.len() as u64);
+    Ok(ingest(source, store, &IngestOptions { downscale, threads }, &|done, _| progress.at(done as u64, ""))?)
+}
+
+/// Says what the linter finds; errors refuse the plan.
+pub(crate) fn check_plan(plan: &Plan, capture: &Capture, output: &Output) -> Result<(), Failure> {
+    let findings = blocks::lint(plan, capture);
+    for warning in findings.iter().filter(|finding| finding.severity == Severity::Warning) {
+        output.note(warning);
+    }
+    let errors: Vec<_> = findings.iter().filter(|finding| finding.severity == Severity::Error).collect();
+    let Some(first) = errors.first() else { return Ok(()) };
+    let more = if errors.len() > 1 { format!(" (and {} more)", errors.len() - 1) } else { String::new() };
+    Err(Failure::Input(format!("the plan cannot run: {first}{more}; plat plan shows all, other --levels may help")))
+}
+
+/// Runs the plan on workers in this process; Ctrl-C cancels the job.
+fn train_blocks(
+    args: &TrainArgs,
+    threads: u32,
+    store: &Store,
+    plan: ArtefactId,
+    journal: &mut Journal,
+    output: &Output,
+) -> Result<Vec<ArtefactId>, Failure> {
+    let options =
+        TrainerOptions { threads: threads as usize, eval_every: args.eval_every, cache_bytes: CACHE_BYTES };
+    let trainers = (0..args.workers)
+        .map(|_| BlockTrainer::new(store.blocking(), options).map(Arc::new))
+        .collect::<Result<Vec<_>, _>>()
+        .map_err(Failure::Work)?;
+    let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build();
+    let runtime = runtime.map_err(|error| Failure::Work(format!("cannot start threads: {error}")))?;
+    let start_worker = |coordinator_url, number: usize, shutdown| {
+        let backend = worker::execute::backend();
+        let options = worker::Options { coordinator_url, worker_id: format!("local-{number}"), backend };
+        worker::run(options, trainers[number].clone(), shutdown)
+    };
+    let result = runtime.block_on(async {
+        let stop = CancellationToken::new();
+        let interrupted = tokio::spawn(interruption(stop.clone(), *output));
+        let hosting = coordinator::Options::new(store.clone());
+        let news = |news: &_| journal.note(news);
+        let result = run_local(hosting, plan, trainers.len(), start_worker, news, stop).await;
+        interrupted.abort();
+        result
+    });
+    result.map_err(|error| match error {
+        LocalError::Cancelled => Failure::Work(format!(
+            "stopped as asked; photos and finished blocks stay in {}, the same command makes use of the photos",
+            store.url()
+        )),
+        other => other.into(),
+    })
+}
+
+/// The first Ctrl-C stops the job, the second the program.
+async fn interruption(stop: CancellationToken, output: Output) {
+    if tokio::signal::ctrl_c().await.is_ok() {
+        output.note("stopping; Ctrl-C again to leave at once");
+        stop.cancel();
+        if tokio::signal::ctrl_c().await.is_ok() {
+            std::process::exit(1);
+        }
+    }
+}
+
+/// A folder for `what` that exists.
+pub(crate) fn make_folder(path: &Path) -> Result<(), Failure> {
+    fs::create_dir_all(path).map_err(cannot("made", path))
+}

@@ -1,0 +1,75 @@
+//! How a command ends when it does not succeed, in one line.
+
+use blocks::PlanError;
+use coordinator::LocalError;
+use dataset::ingest::IngestError;
+use scene::BadInput;
+use store::StoreError;
+
+/// Why a command did not do what it was asked.
+#[derive(Debug)]
+pub(crate) enum Failure {
+    /// Bad usage or bad input: exit code 2.
+    Input(String),
+    /// The work failed: exit code 1.
+    Work(String),
+}
+
+impl Failure {
+    pub(crate) fn exit_code(&self) -> u8 {
+        match self {
+            Self::Input(_) => 2,
+            Self::Work(_) => 1,
+        }
+    }
+}
+
+impl std::fmt::Display for Failure {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let (Self::Input(text) | Self::Work(text)) = self;
+        // Whatever a file or a library put into the text, it stays one printable line.
+        f.write_str(&proto::one_line(text))
+    }
+}
+
+impl From<BadInput> for Failure {
+    fn from(error: BadInput) -> Self {
+        Self::Input(error.to_string())
+    }
+}
+
+impl From<PlanError> for Failure {
+    fn from(error: PlanError) -> Self {
+        Self::Input(error.to_string())
+    }
+}
+
+impl From<StoreError> for Failure {
+    fn from(error: StoreError) -> Self {
+        Self::Work(error.to_string())
+    }
+}
+
+impl From<IngestError> for Failure {
+    fn from(error: IngestError) -> Self {
+        match error {
+            IngestError::BadInput(error) => error.into(),
+            IngestError::Store(error) => error.into(),
+        }
+    }
+}
+
+impl From<LocalError> for Failure {
+    fn from(error: LocalError) -> Self {
+        match error {
+            LocalError::Input(line) => Self::Input(line),
+            other => Self::Work(other.to_string()),
+        }
+    }
+}
+
+/// For `map_err` on what the operating system refuses: the file, what could not be done with it, and why.
+pub(crate) fn cannot<E: std::fmt::Display>(action: &str, path: &std::path::Path) -> impl Fn(E) -> Failure {
+    let (action, path) = (action.to_owned(), path.display().to_string());
+    move |error| Failure::Work(format!("{path}: cannot be {action}: {error}; check the folder and the space on the disk"))
+}

@@ -1,0 +1,55 @@
+//! `plat`: photos in, merged city out.
+//!
+//! Parses the command line, runs the command, and says with the exit code how it went: 0 done, 1 the work failed,
+//! 2 bad usage or bad input. Results go to stdout, everything else to stderr.
+
+mod args;
+mod cameras;
+mod clock;
+mod commands;
+mod config;
+mod failure;
+mod journal;
+mod model;
+mod output;
+mod record;
+
+use std::process::ExitCode;
+
+use args::{BenchCommand, Command};
+use failure::Failure;
+use output::Output;
+
+fn main() -> ExitCode {
+    let cli = match config::parse(std::env::args_os().collect()) {
+        Ok(cli) => cli,
+        Err(config::Stop::Shown(text)) => {
+            output::print(&text);
+            return ExitCode::SUCCESS;
+        }
+        Err(config::Stop::Usage(line)) => return fail(&Failure::Input(line)),
+    };
+    if std::env::var_os("RUST_LOG").is_some() {
+        let filter = tracing_subscriber::EnvFilter::from_default_env();
+        tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
+    }
+    let output = Output::new(cli.json, cli.quiet);
+    let done = match &cli.command {
+        Command::Demo(args) => commands::demo::run(args, &output),
+        Command::Inspect(args) => commands::inspect::run(args, &output),
+        Command::Plan(args) => commands::plan::run(args, &output),
+        Command::Train(args) => commands::train::run(args, &output),
+        Command::Eval(args) => commands::eval::run(args, &output),
+        Command::Render(args) => commands::render::run(args, &output),
+        Command::Export(args) => commands::export::run(args, &output),
+        Command::Bench(BenchCommand::Pareto(args)) => commands::bench::pareto(args, &output),
+        Command::Bench(BenchCommand::Chart(args)) => commands::bench::chart(args, &output),
+        Command::Bench(BenchCommand::Kernels(args)) => commands::kernels::run(args, &output),
+    };
+    done.map_or_else(|failure| fail(&failure), |()| ExitCode::SUCCESS)
+}
+
+fn fail(failure: &Failure) -> ExitCode {
+    output::complain(&failure.to_string());
+    ExitCode::from(failure.exit_code())
+}

@@ -1,0 +1,211 @@
+//! MODEL: the directory that `plat train` wrote, or a `.ply`.
+//!
+//! ```text
+//! OUT/model/model.json          what the model is, written last
+//! OUT/model/plan.plat           the plan, as a frame: ground, tree, who owns what
+//! OUT/model/blocks/L-x-y.plat   the splats of one block, halo included, as a frame
+//! OUT/merged.ply                the finest cut, sewn together
+//! ```
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use blocks::{Ground, Plan};
+use scene::{ArtefactId, BadInput, BlockId, CodecError, GeoOrigin, Splats, frame, ply};
+use serde::{Deserialize, Serialize};
+use store::BlockingStore;
+
+use crate::failure::{Failure, cannot};
+
+/// The version of [`Manifest`] that this program writes and reads.
+const VERSION: u32 = 1;
+/// Said in a PLY's comments of a model that is to be drawn anti-aliased.
+const ANTIALIASED: &str = "antialiased";
+const PLAN_FILE: &str = "plan.plat";
+
+/// `model.json`.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub(crate) struct Manifest {
+    pub(crate) version: u32,
+    /// The plan that it was trained by.
+    pub(crate) plan: ArtefactId,
+    /// Draw with opacity compensated for the pixel's blur.
+    pub(crate) antialiased: bool,
+    pub(crate) sh_degree: u8,
+    pub(crate) geo_origin: Option<GeoOrigin>,
+    pub(crate) ground: Ground,
+    /// Every how many views one was held out; 0 = none.
+    pub(crate) test_every: u32,
+    /// Photos were used at one over this of their size.
+    pub(crate) downscale: u32,
+    /// Splats of the finest cut.
+    pub(crate) splats: u64,
+    /// By (level, y, x).
+    pub(crate) blocks: Vec<Block>,
+}
+
+/// A block of the tree.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub(crate) struct Block {
+    pub(crate) block: BlockId,
+    /// Hash of the block's frame.
+    pub(crate) artefact: ArtefactId,
+    /// Splats with the halo's.
+    pub(crate) splats: u64,
+}
+
+/// A model in memory.
+#[derive(Debug)]
+pub(crate) struct Model {
+    /// The finest cut.
+    pub(crate) splats: Splats,
+    pub(crate) antialiased: bool,
+    /// Of a trained model: its manifest and the folder that `plat train` wrote.
+    pub(crate) trained: Option<(Manifest, PathBuf)>,
+}
+
+impl Model {
+    /// How the model is drawn.
+    pub(crate) fn options(&self) -> render::Options {
+        render::Options { antialiased: self.antialiased, sh_degree: self.splats.sh_degree(), ..Default::default() }
+    }
+
+    /// As an INRIA PLY.
+    pub(crate) fn to_ply(&self) -> Vec<u8> {
+        let comments: &[&str] = if self.antialiased { &[ANTIALIASED] } else { &[] };
+        ply::write(&self.splats, comments)
+    }
+
+    /// The folder for what is said about it.
+    pub(crate) fn folder(&self, path: &Path, what: &str) -> PathBuf {
+        match &self.trained {
+            Some((_, out)) => out.join(what),
+            None => path.with_file_name(format!("{}-{what}", path.file_stem().unwrap_or_default().to_string_lossy())),
+        }
+    }
+}
+
+/// Writes the results of all tasks of a plan, in its order, under `out`, and returns the sewn model.
+pub(crate) fn write(
+    out: &Path,
+    plan: &Plan,
+    results: &[ArtefactId],
+    store: &BlockingStore,
+    geo_origin: Option<GeoOrigin>,
+    downscale: u32,
+) -> Result<Model, Failure> {
+    let folder = out.join("model");
+    let manifest_path = folder.join("model.json");
+    // An older model is no longer one from here on.
+    if manifest_path.exists() {
+        fs::remove_dir_all(&folder).map_err(cannot("replaced", &folder))?;
+    }
+    let blocks_folder = folder.join("blocks");
+    fs::create_dir_all(&blocks_folder).map_err(cannot("made", &blocks_folder))?;
+    save(&folder.join(PLAN_FILE), &plan.to_frame())?;
+
+    let mut blocks = Vec::new();
+    let splats = sew(plan, |block| -> Result<_, Failure> {
+        let index = plan.tasks.iter().position(|task| task.block == block);
+        let artefact = *index.and_then(|i| results.get(i)).ok_or_else(|| Failure::Work(format!("block {block} has no result")))?;
+        let bytes = store.get(artefact)?;
+        let splats = frame::decode_splats(&bytes).map_err(|error| Failure::Work(format!("block {block}: {error}")))?;
+        save(&blocks_folder.join(file_name(block)), &bytes)?;
+        blocks.push(Block { block, artefact, splats: splats.len() as u64 });
+        Ok(splats)
+    })?;
+    let manifest = Manifest {
+        version: VERSION,
+        plan: plan.id(),
+        antialiased: plan.antialiased(),
+        sh_degree: plan.settings.sh_degree,
+        geo_origin,
+        ground: plan.ground,
+        test_every: plan.settings.test_every,
+        downscale,
+        splats: splats.len() as u64,
+        blocks,
+    };
+    save_json(&manifest_path, &manifest)?;
+    let model = Model { splats, antialiased: manifest.antialiased, trained: Some((manifest, out.to_path_buf())) };
+    save(&out.join("merged.ply"), &model.to_ply())?;
+    Ok(model)
+}
+
+/// The finest cut: of every task's splats those that its block owns among all of them.
+fn sew<E>(plan: &Plan, mut result_of: impl FnMut(BlockId) -> Result<Splats, E>) -> Result<Splats, E> {
+    let leaves = plan.leaves();
+    let mut parts = Vec::new();
+    for task in &plan.tasks {
+        let splats = result_of(task.block)?;
+        parts.push((task.block, leaves.keep(&splats, &plan.ground, task.block)));
+    }
+    Ok(blocks::merge(parts))
+}
+
+/// Reads a model: a folder that `plat train` wrote, its `model` folder, or a `.ply`.
+///
+/// # Errors
+/// What is not there, not readable, or not a model.
+pub(crate) fn read(path: &Path) -> Result<Model, BadInput> {
+    let advice = "give a folder that plat train wrote, or a .ply";
+    if path.is_dir() {
+        let folder = [path.join("model"), path.to_path_buf()].into_iter().find(|f| f.join("model.json").is_file());
+        let Some(folder) = folder else {
+            return Err(BadInput::new(path.display().to_string(), "holds no model/model.json", advice));
+        };
+        return read_trained(&folder);
+    }
+    if path.extension().is_none_or(|e| !e.eq_ignore_ascii_case("ply")) {
+        let problem = if path.exists() { "is neither a folder nor a .ply" } else { "does not exist" };
+        return Err(BadInput::new(path.display().to_string(), problem, advice));
+    }
+    let bytes = load(path)?;
+    let splats = ply::read(&bytes).map_err(|error| damaged(path, &error))?;
+    let antialiased = ply::comments(&bytes).iter().any(|comment| comment.trim() == ANTIALIASED);
+    Ok(Model { splats, antialiased, trained: None })
+}
+
+fn read_trained(folder: &Path) -> Result<Model, BadInput> {
+    let path = folder.join("model.json");
+    let manifest: Manifest =
+        serde_json::from_slice(&load(&path)?).map_err(|error| damaged(&path, &CodecError::new(error.to_string())))?;
+    if manifest.version != VERSION {
+        let problem = format!("is of version {}, this program reads {VERSION}", manifest.version);
+        return Err(BadInput::new(path.display().to_string(), problem, "train the model again"));
+    }
+    let path = folder.join(PLAN_FILE);
+    let plan = Plan::from_frame(&load(&path)?).map_err(|error| damaged(&path, &error))?;
+    let splats = sew(&plan, |block| {
+        let path = folder.join("blocks").join(file_name(block));
+        frame::decode_splats(&load(&path)?).map_err(|error| damaged(&path, &error))
+    })?;
+    let out = folder.parent().filter(|_| folder.ends_with("model")).unwrap_or(folder);
+    Ok(Model { splats, antialiased: manifest.antialiased, trained: Some((manifest, out.to_path_buf())) })
+}
+
+fn file_name(block: BlockId) -> String {
+    format!("{}-{}-{}.plat", block.level, block.x, block.y)
+}
+
+fn load(path: &Path) -> Result<Vec<u8>, BadInput> {
+    fs::read(path).map_err(|error| {
+        BadInput::new(path.display().to_string(), format!("cannot be read ({error})"), "check the path")
+    })
+}
+
+fn damaged(path: &Path, error: &CodecError) -> BadInput {
+    BadInput::new(path.display().to_string(), error.to_string(), "restore the file or train the model again")
+}
+
+/// Writes a file.
+pub(crate) fn save(path: &Path, bytes: &[u8]) -> Result<(), Failure> {
+    fs::write(path, bytes).map_err(cannot("written", path))
+}
+
+/// Writes a file of JSON for people: indented, with a last newline.
+pub(crate) fn save_json(path: &Path, value: &impl Serialize) -> Result<(), Failure> {
+    let mut text = serde_json::to_vec_pretty(value).map_err(cannot("written", path))?;
+    text.push(b'\n');
+    save(path, &text)
+}

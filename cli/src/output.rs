@@ -1,0 +1,109 @@
+//! What a person or a script sees: results on stdout, notes and progress on stderr.
+
+use std::fmt::Display;
+use std::io::{IsTerminal, Write};
+use std::sync::atomic::{AtomicU64, Ordering};
+
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use serde::Serialize;
+
+use crate::failure::Failure;
+
+/// How to talk.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Output {
+    json: bool,
+    quiet: bool,
+    terminal: bool,
+}
+
+impl Output {
+    pub(crate) fn new(json: bool, quiet: bool) -> Self {
+        Self { json, quiet, terminal: std::io::stderr().is_terminal() }
+    }
+
+    /// A line on the way, on stderr.
+    pub(crate) fn note(&self, line: impl Display) {
+        if !self.quiet {
+            to_stderr(&format!("{line}\n"));
+        }
+    }
+
+    /// The command's result: the object with `--json`, else the text.
+    pub(crate) fn result(&self, object: &impl Serialize, text: &str) -> Result<(), Failure> {
+        if self.json {
+            let line = serde_json::to_string(object).map_err(|error| Failure::Work(error.to_string()))?;
+            print(&(line + "\n"));
+        } else {
+            print(&format!("{}\n", text.trim_end()));
+        }
+        Ok(())
+    }
+
+    /// Progress of something with this many parts.
+    pub(crate) fn progress(&self, what: &str, total: u64) -> Progress {
+        let bar = (self.terminal && !self.quiet).then(|| {
+            let bar = ProgressBar::with_draw_target(Some(total), ProgressDrawTarget::stderr());
+            let style = ProgressStyle::with_template("{prefix:<10} {bar:30} {pos}/{len} {eta_precise} {msg}");
+            bar.set_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()));
+            bar.set_prefix(what.to_owned());
+            bar
+        });
+        Progress { bar, what: what.to_owned(), total, output: *self, tenths: AtomicU64::new(0) }
+    }
+}
+
+/// A bar on a terminal, a line for every tenth elsewhere.
+pub(crate) struct Progress {
+    bar: Option<ProgressBar>,
+    what: String,
+    total: u64,
+    output: Output,
+    tenths: AtomicU64,
+}
+
+impl Progress {
+    /// So much is done now; from any thread.
+    pub(crate) fn at(&self, done: u64, message: impl Display) {
+        if let Some(bar) = &self.bar {
+            bar.set_message(message.to_string());
+            return bar.set_position(done);
+        }
+        let tenths = (10 * done).checked_div(self.total).unwrap_or(10);
+        if tenths > self.tenths.fetch_max(tenths, Ordering::Relaxed) {
+            let line = format!("{}: {done} of {} {message}", self.what, self.total);
+            self.output.note(line.trim_end());
+        }
+    }
+
+    /// A line beside the bar.
+    pub(crate) fn note(&self, line: impl Display) {
+        match &self.bar {
+            Some(bar) => bar.suspend(|| self.output.note(line)),
+            None => self.output.note(line),
+        }
+    }
+}
+
+impl Drop for Progress {
+    fn drop(&mut self) {
+        if let Some(bar) = &self.bar {
+            bar.finish_and_clear();
+        }
+    }
+}
+
+/// Text on stdout. A reader that went away (`plat … | head`) is no reason to fail.
+pub(crate) fn print(text: &str) {
+    let mut out = std::io::stdout().lock();
+    let _ = out.write_all(text.as_bytes()).and_then(|()| out.flush());
+}
+
+/// The one line of an error, on stderr.
+pub(crate) fn complain(line: &str) {
+    to_stderr(&format!("plat: {line}\n"));
+}
+
+fn to_stderr(text: &str) {
+    let _ = std::io::stderr().lock().write_all(text.as_bytes());
+}

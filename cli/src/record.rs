@@ -1,0 +1,81 @@
+//! What a run says about itself: `report.json`, the object of `--json`, and the source of bench's result lines.
+
+use bench::{CurvePoint, ResultLine};
+use serde::Serialize;
+
+/// The figures of DESIGN section 8 under their names; what was not measured is null.
+#[derive(Debug, Clone, Default, Serialize)]
+pub(crate) struct Record {
+    pub(crate) command: &'static str,
+    pub(crate) commit: &'static str,
+    pub(crate) machine: String,
+    /// The capture's name.
+    pub(crate) scene: String,
+    pub(crate) downscale: u32,
+    pub(crate) config_hash: Option<String>,
+    pub(crate) backend: String,
+    pub(crate) workers: u32,
+    pub(crate) threads: u32,
+    /// Ingest, training and merging, evaluation left out.
+    pub(crate) wall_seconds: Option<f64>,
+    pub(crate) cpu_seconds: Option<f64>,
+    /// dB over the held-out views.
+    pub(crate) psnr: Option<f64>,
+    pub(crate) ssim: Option<f64>,
+    pub(crate) lpips: Option<f64>,
+    /// SSIMULACRA2.
+    pub(crate) perceptual: Option<f64>,
+    pub(crate) zone_psnr: Option<f64>,
+    pub(crate) detections_kept: Option<f64>,
+    pub(crate) splats: u64,
+    /// Size of the merged PLY.
+    pub(crate) bytes: Option<u64>,
+    pub(crate) peak_memory_bytes: Option<u64>,
+    pub(crate) bytes_moved: Option<u64>,
+    /// Rendered frames per second.
+    pub(crate) fps: Option<f64>,
+    pub(crate) seed: Option<u64>,
+}
+
+impl Record {
+    /// A record of this program on this machine.
+    pub(crate) fn new(command: &'static str) -> Self {
+        Self { command, commit: commit(), machine: bench::machine(), ..Self::default() }
+    }
+
+    /// As a line of bench/results.
+    pub(crate) fn line(&self, label: &str, invoked: String, curve: Vec<CurvePoint>) -> ResultLine {
+        ResultLine {
+            label: label.to_owned(),
+            commit: self.commit.to_owned(),
+            machine: self.machine.clone(),
+            scene: self.scene.clone(),
+            downscale: self.downscale,
+            config_hash: self.config_hash.clone(),
+            backend: self.backend.clone(),
+            workers: self.workers,
+            wall_seconds: self.wall_seconds,
+            cpu_seconds: self.cpu_seconds.unwrap_or(f64::NAN),
+            psnr: self.psnr.unwrap_or(f64::NAN),
+            ssim: self.ssim,
+            lpips: self.lpips,
+            perceptual: self.perceptual,
+            zone_psnr: self.zone_psnr,
+            detections_kept: self.detections_kept,
+            splats: Some(self.splats),
+            bytes: self.bytes,
+            peak_memory_bytes: self.peak_memory_bytes,
+            bytes_moved: self.bytes_moved,
+            fps: self.fps,
+            seed: self.seed,
+            command: invoked,
+            curve,
+            source: None,
+        }
+    }
+}
+
+/// The commit that the program was built from, `-dirty` where files differed; `unknown` outside a git checkout.
+pub(crate) fn commit() -> &'static str {
+    option_env!("PLAT_COMMIT").unwrap_or("unknown")
+}

@@ -1,0 +1,296 @@
+//! Photos to artefacts: each view decoded once, undistorted, shrunk if asked, and stored with its mips.
+//!
+//! Everything is keyed by content. A photo that was ingested before, under whatever name or in whatever capture, is
+//! known by the hash of what its pixels depend on, so a second ingest only reads and hashes files, and one that was
+//! interrupted goes on where it was. A thread holds one photo at a time: peak memory depends on the size of photos and
+//! the number of threads, not on the number of photos.
+
+use std::fs::File;
+use std::io::Read;
+use std::path::Path;
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::{Mutex, PoisonError};
+
+use scene::frame::{self, Kind};
+use scene::{ArtefactId, BadInput, Camera, CameraModel, Capture, Pinhole, Pixels, View};
+use serde::{Deserialize, Serialize};
+use store::{BlockingStore, StoreError};
+
+use crate::lens::Undistorter;
+use crate::open::{Photo, Source};
+use crate::photo::Photograph;
+use crate::{mips, photo};
+
+/// An ingested capture in the store.
+pub const CAPTURE: Kind = Kind(*b"capt", 1);
+/// What is remembered of a photo.
+const MEMO: Kind = Kind(*b"memo", 1);
+/// Raised whenever the same photo would give other mips: decoding, undistortion, downscaling, mips, their format.
+const FORMAT: u32 = 1;
+
+/// How to ingest.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct IngestOptions {
+    /// Block average by this factor: sides are divided and rounded down, intrinsics divided exactly. 1 keeps photos.
+    pub downscale: u32,
+    /// Photos in work at once, at least 1.
+    pub threads: usize,
+}
+
+/// What came of it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Ingested {
+    /// The capture, with the cameras of mip 0 and the mips of every view.
+    pub capture: Capture,
+    /// The capture in the store, as a frame of kind [`CAPTURE`]: the same for the same photos, poses and options.
+    pub id: ArtefactId,
+    /// How many photos had to be decoded; the others were known.
+    pub decoded: usize,
+}
+
+/// Why an ingest stopped.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum IngestError {
+    /// A file or an option is at fault.
+    #[error(transparent)]
+    BadInput(#[from] BadInput),
+    /// The store is.
+    #[error(transparent)]
+    Store(#[from] StoreError),
+}
+
+/// Ingests all photos of a capture. `progress` hears (done, of how many) from any thread, one call at a time, in order.
+///
+/// # Errors
+/// The first photo, by name, that cannot be used, or a store that fails. What was stored until then is found again.
+pub fn ingest(
+    source: &Source,
+    store: &BlockingStore,
+    options: &IngestOptions,
+    progress: &(dyn Fn(usize, usize) + Sync),
+) -> Result<Ingested, IngestError> {
+    if options.downscale == 0 {
+        return Err(BadInput::new("--downscale", "is 0", "give 1 to keep the photos as they are, or more").into());
+    }
+    let photos = &source.photos;
+    if photos.len() != source.capture.views.len() {
+        return Err(BadInput::new("the capture", "has not one photo for each view", "open it again").into());
+    }
+    let job = Job { store, downscale: options.downscale, next: AtomicUsize::new(0), failed: AtomicBool::new(false) };
+    let done = Mutex::new(0);
+    let run = || {
+        let (mut views, mut lens) = (Vec::new(), None);
+        while let Some(i) = job.take(photos.len()) {
+            let view = job.view(&source.capture.views[i], &photos[i], &mut lens);
+            job.failed.fetch_or(view.is_err(), Ordering::Relaxed);
+            views.push((i, view));
+            let mut done = done.lock().unwrap_or_else(PoisonError::into_inner);
+            *done += 1;
+            progress(*done, photos.len());
+        }
+        views
+    };
+    let mut views = std::thread::scope(|scope| {
+        let threads: Vec<_> = (1..options.threads.min(photos.len())).map(|_| scope.spawn(run)).collect();
+        let mut views = run();
+        for thread in threads {
+            views.extend(thread.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)));
+        }
+        views
+    });
+    // Photos are taken in order, so whichever thread fails, the first that cannot be used is among those taken.
+    views.sort_by_key(|(i, _)| *i);
+    let views: Vec<(View, bool)> = views.into_iter().map(|(_, view)| view).collect::<Result<_, _>>()?;
+    let decoded = views.iter().filter(|(_, decoded)| *decoded).count();
+    let views = views.into_iter().map(|(view, _)| view).collect();
+    let capture = Capture { views, points: source.capture.points.clone(), geo_origin: source.capture.geo_origin };
+    let id = store.put(frame::encode(CAPTURE, &capture, &[]))?;
+    Ok(Ingested { capture, id, decoded })
+}
+
+/// Reads an ingested capture back.
+///
+/// # Errors
+/// Not in the store, damaged, or not a capture.
+pub fn load_capture(store: &BlockingStore, id: ArtefactId) -> Result<Capture, IngestError> {
+    let bytes = store.get(id)?;
+    let (capture, _) = frame::decode(CAPTURE, &bytes)
+        .map_err(|error| BadInput::new(format!("artefact {id}"), error.to_string(), "ingest the capture again"))?;
+    Ok(capture)
+}
+
+struct Job<'a> {
+    store: &'a BlockingStore,
+    downscale: u32,
+    next: AtomicUsize,
+    failed: AtomicBool,
+}
+
+/// A lens and what undoes it: photos next to each other mostly share one.
+type Lens = Option<((CameraModel, u32, u32), Undistorter)>;
+
+#[derive(Serialize, Deserialize)]
+struct Memo {
+    /// Ids and lengths in bytes.
+    mips: Vec<(ArtefactId, u64)>,
+    masked: bool,
+}
+
+impl Job<'_> {
+    fn take(&self, count: usize) -> Option<usize> {
+        if self.failed.load(Ordering::Relaxed) {
+            return None;
+        }
+        Some(self.next.fetch_add(1, Ordering::Relaxed)).filter(|&i| i < count)
+    }
+
+    /// The view with its mips, and true if its photo had to be decoded.
+    fn view(&self, view: &View, photo: &Photo, lens: &mut Lens) -> Result<(View, bool), IngestError> {
+        let (w, h) = (photo.width, photo.height);
+        let ideal = view.camera.pinhole;
+        for (w, h) in [(w, h), (ideal.width, ideal.height)] {
+            if !(1..=mips::PIXEL_LIMIT).contains(&(u64::from(w) * u64::from(h))) {
+                let problem = format!("has a camera of {w}×{h} pixels, which is nothing or over {}", mips::PIXEL_LIMIT);
+                return Err(BadInput::new(show(&photo.path), problem, "correct its camera's width and height").into());
+            }
+        }
+        let pinhole = shrink(ideal, self.downscale);
+        if pinhole.width.min(pinhole.height) < mips::SHORTEST_SIDE && self.downscale > 1 {
+            let problem =
+                format!("{} leaves less than {} pixels of {}", self.downscale, mips::SHORTEST_SIDE, view.name);
+            return Err(BadInput::new("--downscale", problem, "give a smaller factor").into());
+        }
+        let limit = photo::file_limit(w, h);
+        let bytes = read(&photo.path, limit)?;
+        let mask = photo.mask.as_ref().map(|path| Ok::<_, BadInput>((path, read(path, limit)?))).transpose()?;
+        let name = self.memo_name(photo, &bytes, mask.as_ref().map(|(_, bytes)| bytes.as_slice()));
+        let known = self.recall(&name)?;
+        let decoded = known.is_none();
+        let memo = match known {
+            Some(memo) => memo,
+            None => {
+                let mut pixels = photo::decode(&bytes, w, h).map_err(|e| at(&photo.path, &e))?;
+                drop(bytes);
+                if let Some((path, bytes)) = mask {
+                    let usable = photo::decode_mask(&bytes, w, h).map_err(|e| at(path, &e))?;
+                    pixels.mask = Some(both(pixels.mask.take(), usable));
+                }
+                let finest = self.finest(pixels, undistorter(photo, ideal, lens)?);
+                self.store_mips(finest, &name, &photo.path)?
+            }
+        };
+        let camera = Camera { pinhole, ..view.camera };
+        Ok((
+            View {
+                name: view.name.clone(),
+                camera,
+                mips: memo.mips.iter().map(|(id, _)| *id).collect(),
+                masked: memo.masked,
+            },
+            decoded,
+        ))
+    }
+
+    /// Mip 0: undistorted and shrunk; a mask that leaves nothing out is none.
+    fn finest(&self, mut photo: Photograph, undistorter: &Undistorter) -> Pixels {
+        if !undistorter.is_identity() {
+            photo.mask = photo.mask.map(|mask| undistorter.mask(&mask));
+            photo.rgb = undistorter.rgb(&photo.rgb);
+        }
+        let Pinhole { width, height, .. } = undistorter.pinhole();
+        let mut pixels = Pixels { width, height, rgb: photo::planes(&photo.rgb), mask: photo.mask };
+        drop(photo.rgb);
+        if self.downscale > 1 {
+            pixels = mips::downscale(&pixels, self.downscale);
+        }
+        pixels.mask = pixels.mask.filter(|mask| mask.contains(&0));
+        pixels
+    }
+
+    fn store_mips(&self, finest: Pixels, name: &str, path: &Path) -> Result<Memo, IngestError> {
+        let mut memo = Memo { mips: Vec::new(), masked: finest.mask.is_some() };
+        mips::for_each(finest, |mip| {
+            let bytes = mips::encode(mip).map_err(|e| at(path, &e))?;
+            let length = bytes.len() as u64;
+            memo.mips.push((self.store.put(bytes)?, length));
+            Ok::<_, IngestError>(())
+        })?;
+        self.store.put_name(name, frame::encode(MEMO, &memo, &[]))?;
+        Ok(memo)
+    }
+
+    /// The name under which a photo is remembered: a hash of all that its mips depend on.
+    fn memo_name(&self, photo: &Photo, bytes: &[u8], mask: Option<&[u8]>) -> String {
+        let mask = mask.map(ArtefactId::of);
+        let key = (FORMAT, ArtefactId::of(bytes), mask, photo.model, photo.width, photo.height, self.downscale);
+        format!("ingest/{}", ArtefactId::of(&frame::encode(MEMO, &key, &[])))
+    }
+
+    /// What is remembered, if all of it is still there, at its full length.
+    fn recall(&self, name: &str) -> Result<Option<Memo>, StoreError> {
+        let Some(bytes) = self.store.get_name(name)? else { return Ok(None) };
+        let Ok((memo, _)) = frame::decode::<Memo>(MEMO, &bytes) else { return Ok(None) };
+        for &(id, length) in &memo.mips {
+            if self.store.size(id)? != Some(length) {
+                return Ok(None);
+            }
+        }
+        Ok(Some(memo))
+    }
+}
+
+/// What undoes the lens of a photo, which has to lead to the camera of its view.
+fn undistorter<'a>(photo: &Photo, pinhole: Pinhole, lens: &'a mut Lens) -> Result<&'a Undistorter, BadInput> {
+    let key = (photo.model, photo.width, photo.height);
+    let known = lens.take().filter(|(of, _)| *of == key).map(|(_, undistorter)| undistorter);
+    let undistorter = known.or_else(|| Undistorter::new(&photo.model, photo.width, photo.height));
+    match undistorter.filter(|undistorter| undistorter.pinhole() == pinhole) {
+        Some(undistorter) => Ok(&lens.insert((key, undistorter)).1),
+        None => {
+            let advice = "check the parameters of its camera";
+            Err(BadInput::new(show(&photo.path), "was taken with a lens that cannot be undone", advice))
+        }
+    }
+}
+
+fn shrink(pinhole: Pinhole, factor: u32) -> Pinhole {
+    let n = f64::from(factor);
+    Pinhole {
+        width: pinhole.width / factor,
+        height: pinhole.height / factor,
+        fx: pinhole.fx / n,
+        fy: pinhole.fy / n,
+        cx: pinhole.cx / n,
+        cy: pinhole.cy / n,
+    }
+}
+
+fn both(mask: Option<Vec<u8>>, mut other: Vec<u8>) -> Vec<u8> {
+    if let Some(mask) = mask {
+        other.iter_mut().zip(mask).for_each(|(a, b)| *a &= b);
+    }
+    other
+}
+
+fn read(path: &Path, limit: u64) -> Result<Vec<u8>, BadInput> {
+    let failed = |e: std::io::Error| BadInput::new(show(path), format!("cannot be read ({e})"), "check the file");
+    let file = File::open(path).map_err(failed)?;
+    let mut bytes = Vec::new();
+    file.take(limit + 1).read_to_end(&mut bytes).map_err(failed)?;
+    if bytes.len() as u64 > limit {
+        let problem = format!("is larger than any photo of its camera can be ({} MB)", limit >> 20);
+        return Err(BadInput::new(show(path), problem, "check the file and its camera's width and height"));
+    }
+    Ok(bytes)
+}
+
+fn at(path: &Path, error: &scene::CodecError) -> BadInput {
+    BadInput::new(show(path), error.to_string(), "replace the file or take its image out of the capture")
+}
+
+fn show(path: &Path) -> String {
+    path.display().to_string()
+}
+
+#[cfg(test)]
+mod tests;
