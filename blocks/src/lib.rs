@@ -24,6 +24,6 @@ pub use cut::{cut, keep_core, merge};
 pub use draw::draw;
 pub use ground::{Ground, Square};
 pub use lint::{Finding, Severity, lint};
-pub use lod::{Cut, context_of};
+pub use lod::{Cut, context_of, sweep_of};
 pub use plan::{Mode, Plan, PlanError, PlanSettings, Task, ViewUse};
 pub use planner::plan;

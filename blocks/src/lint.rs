@@ -5,6 +5,7 @@ use std::fmt;
 
 use scene::{BlockId, Capture};
 
+use crate::lod::training_order;
 use crate::plan::{Mode, Plan, Task, ViewUse};
 use crate::planner::MIN_VIEWS;
 use crate::select::max_mip;
@@ -119,8 +120,8 @@ fn order(plan: &Plan, task: &Task, earlier: &BTreeSet<BlockId>, findings: &mut F
         if !earlier.contains(needed) {
             findings.error(task.block, format!("needs block {needed}, which does not come before it"));
         }
-        if needed.level >= task.block.level {
-            findings.error(task.block, format!("needs block {needed}, which is not coarser"));
+        if training_order(*needed) >= training_order(task.block) {
+            findings.error(task.block, format!("needs block {needed}, which is trained later"));
         }
     }
     if plan.settings.mode == Mode::Tree && task.parent != task.block.parent() {
@@ -207,7 +208,7 @@ mod tests {
             ("lists a view twice", |p| p.tasks[2].views[1] = p.tasks[2].views[0]),
             ("has no view", |p| p.tasks[2].views.clear()),
             ("not initialised from its parent", |p| p.tasks[2].parent = None),
-            ("not coarser", |p| p.tasks[2].context = vec![BlockId { level: 1, x: 1, y: 1 }]),
+            ("is trained later", |p| p.tasks[2].context = vec![BlockId { level: 1, x: 1, y: 1 }]),
             ("MiB, the limit is", |p| p.tasks[2].memory_bytes = u64::MAX),
             ("has 0 splats", |p| p.tasks[2].budget = 0),
         ];

@@ -5,7 +5,7 @@ use scene::{ArtefactId, BlockId, CodecError, Rect};
 use serde::{Deserialize, Serialize};
 
 use crate::ground::Ground;
-use crate::lod::Cut;
+use crate::lod::{Cut, training_order};
 
 /// The version of [`Plan`] that this program writes and reads.
 pub const VERSION: u32 = 1;
@@ -82,8 +82,9 @@ pub struct Task {
     pub block: BlockId,
     /// Where the first splats come from; `None` = the sparse points.
     pub parent: Option<BlockId>,
-    /// Blocks that are rendered along, frozen, outside the halo. With the parent they cover the plane; where one lies
-    /// inside another the deeper counts ([`Task::context_cut`]).
+    /// Blocks that are rendered along, frozen: coarser ones outside the halo, and the finished neighbours of its own level,
+    /// inside the halo too. With the parent they cover the plane; where one lies inside another the deeper counts
+    /// ([`Task::context_cut`]).
     pub context: Vec<BlockId>,
     /// What it trains on, by view.
     pub views: Vec<ViewUse>,
@@ -130,7 +131,7 @@ pub struct Plan {
     pub levels: u8,
     /// Metres per pixel of each level, `levels + 1` of them.
     pub rho_metres: Vec<f64>,
-    /// By (level, y, x), so that each comes after its parent and its context.
+    /// By level, sweep, row and column, so that each comes after its parent and its context.
     pub tasks: Vec<Task>,
 }
 
@@ -180,8 +181,7 @@ impl Plan {
                 return bad(format!("whose task {} has an empty window", task.block));
             }
         }
-        let order = |t: &Task| (t.block.level, t.block.y, t.block.x);
-        if self.tasks.is_empty() || !self.tasks.is_sorted_by(|a, b| order(a) < order(b)) {
+        if self.tasks.is_empty() || !self.tasks.is_sorted_by(|a, b| training_order(a.block) < training_order(b.block)) {
             return bad("without tasks or with tasks out of order".into());
         }
         Ok(())
@@ -195,8 +195,7 @@ impl Plan {
 
     /// The task of a block.
     pub fn task(&self, block: BlockId) -> Option<&Task> {
-        let order = |b: BlockId| (b.level, b.y, b.x);
-        self.tasks.binary_search_by_key(&order(block), |t| order(t.block)).ok().map(|i| &self.tasks[i])
+        self.tasks.binary_search_by_key(&training_order(block), |t| training_order(t.block)).ok().map(|i| &self.tasks[i])
     }
 
     /// The finest model: which task's splats count where. Every place has exactly one owner.

@@ -6,7 +6,7 @@ use scene::{ArtefactId, BlockId, Capture};
 
 use crate::allot::{Needs, set_budgets, set_memory, set_steps};
 use crate::ground::{Ground, quantile};
-use crate::lod::context_of;
+use crate::lod::{context_of, finished_neighbours, training_order};
 use crate::plan::{MAX_LEVELS, Mode, Plan, PlanError, PlanSettings, Task, VERSION};
 use crate::select::{Selection, Sightings, full_views, select_level, usable};
 
@@ -159,8 +159,15 @@ impl Survey<'_> {
                     .into_iter()
                     .partition(|u| Capture::is_test(u.view as usize, self.test_every));
             }
-            let context = |block| if tree { context_of(self.ground, block, &existing) } else { Vec::new() };
-            let mut of_level: Vec<Task> = (selections.into_iter())
+            let of_level: BTreeSet<BlockId> = selections.keys().copied().collect();
+            let context = |block| -> Vec<BlockId> {
+                if !tree {
+                    return Vec::new();
+                }
+                let coarser = context_of(self.ground, block, &existing);
+                coarser.into_iter().chain(finished_neighbours(block, &of_level)).collect()
+            };
+            let mut tasks_of_level: Vec<Task> = (selections.into_iter())
                 .map(|(block, selection)| Task {
                     block,
                     parent: block.parent().filter(|_| tree),
@@ -174,9 +181,9 @@ impl Survey<'_> {
                     memory_bytes: 0,
                 })
                 .collect();
-            of_level.sort_by_key(|t| (t.block.y, t.block.x));
-            existing.extend(of_level.iter().map(|t| t.block));
-            tasks.append(&mut of_level);
+            tasks_of_level.sort_by_key(|t| training_order(t.block));
+            existing.extend(of_level);
+            tasks.append(&mut tasks_of_level);
         }
         match tasks.last().map(|t| t.block.level) {
             None => Err(PlanError::NoBlocks { levels, needed: MIN_VIEWS }),

@@ -139,7 +139,7 @@ fn images_equal_the_reference() {
                      {off_though_sure} off though sure, worst of these {worst_sure:.1e}",
                     isa.name()
                 );
-                // Needles longer than the image lose digits to the conic; `long_needles` says how many.
+                // Needles are held to the share alone here; `long_needles` is about them.
                 let strict = kind != Kind::Needle;
                 if off * 10_000 > pixels || (strict && off_though_sure > 0) {
                     failed.push(format!("{} {kind:?} antialiased {antialiased}", isa.name()));
@@ -152,10 +152,10 @@ fn images_equal_the_reference() {
 
 #[test]
 fn long_needles() {
-    // In the f32 conic a needle's determinant and exponent cancel: relative errors grow with the square of its length.
-    // Up to a standard deviation longer than the image that must not show.
+    // With xx·yy - xy² for the determinant and the conic for the exponent, f32 cancels: the error grows with the square of
+    // a needle's length. It must not show, even where the standard deviation is ten times the image.
     for antialiased in [false, true] {
-        for sigma_pixels in [30.0f32, 100.0, 300.0] {
+        for sigma_pixels in [30.0f32, 300.0, 3000.0] {
             let identity = Rigid { rotation: DQuat::IDENTITY, translation: DVec3::ZERO };
             let camera = Camera { camera_from_world: identity, ..camera(250, 187, 250.0) };
             let unit = 4.0 / 250.0; // metres per pixel
@@ -177,8 +177,15 @@ fn long_needles() {
                     tally.add(frame, &Scene::new(&splats, None, &camera, &options));
                 }
                 let Tally { pixels, off, worst_sure, .. } = tally;
-                println!("{} needle of {sigma_pixels} px: {off} of {pixels} pixels off, worst {worst_sure:.1e}", isa.name());
-                assert!(off * 10_000 <= pixels && worst_sure < 1e-2, "{} {sigma_pixels}: {off}, {worst_sure}", isa.name());
+                println!(
+                    "{} needle of {sigma_pixels} px: {off} of {pixels} pixels off, worst {worst_sure:.1e}",
+                    isa.name()
+                );
+                assert!(
+                    off * 10_000 <= pixels && worst_sure < TOLERANCE,
+                    "{} {sigma_pixels}: {off}, {worst_sure}",
+                    isa.name()
+                );
             }
         }
     }
@@ -279,7 +286,11 @@ fn a_splat_with_a_nan_is_not_drawn() {
             let (frame, gradients) = draw(isa, &broken, None, &camera, &options(false));
             let others = (0..36).all(|i| row(&gradients, i + usize::from(i >= 20)) == row(&expected_gradients, i));
             if frame != expected || !others {
-                failed.push(format!("{} column {k}: same image {}, same gradients {others}", isa.name(), frame == expected));
+                failed.push(format!(
+                    "{} column {k}: same image {}, same gradients {others}",
+                    isa.name(),
+                    frame == expected
+                ));
             }
         }
     }
@@ -384,7 +395,9 @@ fn a_renderer_keeps_nothing_from_view_to_view() {
     // Buffers are reused: larger and smaller images, more and fewer splats, must not see one another.
     for isa in Isa::available() {
         let mut used = Renderer::new(isa);
-        for (seed, (width, height), count) in [(1, (250, 187), 900), (2, (17, 33), 40), (3, (64, 64), 500), (4, (3, 5), 0)] {
+        for (seed, (width, height), count) in
+            [(1, (250, 187), 900), (2, (17, 33), 40), (3, (64, 64), 500), (4, (3, 5), 0)]
+        {
             let camera = camera_of(width, height);
             let splats = mixture(&mut Random(seed), &camera, Kind::Behind, count);
             let options = Options { extras: seed % 2 == 0, ..options(true) };

@@ -62,7 +62,8 @@ fn options(antialiased: bool, sh_degree: u8) -> Options {
 /// The loss of each pixel.
 fn losses(image: &Image, upstream: &Upstream) -> Vec<f64> {
     let area = image.transmittance.len();
-    let product = |gradient: &[f32], values: &[f64], i: usize| gradient.get(i).map_or(0.0, |&g| f64::from(g) * values[i]);
+    let product =
+        |gradient: &[f32], values: &[f64], i: usize| gradient.get(i).map_or(0.0, |&g| f64::from(g) * values[i]);
     (0..area)
         .map(|i| {
             (0..3).map(|c| product(&upstream.colour, &image.colour, c * area + i)).sum::<f64>()
@@ -122,9 +123,7 @@ fn classes(sh_degree: u8) -> Vec<(&'static str, usize, usize)> {
 /// Central differences of every column in use, for the trainable splats.
 fn column_slopes(scene: &Scene, upstream: &Upstream) -> Vec<Vec<f64>> {
     let used = column::SH + 3 * sh_coefficients(scene.options.sh_degree);
-    (0..used)
-        .map(|k| (0..scene.own).map(|i| slope(scene, upstream, &|s, x| s.columns[k][i] += x)).collect())
-        .collect()
+    (0..used).map(|k| (0..scene.own).map(|i| slope(scene, upstream, &|s, x| s.columns[k][i] += x)).collect()).collect()
 }
 
 /// Central differences of ξ in `camera_from_world ← exp(ξ)·camera_from_world`, one component at a time.

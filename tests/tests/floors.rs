@@ -8,7 +8,7 @@ use cargo_metadata::{DependencyKind, Metadata, MetadataCommand, PackageId};
 
 /// Each crate's floor in tenths, lowest first. A normal or build dependency must be strictly lower than its user, a
 /// dev-dependency not higher.
-const FLOORS: [(&str, u32); 17] = [
+const FLOORS: [(&str, u32); 16] = [
     ("scene", 0),
     ("shaders", 0),
     ("blocks", 10),
@@ -24,7 +24,6 @@ const FLOORS: [(&str, u32); 17] = [
     ("serve", 40),
     ("bench", 40),
     ("cli", 41),
-    ("plat", 41),
     ("tests", 50),
 ];
 

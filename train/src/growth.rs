@@ -107,7 +107,7 @@ pub struct Refined {
     pub added: usize,
 }
 
-/// Removes what explains nothing, splits the `target - kept` splats with the most error among those that `counts`
+/// Removes what explains nothing or lies where `keeps` is false, splits the `target - kept` splats with the most error among those that `counts`
 /// (the splats that the block owns; the others are neither counted nor limited by the budget, and grow in proportion),
 /// and puts all in Morton order, so that neighbours in space are neighbours in memory. Returns the new splats, and for
 /// each the old row whose moments it keeps.
@@ -117,6 +117,7 @@ pub fn refine(
     growth: &Growth,
     target: usize,
     counts: &(dyn Fn(Vec3) -> bool + Sync),
+    keeps: &(dyn Fn(Vec3) -> bool + Sync),
 ) -> (Splats, Vec<Option<u32>>, Refined) {
     let n = splats.len();
     evidence.resize(n);
@@ -126,7 +127,7 @@ pub fn refine(
     for i in 0..n {
         if !splats.is_finite(i) {
             refined.broken += 1;
-        } else if splats.col(column::OPACITY)[i] < min_logit || (evidence.views[i] > 2 && evidence.weight[i] < 0.02) {
+        } else if !keeps(splats.mean(i)) || splats.col(column::OPACITY)[i] < min_logit || (evidence.views[i] > 2 && evidence.weight[i] < 0.02) {
             refined.removed += 1;
         } else {
             kept.push(i as u32);
@@ -237,7 +238,7 @@ mod tests {
     fn growth_meets_its_target_and_splits_the_worst() {
         let (splats, mut evidence) = row_of(100);
         let growth = Growth::default();
-        let (grown, rows, refined) = refine(&splats, &mut evidence, &growth, 110, &|_| true);
+        let (grown, rows, refined) = refine(&splats, &mut evidence, &growth, 110, &|_| true, &|_| true);
         assert_eq!((grown.len(), rows.len(), refined.added), (110, 110, 10));
         assert!((0..110).filter(|&i| rows[i].is_none()).all(|i| grown.mean(i).x > 85.0));
     }
@@ -248,7 +249,7 @@ mod tests {
         splats.columns_mut()[column::MEAN][3] = f32::NAN;
         splats.columns_mut()[column::OPACITY][4] = -9.0;
         evidence.weight[5] = 0.0;
-        let (grown, _, refined) = refine(&splats, &mut evidence, &Growth::default(), 1, &|_| true);
+        let (grown, _, refined) = refine(&splats, &mut evidence, &Growth::default(), 1, &|_| true, &|_| true);
         assert_eq!((refined.broken, refined.removed, refined.added, grown.len()), (1, 2, 0, 7));
     }
 

@@ -121,6 +121,8 @@ pub struct Job<'a> {
     pub views: &'a [TrainView],
     /// Is a splat here counted against the budget?
     pub counts: &'a (dyn Fn(Vec3) -> bool + Sync),
+    /// May a splat be here? Those that wander off are removed when splats are added: their place is drawn by the context.
+    pub keeps: &'a (dyn Fn(Vec3) -> bool + Sync),
     /// Number of counted splats wanted at the end.
     pub budget: usize,
     /// Number of steps.
@@ -180,7 +182,7 @@ pub enum TrainError {
 /// # Errors
 /// See [`TrainError`].
 pub fn train(job: Job, report: &mut dyn FnMut(Progress) -> Flow) -> Result<Splats, TrainError> {
-    let Job { initial: mut splats, context, views, counts, budget, steps, recipe, .. } = job;
+    let Job { initial: mut splats, context, views, counts, keeps, budget, steps, recipe, .. } = job;
     if views.is_empty() {
         return Err(TrainError::NoViews);
     }
@@ -227,7 +229,7 @@ pub fn train(job: Job, report: &mut dyn FnMut(Progress) -> Flow) -> Result<Splat
         let last_refinement = (growth.until * steps as f32) as u32 + growth.every;
         if done.is_multiple_of(growth.every) && progress >= growth.from && done <= last_refinement && done < steps {
             let target = growth.target(done, steps, start_count, budget);
-            let (grown, rows, _) = growth::refine(&splats, &mut evidence, growth, target, counts);
+            let (grown, rows, _) = growth::refine(&splats, &mut evidence, growth, target, counts, keeps);
             splats = grown;
             adam.rearrange(&rows);
         }

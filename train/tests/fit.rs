@@ -5,8 +5,8 @@ use std::sync::Arc;
 use glam::{DMat3, DQuat, DVec3, Vec3};
 use render::Options;
 use render::cpu::Renderer;
-use scene::{Camera, Pinhole, Pixels, Rect, Rigid, Splat, Splats, column};
 use scene::splats::SH_C0;
+use scene::{Camera, Pinhole, Pixels, Rect, Rigid, Splat, Splats, column};
 use train::{Flow, Job, Recipe, TrainError, TrainView, WindowSource, metrics, random, train};
 
 const WIDTH: u32 = 64;
@@ -132,6 +132,7 @@ impl<'a> Setup<'a> {
     fn try_run(
         self,
         counts: &(dyn Fn(Vec3) -> bool + Sync),
+        keeps: &|_| true,
         report: &mut dyn FnMut(train::Progress) -> Flow,
     ) -> Result<Splats, TrainError> {
         let views = views();
@@ -225,9 +226,8 @@ fn mask_differences(recipe: &Recipe) -> (f32, f32) {
     let black = masked(&photos, |_| 0);
     let noise = masked(&photos, |i| random::bits(8, i as u64) as u8);
     let bare = |photos: &Photos| Photos(photos.0.iter().map(|p| Pixels { mask: None, ..p.clone() }).collect());
-    let run = |photos: &Photos| {
-        Setup { steps: 60, recipe: recipe.clone(), ..Setup::new(perturbed(&truth), photos) }.run()
-    };
+    let run =
+        |photos: &Photos| Setup { steps: 60, recipe: recipe.clone(), ..Setup::new(perturbed(&truth), photos) }.run();
     let largest = |a: &Splats, b: &Splats| {
         let pairs = a.columns().iter().flatten().zip(b.columns().iter().flatten());
         pairs.map(|(a, b)| (a - b).abs()).fold(0.0, f32::max)
@@ -322,9 +322,8 @@ fn more_splats_fit_better() {
     let truth = cloud(6, 200, 0.8);
     let photos = photos(&truth);
     let initial = perturbed(&truth).filter(|i| i % 4 == 0);
-    let run = |budget| {
-        psnr(&Setup { budget, steps: 400, ..Setup::new(initial.clone(), &photos) }.run(), &photos, |_| true)
-    };
+    let run =
+        |budget| psnr(&Setup { budget, steps: 400, ..Setup::new(initial.clone(), &photos) }.run(), &photos, |_| true);
     let (few, many) = (run(50), run(200));
     assert!(many > few + 1.0, "{many} dB with four times the splats, {few} dB without");
 }
@@ -407,7 +406,9 @@ fn a_block_does_not_repair_its_neighbours_region() {
     let quiet = spill(&run(&agreeing, Some(&right)));
     let provoked = spill(&run(&contradicting, Some(&right)));
     let unguarded = spill(&run(&contradicting, None));
-    println!("own share of the neighbour's pixels: {quiet:.4} in peace, {provoked:.4} provoked, {unguarded:.4} without context");
+    println!(
+        "own share of the neighbour's pixels: {quiet:.4} in peace, {provoked:.4} provoked, {unguarded:.4} without context"
+    );
     assert!(unguarded > 0.1, "without a context the block must try to repair: {unguarded}");
     assert!(provoked < 0.1 * unguarded, "{provoked} of the neighbour's pixels are the block's");
 }
@@ -425,7 +426,8 @@ fn a_report_can_stop_and_errors_say_why() {
     assert!(Setup::new(perturbed(&truth), &photos).try_run(&|_| true, &mut report).is_ok());
     assert_eq!(calls, 10);
 
-    let run = |initial: Splats, photos: &Photos| Setup::new(initial, photos).try_run(&|_| true, &mut |_| Flow::Continue);
+    let run =
+        |initial: Splats, photos: &Photos| Setup::new(initial, photos).try_run(&|_| true, &mut |_| Flow::Continue);
     let missing = Photos(photos.0[..6].to_vec());
     assert!(matches!(run(perturbed(&truth), &missing), Err(TrainError::Source(line)) if line.contains("is missing")));
     assert_eq!(run(Splats::new(1), &photos), Err(TrainError::Empty(0)));
@@ -437,6 +439,7 @@ fn a_report_can_stop_and_errors_say_why() {
         context: None,
         views: &[],
         counts: &|_| true,
+        keeps: &|_| true,
         budget: 10,
         steps: 10,
         antialiased: false,

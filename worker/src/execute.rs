@@ -119,11 +119,14 @@ impl Block<'_> {
         let (initial, context) = self.start(results, &views, &recipe)?;
         let mut renderer = Renderer::default();
         let counts = |p: Vec3| self.plan.ground.owns(task.block, p.as_dvec3());
+        let cut = task.context_cut();
+        let keeps = |p: Vec3| self.trains(&cut, p.as_dvec3());
         let job = train::Job {
             initial,
             context: context.as_ref(),
             views: &views,
             counts: &counts,
+            keeps: &keeps,
             budget: task.budget as usize,
             steps: task.steps,
             antialiased: self.plan.antialiased(),
@@ -222,7 +225,7 @@ impl Block<'_> {
         let mut context = Splats::new(sh_degree);
         for (block, splats) in results {
             let splats = cut.keep(&splats, &plan.ground, block);
-            let inside = |i: usize| plan.ground.in_halo(task.block, splats.mean(i).as_dvec3());
+            let inside = |i: usize| self.trains(&cut, splats.mean(i).as_dvec3());
             initial.append(&splats.filter(inside));
             // Only what a window can show is worth keeping in memory.
             let shown: Vec<bool> = (0..splats.len())
@@ -233,6 +236,14 @@ impl Block<'_> {
         }
         let context = (!context.is_empty()).then_some(context);
         Ok((initial, context))
+    }
+
+    /// Is this place the block's to train: in its halo, and not in the core of a neighbour that is final already?
+    fn trains(&self, cut: &blocks::Cut, place: glam::DVec3) -> bool {
+        let ground = &self.plan.ground;
+        let owner = cut.owner_of(ground, place);
+        self.task.parent.is_none()
+            || (ground.in_halo(self.task.block, place) && owner.is_none_or(|b| b.level < self.task.block.level))
     }
 
     /// Where the backdrop stands: around the cameras, five times as far as all but the farthest points.

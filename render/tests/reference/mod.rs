@@ -247,11 +247,7 @@ impl Random {
     pub(crate) fn splat(&mut self, camera: &Camera, pixel: [f32; 2], z: f32, sigma_pixels: f32) -> Splat {
         let k = &camera.pinhole;
         let z = f64::from(z);
-        let p = DVec3::new(
-            (f64::from(pixel[0]) - k.cx) / k.fx * z,
-            (f64::from(pixel[1]) - k.cy) / k.fy * z,
-            z,
-        );
+        let p = DVec3::new((f64::from(pixel[0]) - k.cx) / k.fx * z, (f64::from(pixel[1]) - k.cy) / k.fy * z, z);
         let size = (f64::from(sigma_pixels) * z / k.fx) as f32;
         let mut sh = [[0.0; 3]; 16];
         for (b, channels) in sh.iter_mut().enumerate() {
