@@ -18,7 +18,7 @@ const MIN_SEEN: usize = 4;
 const SHARE_OF_VIEW: f64 = 0.3;
 /// ... or when it sees this share of what the block's good views (their 90th percentile) see of it. BlockGaussian's
 /// second rule takes 10 % of the block's points, which no view of a long street reaches.
-const SHARE_OF_BEST: f64 = 0.1;
+const SHARE_OF_BEST: f64 = 0.02;
 /// Views whose finest pixel is this much larger than the block resolves are left out ...
 const TOO_COARSE: f64 = 4.0;
 /// ... where at least this many others remain.
@@ -151,8 +151,10 @@ pub fn select_level(
     for (i, s) in sightings.all.iter().enumerate() {
         if last != Some(s.point) {
             last = Some(s.point);
-            halos = ground.halos_at(level, capture.points.positions[s.point as usize]).collect();
-            halos.retain(|b| selections.contains_key(b));
+            let place = capture.points.positions[s.point as usize];
+            let on_ground = ground.from_world(place).truncate();
+            halos = ground.halos_at(level, place).collect();
+            halos.retain(|b| selections.contains_key(b) && ground.focus(*b).contains(on_ground));
         }
         seen.extend(halos.iter().map(|b| (b.y, b.x, s.view, i as u32)));
     }
@@ -290,7 +292,7 @@ struct Content {
 }
 
 impl Content {
-    /// The nominal halo, out to the points where the rim has none, and the height range of the points in the halo.
+    /// The nominal focus, out to the points where the rim has none, and the height range of the points in it.
     fn new(capture: &Capture, ground: &Ground, block: BlockId, points: impl Iterator<Item = u32>) -> Self {
         let mut indices: Vec<u32> = points.collect();
         indices.sort_unstable();
@@ -299,7 +301,7 @@ impl Content {
             indices.iter().map(|&i| ground.from_world(capture.points.positions[i as usize])).collect();
         let axis = |k: usize| places.iter().map(|p| p[k]).collect::<Vec<f64>>();
         let (mut x, mut y, mut z) = (axis(0), axis(1), axis(2));
-        let (nominal, halo) = (ground.nominal_halo(block), ground.halo(block));
+        let (nominal, halo) = (ground.nominal_focus(block), ground.focus(block));
         let reach = |values: &mut [f64], k: usize| {
             let low = if halo.min[k].is_finite() { nominal.min[k] } else { nominal.min[k].min(quantile(values, 0.01)) };
             let high =

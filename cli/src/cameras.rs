@@ -2,6 +2,7 @@
 
 use std::path::Path;
 
+use dataset::mips::SHORTEST_SIDE;
 use dataset::open::{OpenOptions, Source};
 use scene::{BadInput, Camera, Capture, Pinhole};
 
@@ -27,7 +28,10 @@ pub(crate) fn name_of(path: &Path) -> String {
 }
 
 /// The capture as ingest will leave it at one over `downscale` of its size, but for the photos.
-pub(crate) fn shrunk(capture: &Capture, downscale: u32) -> Capture {
+///
+/// # Errors
+/// A factor that leaves too little of a photo.
+pub(crate) fn shrunk(capture: &Capture, downscale: u32) -> Result<Capture, BadInput> {
     let mut capture = capture.clone();
     let n = f64::from(downscale);
     for view in &mut capture.views {
@@ -40,8 +44,12 @@ pub(crate) fn shrunk(capture: &Capture, downscale: u32) -> Capture {
             cx: k.cx / n,
             cy: k.cy / n,
         };
+        if downscale > 1 && k.width.min(k.height) < SHORTEST_SIDE {
+            let problem = format!("{downscale} leaves less than {SHORTEST_SIDE} pixels of {}", view.name);
+            return Err(BadInput::new("--downscale", problem, "give a smaller factor"));
+        }
     }
-    capture
+    Ok(capture)
 }
 
 /// The camera with its picture stretched to this size.

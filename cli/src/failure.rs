@@ -71,5 +71,7 @@ impl From<LocalError> for Failure {
 /// For `map_err` on what the operating system refuses: the file, what could not be done with it, and why.
 pub(crate) fn cannot<E: std::fmt::Display>(action: &str, path: &std::path::Path) -> impl Fn(E) -> Failure {
     let (action, path) = (action.to_owned(), path.display().to_string());
-    move |error| Failure::Work(format!("{path}: cannot be {action}: {error}; check the folder and the space on the disk"))
+    move |error| {
+        Failure::Work(format!("{path}: cannot be {action}: {error}; check the folder and the space on the disk"))
+    }
 }

@@ -126,12 +126,8 @@ impl<'a> Journal<'a> {
             self.before.0 += spent.cpu_seconds;
             self.before.1 += spent.wall_seconds;
         }
-        *spent = Spent {
-            attempt,
-            step: report.step,
-            cpu_seconds: report.cpu_seconds,
-            wall_seconds: report.wall_seconds,
-        };
+        *spent =
+            Spent { attempt, step: report.step, cpu_seconds: report.cpu_seconds, wall_seconds: report.wall_seconds };
         let (cpu_seconds, wall_seconds) = self.clocks();
         let line = Line {
             task: self.blocks[task].to_string(),

@@ -107,7 +107,8 @@ pub(crate) fn write(
     let mut blocks = Vec::new();
     let splats = sew(plan, |block| -> Result<_, Failure> {
         let index = plan.tasks.iter().position(|task| task.block == block);
-        let artefact = *index.and_then(|i| results.get(i)).ok_or_else(|| Failure::Work(format!("block {block} has no result")))?;
+        let artefact =
+            *index.and_then(|i| results.get(i)).ok_or_else(|| Failure::Work(format!("block {block} has no result")))?;
         let bytes = store.get(artefact)?;
         let splats = frame::decode_splats(&bytes).map_err(|error| Failure::Work(format!("block {block}: {error}")))?;
         save(&blocks_folder.join(file_name(block)), &bytes)?;

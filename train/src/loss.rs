@@ -68,6 +68,7 @@ impl Photometric {
         let norm = 1.0 / (3.0 * total_weight);
 
         let isa = self.isa;
+        let mask = photo.mask.as_deref().unwrap_or(&[]);
         let band = BAND * width;
         let plane = |all: usize| (all / area) * area..(all / area + 1) * area;
         // Jobs are (colour plane, band of rows), in a fixed order; sums are added in that order.
@@ -83,7 +84,7 @@ impl Photometric {
             .map(|(plane_at, first_row, partials)| {
                 let (x, y) = (&colour[plane(plane_at)], &photo.rgb[plane(plane_at)]);
                 let mut sums = [0.0; 2];
-                ssim_rows(isa, x, y, weights, width, first_row, partials, &mut sums);
+                ssim_rows(isa, x, y, weights, mask, width, first_row, partials, &mut sums);
                 sums
             })
             .collect();
@@ -98,7 +99,7 @@ impl Photometric {
             let range = plane(plane_at);
             let (x, y) = (&colour[range.clone()], &photo.rgb[range.clone()]);
             let partials = [0, 1, 2].map(|k| &partials[k][range.clone()]);
-            gradient_rows(isa, x, y, weights, width, first_row, partials, scale, out);
+            gradient_rows(isa, x, y, weights, mask, width, first_row, partials, scale, out);
         });
         let total = (1.0 - f64::from(self.lambda)) * l1 + f64::from(self.lambda) * (1.0 - ssim);
         Value { l1, ssim, total }
@@ -179,7 +180,7 @@ fn lanes<L: Lanes>(slice: &[f32], at: usize) -> L {
 kernel!(
     /// SSIM's derivatives (times the weights) for the rows that `partials` cover, from `first_row` on; adds Σ w|x-y| and Σ w·SSIM to `sums`.
     fn ssim_rows(
-        x: &[f32], y: &[u8], weights: &[f32], width: usize, first_row: usize, partials: [&mut [f32]; 3], sums: &mut [f64; 2],
+        x: &[f32], y: &[u8], weights: &[f32], mask: &[u8], width: usize, first_row: usize, partials: [&mut [f32]; 3], sums: &mut [f64; 2],
     ) = ssim_rows_lanes
 );
 
@@ -188,6 +189,7 @@ fn ssim_rows_lanes<L: Lanes>(
     x: &[f32],
     y: &[u8],
     weights: &[f32],
+    mask: &[u8],
     width: usize,
     first_row: usize,
     partials: [&mut [f32]; 3],
@@ -211,6 +213,12 @@ fn ssim_rows_lanes<L: Lanes>(
             for i in 0..width {
                 let (x, y) = (x[i], f32::from(y[i]) * (1.0 / 255.0));
                 (rx[i], ry[i], rxx[i], ryy[i], rxy[i]) = (x, y, x * x, y * y, x * y);
+            }
+            // Hidden pixels are to SSIM what lies outside the image: zero in both.
+            if let Some(mask) = mask.get(row * width..(row + 1) * width) {
+                for i in (0..width).filter(|&i| mask[i] < 128) {
+                    (rx[i], ry[i], rxx[i], ryy[i], rxy[i]) = (0.0, 0.0, 0.0, 0.0, 0.0);
+                }
             }
             ring.smooth::<L>(r);
         } else {
@@ -259,7 +267,7 @@ fn ssim_rows_lanes<L: Lanes>(
 kernel!(
     /// dL/dx for the rows that `out` covers: `scale[0]·w·sign(x-y) + scale[1]·dΣSSIM/dx`.
     fn gradient_rows(
-        x: &[f32], y: &[u8], weights: &[f32], width: usize, first_row: usize, partials: [&[f32]; 3], scale: [f32; 2], out: &mut [f32],
+        x: &[f32], y: &[u8], weights: &[f32], mask: &[u8], width: usize, first_row: usize, partials: [&[f32]; 3], scale: [f32; 2], out: &mut [f32],
     ) = gradient_rows_lanes
 );
 
@@ -268,6 +276,7 @@ fn gradient_rows_lanes<L: Lanes>(
     x: &[f32],
     y: &[u8],
     weights: &[f32],
+    mask: &[u8],
     width: usize,
     first_row: usize,
     partials: [&[f32]; 3],
@@ -305,6 +314,11 @@ fn gradient_rows_lanes<L: Lanes>(
             let d_ssim = d_mu + L::splat(2.0) * x * d_xx + y * d_xy;
             let gradient = sign.fma(L::splat(scale[0]), d_ssim * L::splat(scale[1]));
             gradient.store_to(&mut out[..(out_row + 1) * width], out_row * width + i);
+        }
+        if let Some(mask) = mask.get(row * width..(row + 1) * width) {
+            for i in (0..width).filter(|&i| mask[i] < 128) {
+                out[out_row * width + i] = 0.0;
+            }
         }
     }
 }

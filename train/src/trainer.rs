@@ -75,9 +75,13 @@ impl Recipe {
         let recipe = Self::default();
         Self {
             mean: [recipe.mean[0] * 0.5, recipe.mean[1]],
+            log_scale: [recipe.log_scale[1], recipe.log_scale[1] * 0.5],
+            quat: [recipe.quat[1], recipe.quat[1]],
+            opacity: [recipe.opacity[1], recipe.opacity[1] * 0.5],
+            sh_dc: [recipe.sh_dc[0] * 0.5, recipe.sh_dc[1] * 0.5],
             sh_from: [0.0; 3],
             coarse: Vec::new(),
-            growth: Growth { from: 0.0, ..recipe.growth },
+            growth: Growth { from: 0.0, until: 0.5, every: 25, ..recipe.growth },
             ..recipe
         }
     }

@@ -116,6 +116,7 @@ impl Block<'_> {
         let recipe = self.recipe();
         let views = self.windows(&task.views)?;
         let test_views = self.windows(&task.test_views)?;
+        let budget = self.budget(&results);
         let (initial, context) = self.start(results, &views, &recipe)?;
         let mut renderer = Renderer::default();
         let counts = |p: Vec3| self.plan.ground.owns(task.block, p.as_dvec3());
@@ -127,7 +128,7 @@ impl Block<'_> {
             views: &views,
             counts: &counts,
             keeps: &keeps,
-            budget: task.budget as usize,
+            budget,
             steps: task.steps,
             antialiased: self.plan.antialiased(),
             seed: self.seed(),
@@ -167,6 +168,24 @@ impl Block<'_> {
             return Err(failed("stopped before its end, as asked"));
         }
         Ok(splats)
+    }
+
+    /// Splats to end with in the core. The plan shares the budget among the children of a block by what is known beforehand;
+    /// the parent's growth has since put splats where the error was, so the same sum is shared as they lie.
+    fn budget(&self, results: &BTreeMap<BlockId, Splats>) -> usize {
+        let (plan, task) = (self.plan, self.task);
+        let Some(splats) = task.parent.and_then(|parent| results.get(&parent)) else { return task.budget as usize };
+        let siblings: Vec<&Task> = plan.tasks.iter().filter(|t| t.parent == task.parent).collect();
+        let total: u64 = siblings.iter().map(|t| u64::from(t.budget)).sum();
+        let mut counts = vec![0u64; siblings.len()];
+        for i in 0..splats.len() {
+            let place = splats.mean(i).as_dvec3();
+            if let Some(of) = siblings.iter().position(|t| plan.ground.owns(t.block, place)) {
+                counts[of] += 1;
+            }
+        }
+        let own = siblings.iter().position(|t| t.block == task.block).map_or(0, |i| counts[i]);
+        (total * own / counts.iter().sum::<u64>().max(1)).max(1) as usize
     }
 
     /// The recipe of the block's level: a child starts from splats that fit already, one mip coarser, so it needs no

@@ -3,8 +3,8 @@
 use std::path::PathBuf;
 
 use ::bench::{birdseye_camera, oblique_camera, write_png};
-use dataset::synth::{CitySettings, write_city};
 use ::render::cpu::Renderer;
+use dataset::synth::{CitySettings, write_city};
 use glam::DVec3;
 use serde::Serialize;
 use store::Store;
@@ -52,8 +52,7 @@ pub(crate) fn run(args: &DemoArgs, output: &Output) -> Result<(), Failure> {
         let frame = renderer.forward(&trained.model.splats, None, &camera, &trained.model.options());
         write_png(path, &to_image(frame))?;
     }
-    let evaluated =
-        evaluate(&trained.model, trained.capture, store, train_args.plan.test_every, &eval_folder, output)?;
+    let evaluated = evaluate(&trained.model, trained.capture, store, train_args.plan.test_every, &eval_folder, output)?;
     save_json(&eval_folder.join("report.json"), &evaluated)?;
 
     let mut report = trained.report;
@@ -91,9 +90,9 @@ pub(crate) fn run(args: &DemoArgs, output: &Output) -> Result<(), Failure> {
 fn settings(args: &DemoArgs) -> (CitySettings, TrainArgs) {
     let whole = CitySettings::default();
     let (city, steps, budget) = if args.quick {
-        (CitySettings { extent_metres: 100.0, views: 64, width: 160, height: 112, ..whole }, 300, 12_000)
+        (CitySettings { extent_metres: 100.0, views: 64, width: 160, height: 112, ..whole }, 2500, 20_000)
     } else {
-        (whole, 6000, 80_000)
+        (whole, 9000, 80_000)
     };
     let train = TrainArgs {
         capture: args.out.join("city"),

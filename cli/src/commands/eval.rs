@@ -6,10 +6,10 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use ::render::cpu::Renderer;
 use bench::{SheetRow, contact_sheet, write_png};
 use dataset::windows::WindowReader;
 use image::RgbImage;
-use ::render::cpu::Renderer;
 use scene::{BadInput, Capture, Pixels};
 use serde::Serialize;
 use store::{BlockingStore, Store};

@@ -74,8 +74,8 @@ pub(crate) fn run(args: &InspectArgs, output: &Output) -> Result<(), Failure> {
         *sizes.entry(format!("{}x{}", k.width, k.height)).or_default() += 1;
     }
     let points = &capture.points;
-    let mean_track =
-        (!points.track_start.is_empty() && !points.is_empty()).then(|| points.seen_by.len() as f64 / points.len() as f64);
+    let mean_track = (!points.track_start.is_empty() && !points.is_empty())
+        .then(|| points.seen_by.len() as f64 / points.len() as f64);
     let inspected = Inspected {
         command: "inspect",
         scene: cameras::name_of(&args.capture),

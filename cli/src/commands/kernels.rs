@@ -1,8 +1,8 @@
 //! `plat bench kernels`: CPU time of the renderer's forward and backward passes.
 
-use glam::{DQuat, DVec3, Vec3};
 use ::render::cpu::Renderer;
 use ::render::{Options, Upstream};
+use glam::{DQuat, DVec3, Vec3};
 use scene::{Camera, Pinhole, Rigid, Splat, Splats};
 use serde::Serialize;
 use train::random;

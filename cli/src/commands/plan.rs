@@ -1,5 +1,5 @@
 //! `plat plan`: how a capture would be divided. Photos are not read, so this is quick for any capture; tasks, budgets and
-//! windows are those that `plat train` will plan, whose plan also names the photos' contents.
+//! windows are those that `plat train` will use, whose plan also names the photos' contents.
 
 use blocks::{Finding, Plan};
 use scene::{ArtefactId, Capture, frame};
@@ -48,7 +48,7 @@ pub(crate) fn run(args: &PlanArgs, output: &Output) -> Result<(), Failure> {
 
 /// Plans an opened capture; returns it as it was planned for.
 pub(crate) fn plan_of(capture: &Capture, options: &PlanOptions) -> Result<(Capture, Plan), Failure> {
-    let capture = cameras::shrunk(capture, options.downscale);
+    let capture = cameras::shrunk(capture, options.downscale)?;
     let id = ArtefactId::of(&frame::encode(dataset::ingest::CAPTURE, &capture, &[]));
     let settings = options.settings(capture.points.len());
     let plan = blocks::plan(&capture, id, &settings, &worker::execute::backend())?;

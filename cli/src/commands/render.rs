@@ -4,9 +4,9 @@
 use std::collections::BTreeSet;
 use std::path::{Component, Path, PathBuf};
 
-use image::RgbImage;
 use ::render::cpu::Renderer;
 use ::render::{Frame, Options};
+use image::RgbImage;
 use scene::{BadInput, npy};
 use serde::Serialize;
 

@@ -18,6 +18,7 @@ use worker::execute::{BlockTrainer, TrainerOptions};
 
 use crate::args::{Backend, TrainArgs};
 use crate::clock::{self, Stopwatch};
+use crate::commands::plan::plan_of;
 use crate::failure::{Failure, cannot};
 use crate::model::{self, Model, save, save_json};
 use crate::output::Output;
@@ -69,6 +70,9 @@ pub(crate) fn train(args: &TrainArgs, output: &Output) -> Result<Trained, Failur
     check_backend(args.backend)?;
     let mut clock = Stopwatch::start();
     let source = cameras::open(&args.capture, output)?;
+    // What the plan refuses is said before any photo is read.
+    let (planned_for, plan) = plan_of(&source.capture, &args.plan)?;
+    check_plan(&plan, &planned_for, output)?;
     fs::create_dir_all(&args.out).map_err(cannot("made", &args.out))?;
     let store_url = args.store.clone().unwrap_or_else(|| args.out.join("store").display().to_string());
     let store = Store::open(&store_url)?;
@@ -77,14 +81,11 @@ pub(crate) fn train(args: &TrainArgs, output: &Output) -> Result<Trained, Failur
     let ingest_cpu_seconds = clock.cpu_seconds();
 
     let Ingested { capture, id: capture_id, .. } = ingested;
+    let plan = Plan { capture: capture_id, ..plan };
     let mut resolved = args.clone();
-    let settings = args.plan.settings(capture.points.len());
-    (resolved.plan.budget.0, resolved.threads.0) = (Some(settings.budget), Some(threads));
+    (resolved.plan.budget.0, resolved.threads.0) = (Some(plan.settings.budget), Some(threads));
     let (config_text, config_hash) = config::resolved(&resolved);
     save(&args.out.join("config.toml"), config_text.as_bytes())?;
-
-    let plan = blocks::plan(&capture, capture_id, &settings, &worker::execute::backend())?;
-    check_plan(&plan, &capture, output)?;
     save_json(&args.out.join("plan.json"), &plan)?;
     save(&args.out.join("plan.svg"), blocks::draw(&plan, &capture).as_bytes())?;
     let plan_id = store.blocking().put(plan.to_frame())?;
@@ -177,8 +178,7 @@ fn train_blocks(
     journal: &mut Journal,
     output: &Output,
 ) -> Result<Vec<ArtefactId>, Failure> {
-    let options =
-        TrainerOptions { threads: threads as usize, eval_every: args.eval_every, cache_bytes: CACHE_BYTES };
+    let options = TrainerOptions { threads: threads as usize, eval_every: args.eval_every, cache_bytes: CACHE_BYTES };
     let trainers = (0..args.workers)
         .map(|_| BlockTrainer::new(store.blocking(), options).map(Arc::new))
         .collect::<Result<Vec<_>, _>>()

@@ -154,10 +154,11 @@ fn emit_lanes<L: Lanes>(records: &[Projected], first_rank: u32, tiles: (usize, u
         let columns = span(r[at::X], r[at::HALF_WIDTH], tiles.0);
         let rows = span(r[at::Y], r[at::HALF_HEIGHT], tiles.1);
         let (a, b, c) = (L::splat(r[at::A]), L::splat(r[at::B]), L::splat(r[at::C]));
-        let b_over_2c = L::splat(-0.5 * r[at::B] / r[at::C]);
-        let b_over_2a = L::splat(-0.5 * r[at::B] / r[at::A]);
+        // Where the exponent is largest on a vertical (times x) and on a horizontal line (times y).
+        let on_column = L::splat(-r[at::A] * r[at::B] / (r[at::B] * r[at::B] + r[at::C] * r[at::C]));
+        let on_row = L::splat(-r[at::B] / r[at::A]);
         // The exponent must reach log2(α_min); a little slack, as the rasterizer tests each pixel anyway.
-        let floor = L::splat(crate::ALPHA_MIN.log2() - r[at::LOG2_OPACITY] - 1e-3);
+        let reach = L::splat(r[at::LOG2_OPACITY] - crate::ALPHA_MIN.log2() + 1e-3);
         for row in rows {
             let y0 = block_y + L::splat((row * TILE) as f32 - r[at::Y]);
             let y1 = y0 + three;
@@ -167,11 +168,13 @@ fn emit_lanes<L: Lanes>(records: &[Projected], first_rank: u32, tiles: (usize, u
                 let x1 = x0 + three;
                 let x_near = x0.max(L::zero().min(x1));
                 // The largest exponent over a block lies on the vertical or horizontal line nearest to the mean.
-                let y = (b_over_2c * x_near).max(y0).min(y1);
-                let on_vertical = (a * x_near + b * y) * x_near + c * y * y;
-                let x = (b_over_2a * y_near).max(x0).min(x1);
-                let on_horizontal = (a * x + b * y_near) * x + c * y_near * y_near;
-                let blocks = floor.le(on_vertical.max(on_horizontal));
+                let y = (on_column * x_near).max(y0).min(y1);
+                let (u, v) = (a.fma(x_near, b * y), c * y);
+                let on_vertical = u.fma(u, v * v);
+                let x = (on_row * y_near).max(x0).min(x1);
+                let (u, v) = (a.fma(x, b * y_near), c * y_near);
+                let on_horizontal = u.fma(u, v * v);
+                let blocks = on_vertical.min(on_horizontal).le(reach);
                 if blocks != 0 {
                     let tile = (row * tiles.0 + column) as u32;
                     out.pairs.push((tile, Pair { rank: first_rank + n as u32, blocks }));

@@ -14,7 +14,8 @@ pub(crate) mod at {
     /// Mean in pixels.
     pub(crate) const X: usize = 0;
     pub(crate) const Y: usize = 1;
-    /// The conic (a, b, c) as exponents of two: α = 2^(LOG2_OPACITY + A dx² + B dx dy + C dy²).
+    /// The conic's Cholesky factor, for exponents of two: α = 2^(LOG2_OPACITY - (A dx + B dy)² - (C dy)²). The conic itself
+    /// would cancel along needles: its error grows with the square of their length.
     pub(crate) const A: usize = 2;
     pub(crate) const B: usize = 3;
     pub(crate) const C: usize = 4;
@@ -147,8 +148,10 @@ pub(crate) fn ewa<L: Lanes>(splats: &Splats, i: usize, view: &View, p: [L; 3]) -
         a[0][0].fma(a[0][1], a[1][0].fma(a[1][1], a[2][0] * a[2][1])),
         a[0][1].fma(a[0][1], a[1][1].fma(a[1][1], a[2][1] * a[2][1])),
     ];
-    let det0 = (cov[0] * cov[2] - cov[1] * cov[1]).max(L::zero());
-    let det1 = (cov[0] + L::splat(BLUR)) * (cov[2] + L::splat(BLUR)) - cov[1] * cov[1];
+    // A sum of squares (Cauchy and Binet), as xx·yy - xy² would cancel in needles.
+    let minors = each!(c in [0, 1, 2] => a[c][0] * a[(c + 1) % 3][1] - a[c][1] * a[(c + 1) % 3][0]);
+    let det0 = dot(minors, minors);
+    let det1 = L::splat(BLUR).fma(cov[0] + cov[2] + L::splat(BLUR), det0);
     Ewa { inv_z, u, free, quat, inv_norm, axes, scale, t, a, cov, det0, det1 }
 }
 
@@ -223,8 +226,12 @@ fn project_group<L: Lanes>(
     let half_height = (reach * var_y).max(L::zero()).sqrt();
     let x = L::splat(view.focal[0]) * p[0] * e.inv_z + L::splat(view.principal[0]);
     let y = L::splat(view.focal[1]) * p[1] * e.inv_z + L::splat(view.principal[1]);
+    // `exp2` turns NaN into a number, so scales and opacity are looked at themselves.
+    let scales = each!(c in [0, 1, 2] => L::load_from(splats.col(column::LOG_SCALE + c), i, 0.0).abs());
+    let logit = L::load_from(splats.col(column::OPACITY), i, 0.0).abs();
     // A pixel is touched when its centre lies in the box; NaN fails every comparison and is culled.
     let seen = in_front
+        & (scales[0] + scales[1] + scales[2] + logit).lt(L::splat(f32::MAX))
         & L::zero().lt(reach)
         & L::zero().lt(e.det1)
         & (x - half_width).le(L::splat(view.size[0] - 0.5))
@@ -248,15 +255,20 @@ fn project_group<L: Lanes>(
             }
         }
     }
+    // Colours that are not finite, or absurd, would poison whole pixels: such splats are culled.
+    let absurd = L::splat(1e6);
+    let seen = seen & colour[0].abs().lt(absurd) & colour[1].abs().lt(absurd) & colour[2].abs().lt(absurd);
     let colour = each!(c in [0, 1, 2] => colour[c].max(L::zero()));
 
-    let log2e = std::f32::consts::LOG2_E;
+    let half_log2e = L::splat(0.5 * std::f32::consts::LOG2_E);
+    let inv_std_y = (half_log2e / var_y).sqrt();
+    let inv_std_x = (half_log2e * var_y * inv_det).sqrt(); // of x given y
     let lanes = [
         x,
         y,
-        var_y * inv_det * L::splat(-0.5 * log2e),
-        e.cov[1] * inv_det * L::splat(log2e),
-        var_x * inv_det * L::splat(-0.5 * log2e),
+        inv_std_x,
+        -(inv_std_x * e.cov[1] / var_y),
+        inv_std_y,
         opacity.map(f32::log2),
         colour[0],
         colour[1],

@@ -89,10 +89,10 @@ fn backward_group<L: Lanes>(
         conic[0].fma(s[moment::VX], conic[1] * s[moment::VY]),
         conic[1].fma(s[moment::VX], conic[2] * s[moment::VY]),
     ];
-    (d_mean[0] * d_mean[0] + d_mean[1] * d_mean[1]).sqrt().store_to(sink.screen, at);
+    (d_mean[0] * d_mean[0] + d_mean[1] * d_mean[1]).sqrt().keep(seen).store_to(sink.screen, at);
     let (ax, ay) = (s[moment::ABS_X], s[moment::ABS_Y]);
-    (ax * ax + ay * ay).sqrt().store_to(sink.screen_abs, at);
-    s[moment::WEIGHT].store_to(sink.weight, at);
+    (ax * ax + ay * ay).sqrt().keep(seen).store_to(sink.screen_abs, at);
+    s[moment::WEIGHT].keep(seen).store_to(sink.weight, at);
 
     // dΣ' = -K G K with G the symmetric gradient of the conic K.
     let g = [-(half * s[moment::VXX]), -(half * s[moment::VXY]), -(half * s[moment::VYY])];
@@ -108,7 +108,7 @@ fn backward_group<L: Lanes>(
 
     // Opacity: Σ v = o_eff · dL/do_eff, and o_eff = o · √(det0 / det1) in anti-aliased mode.
     let o = opacity::<L>(splats, i);
-    (s[moment::V] * (one - o)).store_to(sink.columns[column::OPACITY], at);
+    (s[moment::V] * (one - o)).keep(seen).store_to(sink.columns[column::OPACITY], at);
     if options.antialiased {
         let ratio = det0 * inv_det;
         // dL/d ratio = ½ Σv / ratio; d ratio / dΣ' = adj(Σ)/det1 - ratio·K.
@@ -132,7 +132,7 @@ fn backward_group<L: Lanes>(
                 d_t[r][j] = d_a[r].fma(axes[c][j], d_t[r][j]);
             }
         }
-        dot(d_axis, axes[c]).store_to(sink.columns[column::LOG_SCALE + c], at);
+        dot(d_axis, axes[c]).keep(seen).store_to(sink.columns[column::LOG_SCALE + c], at);
         d_rotation[c] = each!(j in [0, 1, 2] => d_axis[j] * scale[c]);
     }
     let [[d00, d10, d20], [d01, d11, d21], [d02, d12, d22]] = d_rotation;
@@ -148,7 +148,7 @@ fn backward_group<L: Lanes>(
     ];
     let radial = w * d_unit[0] + x * d_unit[1] + y * d_unit[2] + z * d_unit[3];
     for c in 0..4 {
-        ((d_unit[c] - quat[c] * radial) * inv_norm).store_to(sink.columns[column::QUAT + c], at);
+        ((d_unit[c] - quat[c] * radial) * inv_norm).keep(seen).store_to(sink.columns[column::QUAT + c], at);
     }
 
     // Through T = J W and the projection of the centre.
@@ -185,13 +185,13 @@ fn backward_group<L: Lanes>(
     // Clamped at zero: no gradient.
     let d_colour = each!(c in [0, 1, 2] => L::select(L::zero().lt(colour[c]), d_colour[c], L::zero()));
     for c in 0..3 {
-        (d_colour[c] * c0).store_to(sink.columns[column::SH + c], at);
+        (d_colour[c] * c0).keep(seen).store_to(sink.columns[column::SH + c], at);
     }
     if degree > 0 {
         let mut along = [L::zero(); 15];
         for b in 1..coefficients {
             for c in 0..3 {
-                (d_colour[c] * basis[b - 1]).store_to(sink.columns[column::SH + 3 * b + c], at);
+                (d_colour[c] * basis[b - 1]).keep(seen).store_to(sink.columns[column::SH + 3 * b + c], at);
                 along[b - 1] = d_colour[c].fma(coefficient::<L>(splats, i, b, c), along[b - 1]);
             }
         }
@@ -203,7 +203,7 @@ fn backward_group<L: Lanes>(
         }
     }
     for c in 0..3 {
-        d_world[c].store_to(sink.columns[column::MEAN + c], at);
+        d_world[c].keep(seen).store_to(sink.columns[column::MEAN + c], at);
     }
 
     // Pose: translation moves the centre of the splat and of the camera, rotation the centre and the axes W.
@@ -223,6 +223,16 @@ fn backward_group<L: Lanes>(
         }
     }
 }
+
+/// Zero in the lanes of splats that were not seen, whatever their parameters made of it.
+trait Keep: Lanes {
+    #[inline(always)]
+    fn keep(self, seen: u16) -> Self {
+        Self::select(seen, self, Self::zero())
+    }
+}
+
+impl<L: Lanes> Keep for L {}
 
 /// SH coefficient `b` of channel `c` of sixteen splats.
 #[inline(always)]

@@ -76,6 +76,9 @@ impl TileInput<'_> {
 
     #[inline(always)]
     fn gather(&self, plane: &[f32], scale: f32, out: &mut Plane) {
+        if plane.is_empty() {
+            return;
+        }
         self.runs(|block, lane, count, offset| {
             for k in 0..count {
                 out[block][lane + k] = plane[offset + k] * scale;
@@ -136,7 +139,8 @@ impl<L: Lanes> Spread<L> {
     fn alpha(&self, block: usize, lane_x: L, lane_y: L) -> Alpha<L> {
         let dx = lane_x + L::splat(self.x + (block % 4 * 4) as f32);
         let dy = lane_y + L::splat(self.y + (block / 4 * 4) as f32);
-        let exponent = dx.fma(self.a.fma(dx, self.b * dy), (self.c * dy).fma(dy, self.log2_opacity));
+        let (u, v) = (self.a.fma(dx, self.b * dy), self.c * dy);
+        let exponent = (-u).fma(u, (-v).fma(v, self.log2_opacity));
         let raw = exponent.exp2();
         let drawn = L::splat(ALPHA_MIN).le(raw);
         let clamped = L::splat(ALPHA_MAX).le(raw);
@@ -281,11 +285,6 @@ fn rasterize_backward_tile<L: Lanes, const DEPTH: bool>(tile: &TileInput, band: 
     }
     // What lies behind the splats seen so far, weighted by the upstream gradient; at first all of it.
     let mut behind: Plane = [[0.0; 16]; BLOCKS];
-    tile.runs(|block, lane, count, offset| {
-        for k in 0..count {
-            behind[block][lane + k] = (0..3).map(|c| band.colour[c][offset + k] * band.d_colour[c][offset + k]).sum();
-        }
-    });
     let mut product = |value: &[f32], gradient: &[f32]| {
         if !gradient.is_empty() {
             tile.runs(|block, lane, count, offset| {
@@ -295,6 +294,9 @@ fn rasterize_backward_tile<L: Lanes, const DEPTH: bool>(tile: &TileInput, band: 
             });
         }
     };
+    for c in 0..3 {
+        product(band.colour[c], band.d_colour[c]);
+    }
     product(band.transmittance, band.d_transmittance);
     if DEPTH {
         product(band.depth, band.d_depth);
@@ -313,8 +315,9 @@ fn rasterize_backward_tile<L: Lanes, const DEPTH: bool>(tile: &TileInput, band: 
         let own = r[at::OWN] > 0.0;
         // dα/d(mean) / α, for the absolute sums: the exponent's derivative in natural units.
         let ln2 = std::f32::consts::LN_2;
+        let (a, b, c) = (r[at::A], r[at::B], r[at::C]);
         let (a2, b1, c2) =
-            (L::splat(2.0 * ln2 * r[at::A]), L::splat(ln2 * r[at::B]), L::splat(2.0 * ln2 * r[at::C]));
+            (L::splat(2.0 * ln2 * a * a), L::splat(2.0 * ln2 * a * b), L::splat(2.0 * ln2 * (b * b + c * c)));
         let mut sums = [L::zero(); 16];
         while blocks != 0 {
             let b = blocks.trailing_zeros() as usize & (BLOCKS - 1);

@@ -1,0 +1,179 @@
+//! The program as scripts see it: exit codes, files, bytes.
+
+use std::path::Path;
+use std::process::{Command, Output};
+
+use dataset::synth::{CitySettings, write_city};
+use glam::Vec3;
+use scene::{Splat, Splats, npy, ply};
+use serde_json::Value;
+
+fn plat(folder: &Path, words: &[&str]) -> Output {
+    let program = env!("CARGO_BIN_EXE_plat");
+    Command::new(program).args(words).current_dir(folder).output().expect("plat runs")
+}
+
+/// Runs a command that must succeed, and its JSON.
+fn done(folder: &Path, words: &[&str]) -> Value {
+    let output = plat(folder, &[words, &["--json"]].concat());
+    assert!(output.status.success(), "{words:?}: {}", String::from_utf8_lossy(&output.stderr));
+    let text = String::from_utf8(output.stdout).unwrap();
+    serde_json::from_str(text.lines().last().expect("an object on the last line")).unwrap()
+}
+
+/// Runs a command that must be refused with one line that says this.
+fn refused(folder: &Path, words: &[&str], wanted: &str) {
+    let output = plat(folder, words);
+    let line = String::from_utf8(output.stderr).unwrap();
+    assert_eq!(output.status.code(), Some(2), "{words:?}: {line}");
+    assert!(line.contains(wanted) && line.trim_end().lines().count() == 1, "{words:?}: {line}");
+    assert!(output.stdout.is_empty());
+}
+
+fn city(folder: &Path, views: u32) {
+    let settings = CitySettings { seed: 3, extent_metres: 80.0, views, width: 64, height: 48 };
+    write_city(&folder.join("city"), &settings, |_, _| {}).unwrap();
+}
+
+/// One red splat five metres in front of the origin.
+fn red_splat() -> Vec<u8> {
+    let mut splats = Splats::new(0);
+    splats.push(&Splat::round(Vec3::new(0.0, 0.0, -5.0), 0.0, Vec3::new(0.9, 0.1, 0.1), 0.99));
+    ply::write(&splats, &[])
+}
+
+/// Two views from the origin along -z (OpenGL's forward), whose photos do not exist; one lies in a sub-folder.
+const CAMERAS: &str = r#"{"w": 20, "h": 10, "fl_x": 10, "fl_y": 10, "cx": 10, "cy": 5, "frames": [
+    {"file_path": "front/a.jpg", "transform_matrix": [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]},
+    {"file_path": "b.png", "transform_matrix": [[-1,0,0,0],[0,1,0,0],[0,0,-1,0],[0,0,0,1]]}]}"#;
+
+#[test]
+fn bad_usage_and_bad_input_exit_with_2_and_one_line() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    std::fs::write(at.join("whole.ply"), red_splat()).unwrap();
+    std::fs::write(at.join("cut.ply"), &red_splat()[..300]).unwrap();
+    std::fs::write(at.join("cut2.ply"), &red_splat()[..red_splat().len() - 1]).unwrap();
+    std::fs::write(at.join("notes.txt"), "notes").unwrap();
+    std::fs::write(at.join("cameras.json"), CAMERAS).unwrap();
+    std::fs::write(at.join("bad.toml"), "stepps = 3\n").unwrap();
+    std::fs::create_dir(at.join("empty")).unwrap();
+    city(at, 16);
+    refused(at, &[], "plat demo");
+    refused(at, &["fly"], "fly");
+    refused(at, &["train", "city", "--out", "o", "--speed", "9"], "--speed");
+    refused(at, &["train", "city"], "--out");
+    refused(at, &["train", "missing", "--out", "o"], "missing");
+    refused(at, &["train", "empty", "--out", "o"], "empty");
+    refused(at, &["train", "city", "--out", "o", "--backend", "gpu"], "--backend");
+    refused(at, &["train", "city", "--out", "o", "--steps", "0"], "--steps");
+    refused(at, &["train", "city", "--out", "o", "--downscale", "40"], "--downscale");
+    refused(at, &["train", "city", "--out", "o", "--store", "ftp://x"], "ftp");
+    refused(at, &["train", "city", "--out", "o", "--config", "bad.toml"], "stepps");
+    refused(at, &["plan", "city", "--levels", "99"], "levels");
+    refused(at, &["inspect", "missing"], "missing");
+    for model in ["missing.ply", "cut.ply", "cut2.ply", "notes.txt", "empty"] {
+        refused(at, &["render", model, "--cameras", "cameras.json", "--out", "o"], model);
+        refused(at, &["export", model, "--to", "ply", "--out", "o.ply"], model);
+    }
+    refused(at, &["render", "whole.ply", "--cameras", "notes.txt", "--out", "o"], "notes.txt");
+    refused(at, &["eval", "whole.ply", "missing"], "missing");
+    refused(at, &["bench", "chart"], "bench/results");
+    let train = plat(at, &["train", "--help"]);
+    assert!(train.status.success() && !train.stdout.is_empty());
+}
+
+#[test]
+fn views_are_drawn_from_cameras_alone() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    std::fs::write(at.join("red.ply"), red_splat()).unwrap();
+    std::fs::write(at.join("cameras.json"), CAMERAS).unwrap();
+    let said = done(at, &["render", "red.ply", "--cameras", "cameras.json", "--out", "o", "--depth"]);
+    assert_eq!((&said["views"], &said["splats"], &said["antialiased"]), (&2.into(), &1.into(), &false.into()));
+    let front = image::open(at.join("o/front/a.png")).unwrap().to_rgb8();
+    assert_eq!(front.dimensions(), (20, 10));
+    let [red, green, _] = front.get_pixel(10, 5).0;
+    assert!(red > 200 && green < 40, "{red} {green}");
+    let back = image::open(at.join("o/b.png")).unwrap().to_rgb8();
+    assert!(back.pixels().all(|pixel| pixel.0 == [0; 3]), "the view that looks away sees nothing");
+    let (shape, depth) = npy::read_f32(&std::fs::read(at.join("o/front/a.depth.npy")).unwrap()).unwrap();
+    assert_eq!(shape, [10, 20]);
+    assert!((depth[5 * 20 + 10] - 5.0).abs() < 1e-4 && depth[0] == 0.0, "{} {}", depth[5 * 20 + 10], depth[0]);
+
+    done(at, &["render", "red.ply", "--cameras", "cameras.json", "--out", "large", "--size", "40x20"]);
+    assert_eq!(image::image_dimensions(at.join("large/b.png")).unwrap(), (40, 20));
+    std::fs::write(at.join("out.json"), CAMERAS.replace("front/a.jpg", "../a.jpg")).unwrap();
+    let output = plat(at, &["render", "red.ply", "--cameras", "out.json", "--out", "o2"]);
+    assert!(output.status.code() == Some(2) && !at.join("a.png").exists());
+}
+
+#[test]
+fn a_city_is_trained_measured_and_exported_the_same_twice() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    city(at, 20);
+    let train = |out: &str, threads: &str| {
+        let options = ["--steps", "60", "--budget", "800", "--levels", "1", "--eval-every", "20", "--threads", threads];
+        done(at, &[&["train", "city", "--out", out][..], &options].concat())
+    };
+    let report = train("one", "1");
+    train("two", "2");
+    let bytes = |path: &str| std::fs::read(at.join(path)).unwrap();
+    assert!(bytes("one/merged.ply") == bytes("two/merged.ply"), "the number of threads shows in the result");
+    assert_eq!(bytes("one/plan.json"), bytes("two/plan.json"));
+
+    let text = |path: &str| String::from_utf8(bytes(path)).unwrap();
+    let lines: Vec<Value> = text("one/metrics.jsonl").lines().map(|l| serde_json::from_str(l).unwrap()).collect();
+    assert!(lines.iter().all(|l| l["task"].is_string() && l["cpu_seconds"].is_f64() && l["splats"].is_u64()));
+    assert!(lines.is_sorted_by_key(|l| l["cpu_seconds"].as_f64().map(|s| (s * 1e6) as u64)), "clocks run on");
+    assert!(lines.iter().any(|l| l["psnr"].is_f64()));
+    assert!(text("one/plan.svg").starts_with("<svg"));
+    let stored: Value = serde_json::from_slice(&bytes("one/report.json")).unwrap();
+    assert_eq!((&stored["plan"], &stored["command"], &report["seed"]), (&report["plan"], &"train".into(), &0.into()));
+    for key in ["commit", "machine", "scene", "config_hash", "backend", "lpips", "zone_psnr", "bytes_moved", "fps"] {
+        assert!(report.get(key).is_some(), "{key}");
+    }
+    let antialiased = ply::comments(&bytes("one/merged.ply")).iter().any(|c| c == "antialiased");
+    assert_eq!(report["antialiased"], antialiased);
+
+    // The configuration that a run leaves makes the same plan.
+    done(at, &["train", "city", "--out", "three", "--config", "one/config.toml", "--threads", "2"]);
+    assert!(bytes("three/merged.ply") == bytes("one/merged.ply"));
+
+    let measured = done(at, &["eval", "one", "city"]);
+    assert_eq!(measured["views"].as_array().unwrap().len(), 3);
+    assert!(measured["psnr"].as_f64().unwrap() > 8.0 && at.join("one/eval/sheet.png").is_file());
+    let again = done(at, &["eval", "one/merged.ply", "city"]);
+    assert_eq!(again["psnr"], measured["psnr"], "the merged file is the model");
+    done(at, &["export", "one", "--to", "ply", "--out", "deep/er/city.ply"]);
+    assert!(bytes("deep/er/city.ply") == bytes("one/merged.ply"));
+
+    // Cameras without their photos are enough to draw.
+    std::fs::remove_dir_all(at.join("city/images")).unwrap();
+    let drawn = done(at, &["render", "one", "--cameras", "city", "--out", "views"]);
+    assert_eq!((&drawn["views"], &drawn["antialiased"]), (&20.into(), &antialiased.into()));
+}
+
+#[test]
+fn captures_are_inspected_and_planned() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    city(at, 20);
+    let found = done(at, &["inspect", "city"]);
+    assert_eq!((&found["views"], &found["format"]), (&20.into(), &"colmap".into()));
+    assert!(found["estimate"]["memory_bytes"].as_u64().unwrap() > 0 && found["problem"].is_null());
+    let planned = done(at, &["plan", "city", "--out", "plan.json", "--svg", "plan.svg", "--levels", "1"]);
+    assert!(planned["tasks"].as_u64().unwrap() >= 2);
+    let plan: blocks::Plan = serde_json::from_slice(&std::fs::read(at.join("plan.json")).unwrap()).unwrap();
+    assert_eq!(planned["plan"], plan.id().to_string());
+    // Training plans the same, but for the photos' contents.
+    done(at, &["train", "city", "--out", "o", "--levels", "1", "--steps", "1", "--blocks", "tree"]);
+    let trained: blocks::Plan = serde_json::from_slice(&std::fs::read(at.join("o/plan.json")).unwrap()).unwrap();
+    let same = done(at, &["plan", "city", "--out", "one.json", "--levels", "1", "--steps", "1"]);
+    let one: blocks::Plan = serde_json::from_slice(&std::fs::read(at.join("one.json")).unwrap()).unwrap();
+    assert!(same["plan"] != trained.id().to_string() && one.tasks == trained.tasks);
+    assert!(std::fs::read_to_string(at.join("plan.svg")).unwrap().starts_with("<svg"));
+    let human = plat(at, &["plan", "city"]);
+    assert!(human.status.success() && String::from_utf8(human.stdout).unwrap().contains("level 0"));
+}
