@@ -195,7 +195,10 @@ impl Plan {
 
     /// The task of a block.
     pub fn task(&self, block: BlockId) -> Option<&Task> {
-        self.tasks.binary_search_by_key(&training_order(block), |t| training_order(t.block)).ok().map(|i| &self.tasks[i])
+        self.tasks
+            .binary_search_by_key(&training_order(block), |t| training_order(t.block))
+            .ok()
+            .map(|i| &self.tasks[i])
     }
 
     /// The finest model: which task's splats count where. Every place has exactly one owner.

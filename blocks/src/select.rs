@@ -18,7 +18,7 @@ const MIN_SEEN: usize = 4;
 const SHARE_OF_VIEW: f64 = 0.3;
 /// ... or when it sees this share of what the block's good views (their 90th percentile) see of it. BlockGaussian's
 /// second rule takes 10 % of the block's points, which no view of a long street reaches.
-const SHARE_OF_BEST: f64 = 0.02;
+const SHARE_OF_BEST: f64 = 0.1;
 /// Views whose finest pixel is this much larger than the block resolves are left out ...
 const TOO_COARSE: f64 = 4.0;
 /// ... where at least this many others remain.
@@ -151,10 +151,8 @@ pub fn select_level(
     for (i, s) in sightings.all.iter().enumerate() {
         if last != Some(s.point) {
             last = Some(s.point);
-            let place = capture.points.positions[s.point as usize];
-            let on_ground = ground.from_world(place).truncate();
-            halos = ground.halos_at(level, place).collect();
-            halos.retain(|b| selections.contains_key(b) && ground.focus(*b).contains(on_ground));
+            halos = ground.halos_at(level, capture.points.positions[s.point as usize]).collect();
+            halos.retain(|b| selections.contains_key(b));
         }
         seen.extend(halos.iter().map(|b| (b.y, b.x, s.view, i as u32)));
     }
@@ -245,14 +243,12 @@ impl Seen {
         Self { view, count: depth.len(), depth_metres, footprint_metres, bounds }
     }
 
-    /// The window of the mip that fits, around the seen points and the block's box; `None` where it is a sliver.
+    /// The window of the mip that fits, around the box of the block's focus (around the seen points where that cannot be
+    /// projected); `None` where it is a sliver.
     fn window(&self, capture: &Capture, content: &Content, rho_metres: f64) -> Option<ViewUse> {
         let camera = &capture.views[self.view as usize].camera;
         let mip = mip_for(camera, self.depth_metres, rho_metres);
-        let (mut low, mut high) = self.bounds;
-        if let Some((box_low, box_high)) = content.project(camera, 0.05 * self.depth_metres) {
-            (low, high) = (low.min(box_low), high.max(box_high));
-        }
+        let (low, high) = content.project(camera, 0.05 * self.depth_metres).unwrap_or(self.bounds);
         let small = camera.mip(mip);
         let scale = 1.0 / f64::from(1u32 << mip);
         let pad = (high - low) * WINDOW_PAD + 2.0 / scale;
@@ -399,11 +395,11 @@ mod tests {
                 let (window, full) = (used.window, image.full());
                 assert!(window.x + window.width <= full.width && window.y + window.height <= full.height);
                 assert!(window.x % TILE == 0 && window.y % TILE == 0);
-                // All but stray points of the halo that this view sees lie in the window.
+                // All but stray points of the focus that this view sees lie in the window.
                 let (mut inside, mut all) = (0, 0);
                 for s in sightings.all.iter().filter(|s| s.view == used.view) {
                     let place = capture.points.positions[s.point as usize];
-                    if ground.in_halo(block, place) {
+                    if ground.focus(block).contains(ground.from_world(place).truncate()) {
                         let (pixel, _) = image.window(window).project(place);
                         all += 1;
                         inside += i32::from(

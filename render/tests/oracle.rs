@@ -83,10 +83,7 @@ fn case(name: &str) -> Option<Case> {
             cx: k[2],
             cy: k[5],
         },
-        camera_from_world: Rigid {
-            rotation: DQuat::from_mat3(&rotation),
-            translation: DVec3::new(v[3], v[7], v[11]),
-        },
+        camera_from_world: Rigid { rotation: DQuat::from_mat3(&rotation), translation: DVec3::new(v[3], v[7], v[11]) },
     };
     let bg = get("bg");
     let background = [bg[0] as f32, bg[1] as f32, bg[2] as f32];
@@ -101,8 +98,7 @@ fn planes(values: &[f64], channels: usize) -> Vec<f32> {
 
 fn cosine(a: &[f32], b: &[f64]) -> (f64, f64) {
     let dot = |f: &dyn Fn(usize) -> f64| (0..b.len()).map(f).sum::<f64>();
-    let (ab, aa, bb) =
-        (dot(&|i| f64::from(a[i]) * b[i]), dot(&|i| f64::from(a[i]).powi(2)), dot(&|i| b[i] * b[i]));
+    let (ab, aa, bb) = (dot(&|i| f64::from(a[i]) * b[i]), dot(&|i| f64::from(a[i]).powi(2)), dot(&|i| b[i] * b[i]));
     (ab / (aa * bb).sqrt(), (aa / bb).sqrt())
 }
 
@@ -138,8 +134,10 @@ fn images_and_gradients_agree_with_the_float64_oracle() {
                 let expected = &arrays[key].1;
                 let n = splats.len();
                 let width = expected.len() / n;
-                let ours: Vec<f32> =
-                    (0..n).flat_map(|i| (0..width).map(move |k| (i, k))).map(|(i, k)| gradients.columns[first + k][i]).collect();
+                let ours: Vec<f32> = (0..n)
+                    .flat_map(|i| (0..width).map(move |k| (i, k)))
+                    .map(|(i, k)| gradients.columns[first + k][i])
+                    .collect();
                 let (cosine, ratio) = cosine(&ours, expected);
                 println!("{name} {} {key}: cosine {cosine:.8}, length ratio {ratio:.6}", isa.name());
                 assert!(cosine > 0.99999 && (ratio - 1.0).abs() < 1e-3, "{name} {} {key}", isa.name());

@@ -187,8 +187,7 @@ impl CameraModel {
         let [k1, k2, p1, p2, k3, k4, k5, k6] = self.distortion();
         let (x, y) = (ideal.x, ideal.y);
         let r2 = ideal.length_squared();
-        let radial =
-            (1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1.0 + r2 * (k4 + r2 * (k5 + r2 * k6)));
+        let radial = (1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1.0 + r2 * (k4 + r2 * (k5 + r2 * k6)));
         DVec2::new(
             x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
             y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
@@ -203,10 +202,7 @@ mod tests {
     fn camera() -> Camera {
         Camera {
             pinhole: Pinhole { width: 101, height: 50, fx: 80.0, fy: 90.0, cx: 50.0, cy: 24.0 },
-            camera_from_world: Rigid {
-                rotation: DQuat::from_rotation_y(0.3),
-                translation: DVec3::new(1.0, 2.0, 3.0),
-            },
+            camera_from_world: Rigid { rotation: DQuat::from_rotation_y(0.3), translation: DVec3::new(1.0, 2.0, 3.0) },
         }
     }
 

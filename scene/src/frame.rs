@@ -85,8 +85,7 @@ pub struct SplatsHeader {
 
 /// Splats as a frame: all columns one after the other, f32 little endian.
 pub fn encode_splats(splats: &Splats) -> Vec<u8> {
-    let bulk: Vec<u8> =
-        splats.columns().iter().flat_map(|c| bytemuck::cast_slice::<f32, u8>(c)).copied().collect();
+    let bulk: Vec<u8> = splats.columns().iter().flat_map(|c| bytemuck::cast_slice::<f32, u8>(c)).copied().collect();
     encode(SPLATS, &SplatsHeader { sh_degree: splats.sh_degree(), count: splats.len() as u64 }, &bulk)
 }
 
@@ -106,9 +105,8 @@ pub fn decode_splats(bytes: &[u8]) -> Result<Splats, CodecError> {
     if header.count == 0 {
         return Ok(Splats::new(header.sh_degree));
     }
-    let values = |chunk: &[u8]| {
-        chunk.chunks_exact(4).map(|b| f32::from_le_bytes(b.try_into().expect("four bytes"))).collect()
-    };
+    let values =
+        |chunk: &[u8]| chunk.chunks_exact(4).map(|b| f32::from_le_bytes(b.try_into().expect("four bytes"))).collect();
     let columns = bulk.chunks_exact(4 * header.count as usize).map(values).collect();
     Splats::from_columns(columns).ok_or_else(|| CodecError::new("splat columns of unequal length"))
 }

@@ -21,6 +21,6 @@ pub mod transforms;
 pub use camera::{Camera, CameraModel, Pinhole, Rect, Rigid};
 pub use capture::{Capture, GeoOrigin, SparsePoints, View};
 pub use error::{BadInput, CodecError};
-pub use image::Pixels;
 pub use ids::{ArtefactId, BlockId};
+pub use image::Pixels;
 pub use splats::{Splat, Splats, column};

@@ -127,7 +127,10 @@ pub fn refine(
     for i in 0..n {
         if !splats.is_finite(i) {
             refined.broken += 1;
-        } else if !keeps(splats.mean(i)) || splats.col(column::OPACITY)[i] < min_logit || (evidence.views[i] > 2 && evidence.weight[i] < 0.02) {
+        } else if !keeps(splats.mean(i))
+            || splats.col(column::OPACITY)[i] < min_logit
+            || (evidence.views[i] > 2 && evidence.weight[i] < 0.02)
+        {
             refined.removed += 1;
         } else {
             kept.push(i as u32);
@@ -141,9 +144,8 @@ pub fn refine(
     let wanted = ((target.saturating_sub(owned)) as f64 * share) as usize;
     let wanted = wanted.min(limit).min(kept.len());
     let mut order = kept.clone();
-    let by_error = |a: &u32, b: &u32| {
-        evidence.error[*b as usize].total_cmp(&evidence.error[*a as usize]).then(a.cmp(b))
-    };
+    let by_error =
+        |a: &u32, b: &u32| evidence.error[*b as usize].total_cmp(&evidence.error[*a as usize]).then(a.cmp(b));
     if wanted < order.len() {
         order.select_nth_unstable_by(wanted, by_error);
     }
@@ -229,8 +231,7 @@ mod tests {
         for i in 0..n {
             splats.push(&Splat::round(Vec3::new(i as f32, 0.0, 0.0), -1.0, Vec3::splat(0.5), 0.5));
         }
-        let evidence =
-            Evidence { error: (0..n).map(|i| i as f32).collect(), weight: vec![1.0; n], views: vec![5; n] };
+        let evidence = Evidence { error: (0..n).map(|i| i as f32).collect(), weight: vec![1.0; n], views: vec![5; n] };
         (splats, evidence)
     }
 

@@ -15,8 +15,7 @@ const TAPS: usize = 11;
 /// Rows or columns beyond a pixel that its window reaches.
 const REACH: usize = TAPS / 2;
 /// exp(-d² / (2·1.5²)) for d = 5, 4, … 0, normalised so that the eleven taps sum to one.
-const WINDOW: [f32; REACH + 1] =
-    [0.001_028_38, 0.007_598_758, 0.036_000_773, 0.109_360_69, 0.213_005_54, 0.266_011_72];
+const WINDOW: [f32; REACH + 1] = [0.001_028_38, 0.007_598_758, 0.036_000_773, 0.109_360_69, 0.213_005_54, 0.266_011_72];
 /// Stabilisers for values in 0..1.
 const C1: f32 = 0.01 * 0.01;
 const C2: f32 = 0.03 * 0.03;
@@ -394,8 +393,7 @@ mod tests {
                 let (mut up, mut down) = (exact.clone(), exact.clone());
                 up[i] += step;
                 down[i] -= step;
-                let slope =
-                    (naive(&up, &photo, &weights, 0.2) - naive(&down, &photo, &weights, 0.2)) / (2.0 * step);
+                let slope = (naive(&up, &photo, &weights, 0.2) - naive(&down, &photo, &weights, 0.2)) / (2.0 * step);
                 assert!((f64::from(gradient[i]) - slope).abs() < 2e-7, "{i}: {} against {slope}", gradient[i]);
             }
         }

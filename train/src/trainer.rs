@@ -207,7 +207,8 @@ pub fn train(job: Job, report: &mut dyn FnMut(Progress) -> Flow) -> Result<Splat
         }
         let progress = step as f32 / steps as f32;
         let view = pick(views, job.seed, step);
-        let (mip, rect, camera) = (0..=coarser(recipe, progress)).rev().find_map(|c| view.at(c)).expect("at(0) always is");
+        let (mip, rect, camera) =
+            (0..=coarser(recipe, progress)).rev().find_map(|c| view.at(c)).expect("at(0) always is");
         let photo = job.source.window(view.view, mip, rect).map_err(TrainError::Source)?;
 
         let sh_degree = recipe.sh_from.iter().filter(|&&from| progress >= from).count() as u8;
@@ -285,10 +286,14 @@ fn rates(recipe: &Recipe, progress: f32, log_scale_bounds: [f32; 2]) -> Rates {
 fn pixel_weights(frame: &render::Frame, photo: &Pixels, weights: &mut Vec<f32>) {
     weights.clear();
     if !frame.own.is_empty() {
-        // A pixel that nothing explains yet counts in full: whoever sees it may repair it.
-        const UNEXPLAINED: f32 = 0.01;
+        // What nothing explains yet is half the block's: whoever sees it may repair it. Squared, as Adam makes steps of a
+        // given size of however small a gradient, if only it is steady.
+        const UNEXPLAINED: f32 = 0.5;
+        const NOTHING: f32 = 1e-4;
         weights.extend(frame.own.iter().zip(&frame.transmittance).map(|(own, transmittance)| {
-            (own + UNEXPLAINED) / (1.0 - transmittance + UNEXPLAINED)
+            let open = UNEXPLAINED * transmittance + NOTHING;
+            let share = (own + open) / (1.0 - transmittance + open);
+            share * share
         }));
     }
     if let Some(mask) = &photo.mask {

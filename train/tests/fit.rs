@@ -132,7 +132,6 @@ impl<'a> Setup<'a> {
     fn try_run(
         self,
         counts: &(dyn Fn(Vec3) -> bool + Sync),
-        keeps: &|_| true,
         report: &mut dyn FnMut(train::Progress) -> Flow,
     ) -> Result<Splats, TrainError> {
         let views = views();
@@ -141,6 +140,7 @@ impl<'a> Setup<'a> {
             context: self.context,
             views: &views,
             counts,
+            keeps: &|_| true,
             budget: self.budget,
             steps: self.steps,
             antialiased: false,

@@ -270,7 +270,8 @@ impl Block<'_> {
         let cameras = views.iter().map(|view| view.camera.centre());
         let centre = cameras.clone().sum::<glam::DVec3>() / views.len().max(1) as f64;
         let points = self.capture.points.positions.iter().copied();
-        let mut distances: Vec<f64> = points.chain(cameras).map(|p| p.distance(centre)).filter(|d| d.is_finite()).collect();
+        let mut distances: Vec<f64> =
+            points.chain(cameras).map(|p| p.distance(centre)).filter(|d| d.is_finite()).collect();
         distances.sort_by(f64::total_cmp);
         let far = distances.get(distances.len() * 98 / 100).copied().unwrap_or(1.0);
         (centre, 5.0 * far.max(self.plan.ground.edge_metres * 0.5))

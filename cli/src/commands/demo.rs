@@ -92,7 +92,7 @@ fn settings(args: &DemoArgs) -> (CitySettings, TrainArgs) {
     let (city, steps, budget) = if args.quick {
         (CitySettings { extent_metres: 100.0, views: 64, width: 160, height: 112, ..whole }, 2500, 20_000)
     } else {
-        (whole, 9000, 80_000)
+        (whole, 8000, 60_000)
     };
     let train = TrainArgs {
         capture: args.out.join("city"),

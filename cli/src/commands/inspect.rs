@@ -12,10 +12,10 @@ use crate::failure::Failure;
 use crate::output::Output;
 use crate::{cameras, commands::train::check_plan};
 
-/// CPU seconds of one pixel in one training step, and of one splat in one step, as measured on the bench's captures on a
-/// 2.5 GHz AVX-512 core. An estimate for people: a plan does not depend on it.
-const CPU_SECONDS_PER_PIXEL: f64 = 0.35e-6;
-const CPU_SECONDS_PER_SPLAT: f64 = 0.6e-6;
+/// CPU seconds of one pixel in one training step, and of one splat in one step, as measured on the bench's captures on an
+/// AVX-512 core. An estimate for people: a plan does not depend on it.
+const CPU_SECONDS_PER_PIXEL: f64 = 0.2e-6;
+const CPU_SECONDS_PER_SPLAT: f64 = 0.35e-6;
 
 /// What a plan would take.
 #[derive(Debug, Clone, Copy, Serialize)]

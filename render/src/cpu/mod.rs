@@ -144,7 +144,8 @@ impl Renderer {
         };
         draw(splats, options, 1.0, &mut own_records[..splats.len()], own_seen);
         if let Some(context) = context {
-            let options = Options { sh_degree: options.sh_degree.min(context.sh_degree()), ..*options };
+            // The context is finished: it is drawn in full, whatever degree the trainable splats have reached.
+            let options = Options { sh_degree: context.sh_degree(), ..*options };
             draw(context, &options, 0.0, context_records, context_seen);
         }
     }
@@ -260,10 +261,13 @@ impl Renderer {
         out.seen.extend_from_slice(&self.seen[..words]);
         // Coefficients above the degree in use are not touched: their columns stay out of the sinks.
         let used = scene::column::SH + 3 * scene::splats::sh_coefficients(options.sh_degree);
-        let mut sinks: Vec<Sink> =
-            (out.screen.chunks_mut(CHUNK).zip(out.screen_abs.chunks_mut(CHUNK)).zip(out.weight.chunks_mut(CHUNK)))
-                .map(|((screen, screen_abs), weight)| Sink { columns: Vec::with_capacity(used), screen, screen_abs, weight })
-                .collect();
+        let mut sinks: Vec<Sink> = (out
+            .screen
+            .chunks_mut(CHUNK)
+            .zip(out.screen_abs.chunks_mut(CHUNK))
+            .zip(out.weight.chunks_mut(CHUNK)))
+        .map(|((screen, screen_abs), weight)| Sink { columns: Vec::with_capacity(used), screen, screen_abs, weight })
+        .collect();
         for column in &mut out.columns[..used] {
             for (sink, chunk) in sinks.iter_mut().zip(column.chunks_mut(CHUNK)) {
                 sink.columns.push(chunk);

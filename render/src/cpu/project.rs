@@ -250,8 +250,7 @@ fn project_group<L: Lanes>(
         let basis = sh::basis(options.sh_degree, dx, dy, dz);
         for (b, basis) in basis.iter().enumerate().take(scene::splats::sh_coefficients(options.sh_degree) - 1) {
             for c in 0..3 {
-                colour[c] =
-                    basis.fma(L::load_from(splats.col(column::SH + 3 * (b + 1) + c), i, 0.0), colour[c]);
+                colour[c] = basis.fma(L::load_from(splats.col(column::SH + 3 * (b + 1) + c), i, 0.0), colour[c]);
             }
         }
     }

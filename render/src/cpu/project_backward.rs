@@ -85,10 +85,8 @@ fn backward_group<L: Lanes>(
     // The conic and what follows from the moments.
     let inv_det = one / det1;
     let conic = [(cov[2] + L::splat(BLUR)) * inv_det, -(cov[1] * inv_det), (cov[0] + L::splat(BLUR)) * inv_det];
-    let d_mean = [
-        conic[0].fma(s[moment::VX], conic[1] * s[moment::VY]),
-        conic[1].fma(s[moment::VX], conic[2] * s[moment::VY]),
-    ];
+    let d_mean =
+        [conic[0].fma(s[moment::VX], conic[1] * s[moment::VY]), conic[1].fma(s[moment::VX], conic[2] * s[moment::VY])];
     (d_mean[0] * d_mean[0] + d_mean[1] * d_mean[1]).sqrt().keep(seen).store_to(sink.screen, at);
     let (ax, ay) = (s[moment::ABS_X], s[moment::ABS_Y]);
     (ax * ax + ay * ay).sqrt().keep(seen).store_to(sink.screen_abs, at);
@@ -122,10 +120,7 @@ fn backward_group<L: Lanes>(
     let mut d_t = [[L::zero(); 3]; 2];
     let mut d_rotation = [[L::zero(); 3]; 3]; // by columns
     for c in 0..3 {
-        let d_a = [
-            two * (d_cov[0] * a[c][0] + d_cov[1] * a[c][1]),
-            two * (d_cov[1] * a[c][0] + d_cov[2] * a[c][1]),
-        ];
+        let d_a = [two * (d_cov[0] * a[c][0] + d_cov[1] * a[c][1]), two * (d_cov[1] * a[c][0] + d_cov[2] * a[c][1])];
         let d_axis = each!(j in [0, 1, 2] => t[0][j].fma(d_a[0], t[1][j] * d_a[1]));
         for r in 0..2 {
             for j in 0..3 {
@@ -139,12 +134,9 @@ fn backward_group<L: Lanes>(
     let [w, x, y, z] = quat;
     let d_unit = [
         two * (x * (d21 - d12) + y * (d02 - d20) + z * (d10 - d01)),
-        two * (y * (d01 + d10) + z * (d02 + d20) + w * (d21 - d12))
-            - L::splat(4.0) * x * (d11 + d22),
-        two * (x * (d01 + d10) + z * (d12 + d21) + w * (d02 - d20))
-            - L::splat(4.0) * y * (d00 + d22),
-        two * (x * (d02 + d20) + y * (d12 + d21) + w * (d10 - d01))
-            - L::splat(4.0) * z * (d00 + d11),
+        two * (y * (d01 + d10) + z * (d02 + d20) + w * (d21 - d12)) - L::splat(4.0) * x * (d11 + d22),
+        two * (x * (d01 + d10) + z * (d12 + d21) + w * (d02 - d20)) - L::splat(4.0) * y * (d00 + d22),
+        two * (x * (d02 + d20) + y * (d12 + d21) + w * (d10 - d01)) - L::splat(4.0) * z * (d00 + d11),
     ];
     let radial = w * d_unit[0] + x * d_unit[1] + y * d_unit[2] + z * d_unit[3];
     for c in 0..4 {
@@ -165,8 +157,7 @@ fn backward_group<L: Lanes>(
         d_p[r] = d_ratio * inv_z;
         d_p[2] = d_p[2] - d_ratio * p[r] * inv_z * inv_z;
     }
-    let mut d_world =
-        each!(j in [0, 1, 2] => rows[0][j].fma(d_p[0], rows[1][j].fma(d_p[1], rows[2][j] * d_p[2])));
+    let mut d_world = each!(j in [0, 1, 2] => rows[0][j].fma(d_p[0], rows[1][j].fma(d_p[1], rows[2][j] * d_p[2])));
 
     // Colour.
     let d_colour = [s[moment::RED], s[moment::GREEN], s[moment::BLUE]];

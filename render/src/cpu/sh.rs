@@ -5,8 +5,7 @@ use super::simd::Lanes;
 
 const C1: f32 = 0.488_602_52;
 const C2: [f32; 5] = [1.092_548_4, -1.092_548_4, 0.315_391_57, -1.092_548_4, 0.546_274_24];
-const C3: [f32; 7] =
-    [-0.590_043_6, 2.890_611_4, -0.457_045_8, 0.373_176_34, -0.457_045_8, 1.445_305_7, -0.590_043_6];
+const C3: [f32; 7] = [-0.590_043_6, 2.890_611_4, -0.457_045_8, 0.373_176_34, -0.457_045_8, 1.445_305_7, -0.590_043_6];
 
 /// The basis functions of degrees 1 ..= `degree` at unit direction (x, y, z); the constant one is left out. Entries
 /// above the degree are zero.
@@ -59,7 +58,8 @@ pub(crate) fn basis_gradient<L: Lanes>(degree: u8, x: L, y: L, z: L, s: &[L; 15]
         let (two, three, six, eight) = (L::splat(2.0), L::splat(3.0), L::splat(6.0), L::splat(8.0));
         let (xx, yy, zz) = (x * x, y * y, z * z);
         let (xy, xz, yz) = (x * y, x * z, y * z);
-        let (s8, s9, s10, s11) = (L::splat(C3[0]) * s[8], L::splat(C3[1]) * s[9], L::splat(C3[2]) * s[10], L::splat(C3[3]) * s[11]);
+        let (s8, s9, s10, s11) =
+            (L::splat(C3[0]) * s[8], L::splat(C3[1]) * s[9], L::splat(C3[2]) * s[10], L::splat(C3[3]) * s[11]);
         let (s12, s13, s14) = (L::splat(C3[4]) * s[12], L::splat(C3[5]) * s[13], L::splat(C3[6]) * s[14]);
         let four_zz = L::splat(4.0) * zz;
         d[0] = d[0] + s8 * six * xy + s9 * yz - s10 * two * xy - s11 * six * xz
@@ -71,7 +71,10 @@ pub(crate) fn basis_gradient<L: Lanes>(degree: u8, x: L, y: L, z: L, s: &[L; 15]
             - s12 * two * xy
             - s13 * two * yz
             - s14 * six * xy;
-        d[2] = d[2] + s9 * xy + s10 * eight * yz + s11 * (six * zz - three * (xx + yy))
+        d[2] = d[2]
+            + s9 * xy
+            + s10 * eight * yz
+            + s11 * (six * zz - three * (xx + yy))
             + s12 * eight * xz
             + s13 * (xx - yy);
     }

@@ -455,9 +455,7 @@ mod x86 {
     impl Avx512 {
         #[inline(always)]
         fn fold_two(a: Self, b: Self) -> __m512d {
-            unsafe {
-                _mm512_castps_pd(_mm512_add_ps(_mm512_unpacklo_ps(a.0, b.0), _mm512_unpackhi_ps(a.0, b.0)))
-            }
+            unsafe { _mm512_castps_pd(_mm512_add_ps(_mm512_unpacklo_ps(a.0, b.0), _mm512_unpackhi_ps(a.0, b.0))) }
         }
         #[inline(always)]
         fn fold_four(v: &[Self; 16], i: usize) -> Self {
@@ -556,29 +554,16 @@ mod x86 {
         }
         #[inline(always)]
         fn lt(self, b: Self) -> u16 {
-            unsafe {
-                Self::bits(
-                    _mm256_cmp_ps::<_CMP_LT_OQ>(self.0, b.0),
-                    _mm256_cmp_ps::<_CMP_LT_OQ>(self.1, b.1),
-                )
-            }
+            unsafe { Self::bits(_mm256_cmp_ps::<_CMP_LT_OQ>(self.0, b.0), _mm256_cmp_ps::<_CMP_LT_OQ>(self.1, b.1)) }
         }
         #[inline(always)]
         fn le(self, b: Self) -> u16 {
-            unsafe {
-                Self::bits(
-                    _mm256_cmp_ps::<_CMP_LE_OQ>(self.0, b.0),
-                    _mm256_cmp_ps::<_CMP_LE_OQ>(self.1, b.1),
-                )
-            }
+            unsafe { Self::bits(_mm256_cmp_ps::<_CMP_LE_OQ>(self.0, b.0), _mm256_cmp_ps::<_CMP_LE_OQ>(self.1, b.1)) }
         }
         #[inline(always)]
         fn select(mask: u16, a: Self, b: Self) -> Self {
             unsafe {
-                Self(
-                    _mm256_blendv_ps(b.0, a.0, Self::mask(mask)),
-                    _mm256_blendv_ps(b.1, a.1, Self::mask(mask >> 8)),
-                )
+                Self(_mm256_blendv_ps(b.0, a.0, Self::mask(mask)), _mm256_blendv_ps(b.1, a.1, Self::mask(mask >> 8)))
             }
         }
         #[inline(always)]
@@ -643,8 +628,21 @@ mod tests {
         let sums: [L; 16] = std::array::from_fn(|i| a * L::splat(i as f32) + b);
         let mask = a.lt(b);
         for v in [
-            a + b, a - b, a * b, a / b, -a, a.fma(b, a), a.min(b), a.max(b), a.abs(), b.abs().sqrt(), a.exp2(),
-            b.abs().recip(), L::select(mask, a, b), L::select(b.le(a), a, b), L::sums(&sums),
+            a + b,
+            a - b,
+            a * b,
+            a / b,
+            -a,
+            a.fma(b, a),
+            a.min(b),
+            a.max(b),
+            a.abs(),
+            b.abs().sqrt(),
+            a.exp2(),
+            b.abs().recip(),
+            L::select(mask, a, b),
+            L::select(b.le(a), a, b),
+            L::sums(&sums),
         ] {
             out.push(v.to_array());
         }
