@@ -100,7 +100,7 @@ impl FromStr for ArtefactId {
     fn from_str(text: &str) -> Result<Self, CodecError> {
         let bad = || CodecError::new("an artefact id is 64 hexadecimal digits".to_string());
         let digits = text.as_bytes();
-        if digits.len() != 64 {
+        if digits.len() != 64 || !digits.iter().all(|d| matches!(d, b'0'..=b'9' | b'a'..=b'f')) {
             return Err(bad());
         }
         let mut id = [0u8; 32];
@@ -147,6 +147,8 @@ mod tests {
     fn artefact_ids_round_trip() {
         let id = ArtefactId::of(b"plat");
         assert_eq!(id.to_string().parse::<ArtefactId>().unwrap(), id);
-        assert!("zz".repeat(32).parse::<ArtefactId>().is_err());
+        for bad in ["zz", "+f", "AB"] {
+            assert!(bad.repeat(32).parse::<ArtefactId>().is_err(), "{bad}");
+        }
     }
 }
