@@ -284,9 +284,9 @@ fn broken_numbers_at_the_start_are_survived() {
         let after = psnr(&fitted, &photos, |_| true);
         println!("{value}: {after:.2} dB instead of {healthy:.2}, {skipped} steps left out, {} splats", fitted.len());
         assert!(all_finite(&fitted), "{value}: broken rows are left");
-        assert!(after > healthy - 3.0, "{value}: {after} dB instead of {healthy}");
+        assert!(after > healthy - 1.0, "{value}: {after} dB instead of {healthy}");
         // A row that makes the image infinite costs the steps up to the first refinement, no more.
-        assert!(skipped <= 50, "{value}: {skipped} steps were left out");
+        assert!(skipped == 0, "{value}: {skipped} steps were left out");
     }
 }
 
