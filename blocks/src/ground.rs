@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 /// A halo is the core scaled by this about its centre (DOGS, Rubble: 1.2 gives 24.25 dB, 1.4 gives 25.78, 1.5 25.97).
 pub const HALO_SCALE: f64 = 1.4;
 /// Edge of what a block's windows show, relative to its core. Pixels farther out teach splats that the merge drops; a
-/// rim of them is needed, as a splat outside the core may reach into it. (1.4 instead of 1.1 costs half as many pixels again.)
+/// rim of them is needed, as a splat outside the core may reach into it.
 pub const FOCUS_SCALE: f64 = 1.1;
 /// A direction nearer to world z than this is taken to be world z: cos 20°.
 const SNAP_COSINE: f64 = 0.939_692_6;
