@@ -1,10 +1,11 @@
 //! What a run leaves for people: result lines, the chart and table drawn from them, contact sheets, bird's-eye cameras.
 //!
 //! `bench/results/*.jsonl` holds one [`ResultLine`] per run and is never edited by hand; the README's chart and table
-//! are functions of it.
+//! are functions of it. Lines with a `kind` are measurements of a part ([`PartLine`]).
 
 pub mod birdseye;
 pub mod chart;
+pub mod parts;
 pub mod sheet;
 pub mod table;
 
@@ -17,6 +18,7 @@ use serde::{Deserialize, Serialize};
 
 pub use birdseye::{birdseye_camera, oblique_camera};
 pub use chart::chart;
+pub use parts::{PartLine, append_part};
 pub use sheet::{SheetRow, contact_sheet, write_png};
 pub use table::{replace_table, table};
 
@@ -120,8 +122,12 @@ impl ResultLine {
 /// # Errors
 /// A number that is not finite (JSON has none), or a file that cannot be written.
 pub fn append(path: &Path, line: &ResultLine) -> Result<(), BadInput> {
+    append_line(path, line, line.is_finite())
+}
+
+fn append_line(path: &Path, line: &impl Serialize, is_finite: bool) -> Result<(), BadInput> {
     let name = path.display().to_string();
-    if !line.is_finite() {
+    if !is_finite {
         return Err(BadInput::new(name, "a result with a number that is not finite", "give null for what is unknown"));
     }
     let refuse = |e: std::io::Error| BadInput::new(name.clone(), format!("cannot be written: {e}"), "check the folder");
@@ -131,7 +137,16 @@ pub fn append(path: &Path, line: &ResultLine) -> Result<(), BadInput> {
     file.write_all(text.as_bytes()).map_err(refuse)
 }
 
-/// The lines of a results file, in order; empty lines are skipped.
+/// Whether a line is of a [`PartLine`].
+fn is_part(line: &str) -> bool {
+    #[derive(Deserialize)]
+    struct Kind {
+        kind: Option<serde::de::IgnoredAny>,
+    }
+    serde_json::from_str(line).is_ok_and(|Kind { kind }| kind.is_some())
+}
+
+/// The runs of a results file, in order; empty lines and those of parts are skipped.
 ///
 /// # Errors
 /// A file that cannot be read, or a line that is not a result.
@@ -139,7 +154,7 @@ pub fn read(path: &Path) -> Result<Vec<ResultLine>, BadInput> {
     let name = path.display().to_string();
     let refuse = |e: std::io::Error| BadInput::new(name.clone(), format!("cannot be read: {e}"), "check the path");
     let text = fs::read_to_string(path).map_err(refuse)?;
-    let lines = text.lines().enumerate().filter(|(_, line)| !line.trim().is_empty());
+    let lines = text.lines().enumerate().filter(|(_, line)| !line.trim().is_empty() && !is_part(line));
     let parse = |(i, line): (usize, &str)| -> Result<ResultLine, BadInput> {
         let bad =
             |what: String| BadInput::new(format!("{name}:{}", i + 1), what, "restore the line from version control");
@@ -231,6 +246,23 @@ pub(crate) mod tests {
         let lines = [line("plat tree", "fox", &[(1.0, 20.0)]), line("plat whole", "fox", &[(2.0, 21.5)])];
         lines.iter().for_each(|l| append(&path, l).unwrap());
         assert_eq!(read_folder(folder.path()).unwrap(), lines);
+        let part = parts::Ingest {
+            commit: "unknown".into(),
+            machine: machine(),
+            scene: "fox".into(),
+            downscale: 1,
+            threads: 2,
+            photos: 50,
+            pixels: 1000,
+            wall_seconds: 1.0,
+            cpu_seconds: 2.0,
+            peak_memory_bytes: None,
+            bytes_written: 3000,
+            command: "plat bench ingest".into(),
+        };
+        append_part(&path, &PartLine::Ingest(part.clone())).unwrap();
+        assert!(append_part(&path, &PartLine::Ingest(parts::Ingest { cpu_seconds: f64::NAN, ..part })).is_err());
+        assert_eq!(read_folder(folder.path()).unwrap(), lines, "parts are no runs");
         let not_finite = ResultLine { psnr: f64::NAN, ..lines[0].clone() };
         assert!(append(&path, &not_finite).is_err());
         assert_eq!(read(&path).unwrap().len(), 2);

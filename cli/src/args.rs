@@ -57,6 +57,10 @@ pub(crate) enum BenchCommand {
     Chart(ChartArgs),
     /// Time the renderer's forward and backward passes
     Kernels(KernelsArgs),
+    /// Ingest a capture into a store of its own, and append what it took to the results
+    Ingest(IngestArgs),
+    /// Build the demo, and append what it took and how good it is to the results
+    Demo(BenchDemoArgs),
 }
 
 /// A value, or `auto`: the program chooses.
@@ -242,14 +246,24 @@ pub(crate) struct TrainArgs {
     /// Threads of each worker; auto shares out the cores
     #[arg(long, value_name = "N|auto", default_value_t)]
     pub(crate) threads: Auto<u32>,
-    /// Measure held-out PSNR every N steps of a task; 0 measures only at its end
+    /// Measure held-out PSNR of the merged model so far every N steps of a task; 0 measures only at its end
     #[arg(long, value_name = "N", default_value_t = 0)]
     pub(crate) eval_every: u32,
+    /// Be done within M minutes of wall time: every task takes its share, in fewer steps if need be. What was shortened
+    /// so depends on the machine's speed: its bytes are not the same twice
+    #[arg(long, value_name = "M", value_parser = minutes)]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(crate) minutes: Option<f64>,
+}
+
+fn minutes(text: &str) -> Result<f64, String> {
+    let value = text.parse().ok().filter(|minutes: &f64| *minutes > 0.0 && minutes.is_finite());
+    value.ok_or_else(|| "give minutes above 0, such as 30 or 0.5".into())
 }
 
 #[derive(Debug, Clone, Args)]
 pub(crate) struct EvalArgs {
-    /// Folder that `plat train` wrote, or a .ply
+    /// Folder that `plat train` wrote, a .ply or a .spz
     pub(crate) model: PathBuf,
     /// Folder of the capture
     pub(crate) capture: PathBuf,
@@ -265,11 +279,25 @@ pub(crate) struct EvalArgs {
     /// Store of the photos; by default the model's own where it is there, else a temporary one
     #[arg(long, value_name = "URL")]
     pub(crate) store: Option<String>,
+    /// Also measure LPIPS with this network (ONNX)
+    #[arg(long, value_name = "FILE", long_help = LPIPS_HELP)]
+    pub(crate) lpips: Option<PathBuf>,
 }
+
+const LPIPS_HELP: &str = "\
+Also measure LPIPS with this network, an ONNX file with the weights inside: two inputs (1, 3, height, width) of sRGB
+values in -1..1, one output, a number. The Python package lpips exports one (net='alex', as most papers):
+
+    import lpips, torch
+    x = torch.zeros(1, 3, 64, 64)
+    free = {2: 'height', 3: 'width'}
+    torch.onnx.export(lpips.LPIPS(net='alex').eval(), (x, x), 'lpips.onnx', input_names=['a', 'b'],
+                      output_names=['distance'], dynamic_axes={'a': free, 'b': free}, dynamo=False)
+";
 
 #[derive(Debug, Clone, Args)]
 pub(crate) struct RenderArgs {
-    /// Folder that `plat train` wrote, or a .ply
+    /// Folder that `plat train` wrote, a .ply or a .spz
     pub(crate) model: PathBuf,
     /// Cameras to draw from: the folder of a capture, whose photos need not be there, or a transforms.json
     #[arg(long, value_name = "CAPTURE|FILE")]
@@ -296,11 +324,13 @@ pub(crate) struct RenderArgs {
 pub(crate) enum Format {
     /// INRIA's PLY, which every viewer and trainer reads
     Ply,
+    /// Niantic's SPZ, version 3: a tenth of the size, rounded
+    Spz,
 }
 
 #[derive(Debug, Clone, Args)]
 pub(crate) struct ExportArgs {
-    /// Folder that `plat train` wrote, or a .ply
+    /// Folder that `plat train` wrote, a .ply or a .spz
     pub(crate) model: PathBuf,
     /// Format
     #[arg(long, value_enum)]
@@ -321,8 +351,38 @@ pub(crate) struct ParetoArgs {
     /// Folder of the result lines; this one goes to plat.jsonl there
     #[arg(long, value_name = "DIR", default_value = "bench/results")]
     pub(crate) results: PathBuf,
+    /// Also measure LPIPS with this network (ONNX), see plat eval --help
+    #[arg(long, value_name = "FILE")]
+    pub(crate) lpips: Option<PathBuf>,
     #[command(flatten)]
     pub(crate) train: TrainArgs,
+}
+
+#[derive(Debug, Clone, Args)]
+pub(crate) struct IngestArgs {
+    /// Folder of the capture: COLMAP or transforms.json
+    pub(crate) capture: PathBuf,
+    /// Use photos at one N-th of their size
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
+    pub(crate) downscale: u32,
+    /// What the line calls the capture; by default the name of its folder
+    #[arg(long)]
+    pub(crate) scene: Option<String>,
+    /// Folder of the result lines; this one goes to ingest.jsonl there
+    #[arg(long, value_name = "DIR", default_value = "bench/results")]
+    pub(crate) results: PathBuf,
+}
+
+#[derive(Debug, Clone, Args)]
+pub(crate) struct BenchDemoArgs {
+    /// What the chart calls the run
+    #[arg(long, default_value = "plat tree")]
+    pub(crate) label: String,
+    /// Folder of the result lines; this one goes to plat.jsonl there
+    #[arg(long, value_name = "DIR", default_value = "bench/results")]
+    pub(crate) results: PathBuf,
+    #[command(flatten)]
+    pub(crate) demo: DemoArgs,
 }
 
 #[derive(Debug, Clone, Args)]
@@ -352,6 +412,9 @@ pub(crate) struct KernelsArgs {
     /// Threads
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=1024))]
     pub(crate) threads: u32,
+    /// Append to kernels.jsonl in this folder of result lines; the line is kept out of chart and table
+    #[arg(long, value_name = "DIR")]
+    pub(crate) results: Option<PathBuf>,
     /// Passes to take the median of
     #[arg(long, value_name = "N", default_value_t = 20, value_parser = clap::value_parser!(u32).range(1..=10_000))]
     pub(crate) passes: u32,

@@ -2,6 +2,7 @@
 
 use std::path::Path;
 
+use dataset::ingest::shrink;
 use dataset::mips::SHORTEST_SIDE;
 use dataset::open::{OpenOptions, Source};
 use scene::{BadInput, Camera, Capture, Pinhole};
@@ -33,17 +34,9 @@ pub(crate) fn name_of(path: &Path) -> String {
 /// A factor that leaves too little of a photo.
 pub(crate) fn shrunk(capture: &Capture, downscale: u32) -> Result<Capture, BadInput> {
     let mut capture = capture.clone();
-    let n = f64::from(downscale);
     for view in &mut capture.views {
         let k = &mut view.camera.pinhole;
-        *k = Pinhole {
-            width: k.width / downscale,
-            height: k.height / downscale,
-            fx: k.fx / n,
-            fy: k.fy / n,
-            cx: k.cx / n,
-            cy: k.cy / n,
-        };
+        *k = shrink(*k, downscale);
         if downscale > 1 && k.width.min(k.height) < SHORTEST_SIDE {
             let problem = format!("{downscale} leaves less than {SHORTEST_SIDE} pixels of {}", view.name);
             return Err(BadInput::new("--downscale", problem, "give a smaller factor"));

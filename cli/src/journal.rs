@@ -26,14 +26,17 @@ struct Line {
     wall_seconds: f64,
     splats: u64,
     loss: Option<f64>,
-    /// dB over the task's test windows, where it was measured.
+    /// dB of the merged model so far over the job's test views, where it was measured.
     psnr: Option<f64>,
+    /// Splats of what was measured.
+    merged_splats: Option<u64>,
 }
 
 /// What a task has taken so far.
 #[derive(Debug, Clone, Default)]
 struct Spent {
     attempt: u32,
+    /// Of the planned steps; a cap in time may leave fewer to take.
     step: u64,
     cpu_seconds: f64,
     wall_seconds: f64,
@@ -56,7 +59,8 @@ pub(crate) struct Total {
 pub(crate) struct Journal<'a> {
     path: PathBuf,
     file: File,
-    blocks: Vec<BlockId>,
+    /// Each task's block and steps as planned.
+    planned: Vec<(BlockId, u32)>,
     tasks: Vec<Spent>,
     workers: u32,
     /// Since the start of the program's work.
@@ -81,7 +85,7 @@ impl<'a> Journal<'a> {
         Ok(Self {
             path: path.to_path_buf(),
             file: File::create(path).map_err(cannot("written", path))?,
-            blocks: plan.tasks.iter().map(|task| task.block).collect(),
+            planned: plan.tasks.iter().map(|task| (task.block, task.steps)).collect(),
             tasks: vec![Spent::default(); plan.tasks.len()],
             workers,
             before: (clock.cpu_seconds(), clock.wall_seconds()),
@@ -97,12 +101,12 @@ impl<'a> Journal<'a> {
     pub(crate) fn note(&mut self, news: &News) {
         match news {
             News::Changed(changed) => {
-                let Some(block) = self.blocks.get(changed.task as usize) else { return };
+                let Some((block, _)) = self.planned.get(changed.task as usize) else { return };
                 match changed.state() {
                     TaskState::Done => {
                         self.done += 1;
-                        if self.blocks.len() > 1 {
-                            self.progress.note(format!("block {block} done, {} of {}", self.done, self.blocks.len()));
+                        if self.planned.len() > 1 {
+                            self.progress.note(format!("block {block} done, {} of {}", self.done, self.planned.len()));
                         }
                     }
                     TaskState::Failed | TaskState::Quarantined => {
@@ -126,11 +130,13 @@ impl<'a> Journal<'a> {
             self.before.0 += spent.cpu_seconds;
             self.before.1 += spent.wall_seconds;
         }
-        *spent =
-            Spent { attempt, step: report.step, cpu_seconds: report.cpu_seconds, wall_seconds: report.wall_seconds };
+        let (block, planned) = self.planned[task];
+        let share = report.step as f64 / report.steps.max(1) as f64;
+        let step = (share * f64::from(planned)) as u64;
+        *spent = Spent { attempt, step, cpu_seconds: report.cpu_seconds, wall_seconds: report.wall_seconds };
         let (cpu_seconds, wall_seconds) = self.clocks();
         let line = Line {
-            task: self.blocks[task].to_string(),
+            task: block.to_string(),
             attempt,
             step: report.step,
             steps: report.steps,
@@ -139,10 +145,11 @@ impl<'a> Journal<'a> {
             splats: report.splats,
             loss: report.loss,
             psnr: report.psnr,
+            merged_splats: report.merged_splats,
         };
         if let Some(psnr) = report.psnr {
             self.total.last_psnr = Some(psnr);
-            self.total.curve.push(CurvePoint { cpu_seconds, psnr, splats: Some(report.splats) });
+            self.total.curve.push(CurvePoint { cpu_seconds, psnr, splats: report.merged_splats });
         }
         let written = serde_json::to_string(&line).map_err(std::io::Error::from);
         let written = written.and_then(|text| self.file.write_all((text + "\n").as_bytes()));

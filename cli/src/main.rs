@@ -10,6 +10,7 @@ mod commands;
 mod config;
 mod failure;
 mod journal;
+mod lpips;
 mod model;
 mod output;
 mod record;
@@ -45,6 +46,8 @@ fn main() -> ExitCode {
         Command::Bench(BenchCommand::Pareto(args)) => commands::bench::pareto(args, &output),
         Command::Bench(BenchCommand::Chart(args)) => commands::bench::chart(args, &output),
         Command::Bench(BenchCommand::Kernels(args)) => commands::kernels::run(args, &output),
+        Command::Bench(BenchCommand::Ingest(args)) => commands::bench::ingest(args, &output),
+        Command::Bench(BenchCommand::Demo(args)) => commands::bench::demo(args, &output),
     };
     done.map_or_else(|failure| fail(&failure), |()| ExitCode::SUCCESS)
 }

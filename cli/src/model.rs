@@ -1,4 +1,4 @@
-//! MODEL: the directory that `plat train` wrote, or a `.ply`.
+//! MODEL: the directory that `plat train` wrote, a `.ply` (INRIA's or PlayCanvas' compressed), or a `.spz`.
 //!
 //! ```text
 //! OUT/model/model.json          what the model is, written last
@@ -11,7 +11,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use blocks::{Ground, Plan};
-use scene::{ArtefactId, BadInput, BlockId, CodecError, GeoOrigin, Splats, frame, ply};
+use scene::{ArtefactId, BadInput, BlockId, CodecError, GeoOrigin, Splats, frame, ply, spz};
 use serde::{Deserialize, Serialize};
 use store::BlockingStore;
 
@@ -74,6 +74,15 @@ impl Model {
     pub(crate) fn to_ply(&self) -> Vec<u8> {
         let comments: &[&str] = if self.antialiased { &[ANTIALIASED] } else { &[] };
         ply::write(&self.splats, comments)
+    }
+
+    /// As SPZ of version 3.
+    ///
+    /// # Errors
+    /// Splats that the format cannot hold.
+    pub(crate) fn to_spz(&self) -> Result<Vec<u8>, Failure> {
+        spz::write(&self.splats, self.antialiased, spz::Version::V3)
+            .map_err(|error| Failure::Work(format!("cannot be written as SPZ: {error}")))
     }
 
     /// The folder for what is said about it.
@@ -144,12 +153,12 @@ fn sew<E>(plan: &Plan, mut result_of: impl FnMut(BlockId) -> Result<Splats, E>) 
     Ok(blocks::merge(parts))
 }
 
-/// Reads a model: a folder that `plat train` wrote, its `model` folder, or a `.ply`.
+/// Reads a model: a folder that `plat train` wrote, its `model` folder, a `.ply` or a `.spz`.
 ///
 /// # Errors
 /// What is not there, not readable, or not a model.
 pub(crate) fn read(path: &Path) -> Result<Model, BadInput> {
-    let advice = "give a folder that plat train wrote, or a .ply";
+    let advice = "give a folder that plat train wrote, a .ply or a .spz";
     if path.is_dir() {
         let folder = [path.join("model"), path.to_path_buf()].into_iter().find(|f| f.join("model.json").is_file());
         let Some(folder) = folder else {
@@ -157,11 +166,16 @@ pub(crate) fn read(path: &Path) -> Result<Model, BadInput> {
         };
         return read_trained(&folder);
     }
-    if path.extension().is_none_or(|e| !e.eq_ignore_ascii_case("ply")) {
-        let problem = if path.exists() { "is neither a folder nor a .ply" } else { "does not exist" };
+    let is = |extension: &str| path.extension().is_some_and(|e| e.eq_ignore_ascii_case(extension));
+    if !path.exists() || !(is("ply") || is("spz")) {
+        let problem = if path.exists() { "is neither a folder nor a .ply or .spz" } else { "does not exist" };
         return Err(BadInput::new(path.display().to_string(), problem, advice));
     }
     let bytes = load(path)?;
+    if is("spz") {
+        let (splats, antialiased) = spz::read(&bytes).map_err(|error| damaged(path, &error))?;
+        return Ok(Model { splats, antialiased, trained: None });
+    }
     let splats = ply::read(&bytes).map_err(|error| damaged(path, &error))?;
     let antialiased = ply::comments(&bytes).iter().any(|comment| comment.trim() == ANTIALIASED);
     Ok(Model { splats, antialiased, trained: None })

@@ -43,6 +43,12 @@ impl Record {
         Self { command, commit: commit(), machine: bench::machine(), ..Self::default() }
     }
 
+    /// Takes over what an evaluation of the model measured.
+    pub(crate) fn measured(&mut self, by: &Self) {
+        (self.psnr, self.ssim, self.perceptual) = (by.psnr, by.ssim, by.perceptual);
+        (self.lpips, self.fps) = (by.lpips, by.fps);
+    }
+
     /// As a line of bench/results.
     pub(crate) fn line(&self, label: &str, invoked: String, curve: Vec<CurvePoint>) -> ResultLine {
         ResultLine {

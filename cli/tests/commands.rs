@@ -69,6 +69,9 @@ fn bad_usage_and_bad_input_exit_with_2_and_one_line() {
     refused(at, &["train", "city", "--out", "o", "--steps", "0"], "--steps");
     refused(at, &["train", "city", "--out", "o", "--downscale", "40"], "--downscale");
     refused(at, &["train", "city", "--out", "o", "--store", "ftp://x"], "ftp");
+    for minutes in ["0", "-1", "nan", "inf", "soon"] {
+        refused(at, &["train", "city", "--out", "o", &format!("--minutes={minutes}")], "--minutes");
+    }
     refused(at, &["train", "city", "--out", "o", "--config", "bad.toml"], "stepps");
     refused(at, &["plan", "city", "--levels", "99"], "levels");
     refused(at, &["inspect", "missing"], "missing");
@@ -143,6 +146,14 @@ fn a_city_is_trained_measured_and_exported_the_same_twice() {
 
     let measured = done(at, &["eval", "one", "city"]);
     assert_eq!(measured["views"].as_array().unwrap().len(), 3);
+    // What is measured on the way is the merged model, so the last figure is the model's, and so is the splats' number.
+    assert_eq!(report["psnr"], measured["psnr"]);
+    let on_the_way: Vec<&Value> = lines.iter().filter(|l| l["psnr"].is_f64()).collect();
+    let tasks = report["tasks"].as_u64().unwrap() as usize;
+    assert!(tasks > 2 && on_the_way.len() > 2 * tasks, "{tasks} {}", on_the_way.len());
+    let last = on_the_way.last().unwrap();
+    assert_eq!((&last["psnr"], &last["merged_splats"]), (&measured["psnr"], &report["splats"]));
+    assert!(report["bytes_moved"].as_u64() > report["bytes"].as_u64(), "{}", report["bytes_moved"]);
     assert!(measured["psnr"].as_f64().unwrap() > 8.0 && at.join("one/eval/sheet.png").is_file());
     let again = done(at, &["eval", "one/merged.ply", "city"]);
     assert_eq!(again["psnr"], measured["psnr"], "the merged file is the model");
@@ -176,4 +187,140 @@ fn captures_are_inspected_and_planned() {
     assert!(std::fs::read_to_string(at.join("plan.svg")).unwrap().starts_with("<svg"));
     let human = plat(at, &["plan", "city"]);
     assert!(human.status.success() && String::from_utf8(human.stdout).unwrap().contains("level 0"));
+}
+
+#[test]
+fn a_cap_in_time_shortens_every_task_and_leaves_a_whole_model() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    city(at, 20);
+    // Without the cap this would take half an hour.
+    let options = ["--steps", "1000000", "--budget", "800", "--levels", "1", "--minutes", "0.05", "--store", "store"];
+    for blocks in ["whole", "tree"] {
+        let train = ["train", "city", "--out", blocks, "--blocks", blocks];
+        let report = done(at, &[&train[..], &options].concat());
+        assert_eq!(report["capped"], true, "{blocks}");
+        let plan: blocks::Plan =
+            serde_json::from_slice(&std::fs::read(at.join(blocks).join("plan.json")).unwrap()).unwrap();
+        let metrics = std::fs::read_to_string(at.join(blocks).join("metrics.jsonl")).unwrap();
+        let lines: Vec<Value> = metrics.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+        for task in &plan.tasks {
+            let of_task = |line: &&Value| line["task"] == task.block.to_string();
+            let last = lines.iter().rfind(of_task).expect("every task has its say");
+            assert!(last["step"].as_u64() >= Some(1) && last["step"].as_u64() < Some(task.steps.into()), "{last}");
+        }
+        let splats = ply::read(&std::fs::read(at.join(blocks).join("merged.ply")).unwrap()).unwrap();
+        assert_eq!(report["splats"], splats.len());
+        assert!(done(at, &["eval", blocks, "city"])["psnr"].is_f64());
+    }
+    // A cap that is not reached changes nothing.
+    let options = ["--steps", "20", "--budget", "800", "--levels", "0", "--store", "store"];
+    let free = done(at, &[&["train", "city", "--out", "free"][..], &options].concat());
+    let far = done(at, &[&["train", "city", "--out", "far", "--minutes", "600"][..], &options].concat());
+    assert_eq!((&free["capped"], &far["capped"]), (&false.into(), &false.into()));
+    let bytes = |out: &str| std::fs::read(at.join(out).join("merged.ply")).unwrap();
+    assert!(bytes("free") == bytes("far"));
+}
+
+/// A field of a protocol buffer: a message, text or bytes.
+fn field(number: u8, bytes: impl AsRef<[u8]>) -> Vec<u8> {
+    let bytes = bytes.as_ref();
+    assert!(bytes.len() < 1 << 14);
+    [&[number << 3 | 2, bytes.len() as u8 | 0x80, (bytes.len() >> 7) as u8][..], bytes].concat()
+}
+
+/// A field of a protocol buffer: a number.
+fn number(field: u8, value: u8) -> Vec<u8> {
+    vec![field << 3, value]
+}
+
+/// An ONNX graph of LPIPS's signature that says the mean squared difference of its `inputs` pictures' first and last.
+fn squares(inputs: usize) -> Vec<u8> {
+    let node = |operator: &str, inputs: [&str; 2], output: &str| {
+        let inputs = inputs.iter().filter(|input| !input.is_empty()).flat_map(|input| field(1, input));
+        field(1, [inputs.collect(), field(2, output), field(4, operator)].concat())
+    };
+    let value = |at: u8, name: &str, dimensions: Vec<u8>| {
+        let tensor = [number(1, 1), field(2, dimensions)].concat();
+        field(at, [field(1, name), field(2, field(1, tensor))].concat())
+    };
+    let image = || [field(1, number(1, 1)), field(1, number(1, 3)), field(1, field(2, "h")), field(1, field(2, "w"))];
+    let names = ["a", "b"];
+    let mut graph = [
+        node("Sub", ["a", names[inputs - 1]], "difference"),
+        node("Mul", ["difference", "difference"], "squared"),
+        node("ReduceMean", ["squared", ""], "distance"),
+        field(2, "squares"),
+    ]
+    .concat();
+    for name in &names[..inputs] {
+        graph.extend(value(11, name, image().concat()));
+    }
+    graph.extend(value(12, "distance", [(); 4].map(|()| field(1, number(1, 1))).concat()));
+    [number(1, 8), field(7, graph), field(8, [field(1, ""), number(2, 13)].concat())].concat()
+}
+
+#[test]
+fn lpips_is_measured_with_a_network_that_the_user_names() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    city(at, 16);
+    std::fs::write(at.join("red.ply"), red_splat()).unwrap();
+    std::fs::write(at.join("net.onnx"), squares(2)).unwrap();
+    assert!(done(at, &["eval", "red.ply", "city", "--out", "o"])["lpips"].is_null());
+    let measured = done(at, &["eval", "red.ply", "city", "--lpips", "net.onnx", "--out", "o"]);
+    for view in measured["views"].as_array().unwrap() {
+        // Values are in -1..1, so a difference counts twice.
+        let expected = 4.0 * 10f64.powf(-0.1 * view["psnr"].as_f64().unwrap());
+        assert!((view["lpips"].as_f64().unwrap() - expected).abs() < 1e-4 * expected, "{view} {expected}");
+    }
+    assert!(measured["lpips"].is_f64());
+    let human = plat(at, &["eval", "red.ply", "city", "--lpips", "net.onnx", "--out", "o"]);
+    assert!(String::from_utf8(human.stdout).unwrap().contains("LPIPS"));
+
+    let whole = squares(2);
+    std::fs::write(at.join("one.onnx"), squares(1)).unwrap();
+    std::fs::write(at.join("text.onnx"), "no network\n").unwrap();
+    std::fs::write(at.join("none.onnx"), "").unwrap();
+    // (What follows the operators may be missing.)
+    for (i, length) in (1..whole.len() / 2).step_by(17).enumerate() {
+        std::fs::write(at.join(format!("cut{i}.onnx")), &whole[..length]).unwrap();
+        refused(at, &["eval", "red.ply", "city", "--quiet", "--lpips", &format!("cut{i}.onnx")], "cut");
+    }
+    for bad in ["one.onnx", "text.onnx", "none.onnx", "missing.onnx", "city"] {
+        refused(at, &["eval", "red.ply", "city", "--quiet", "--lpips", bad], bad);
+    }
+}
+
+#[test]
+fn measurements_are_kept_as_lines() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    city(at, 16);
+    let lines = |file: &str| -> Vec<Value> {
+        let text = std::fs::read_to_string(at.join("results").join(file)).unwrap();
+        text.lines().map(|line| serde_json::from_str(line).unwrap()).collect()
+    };
+    done(at, &["bench", "ingest", "city", "--results", "results"]);
+    let said = done(at, &["bench", "ingest", "city", "--results", "results", "--scene", "town", "--downscale", "2"]);
+    let ingests = lines("ingest.jsonl");
+    assert_eq!((ingests.len(), &ingests[1]), (2, &said));
+    assert_eq!((&said["kind"], &said["scene"], &said["photos"]), (&"ingest".into(), &"town".into(), &16.into()));
+    assert!(ingests[0]["bytes_written"].as_u64() > said["bytes_written"].as_u64(), "{ingests:?}");
+    let kernels = ["bench", "kernels", "--splats", "50", "--size", "32x32", "--passes", "1"];
+    done(at, &kernels);
+    let said = done(at, &[&kernels[..], &["--results", "results"]].concat());
+    assert_eq!(lines("kernels.jsonl"), [said]);
+
+    std::fs::write(at.join("net.onnx"), squares(2)).unwrap();
+    let pareto = ["bench", "pareto", "--label", "l", "--scene", "s", "--results", "results", "--lpips", "net.onnx"];
+    let train = ["--out", "o", "city", "--steps", "20", "--budget", "800", "--levels", "1", "--eval-every", "10"];
+    let run = done(at, &[&pareto[..], &train].concat());
+    assert!(
+        run["lpips"].is_f64() && run["bytes_moved"].is_u64() && run["curve"].as_array().unwrap().len() > 4,
+        "{run}"
+    );
+    // The chart shows the run and minds nothing else.
+    std::fs::write(at.join("README.md"), "<!-- bench:begin -->\n<!-- bench:end -->\n").unwrap();
+    assert_eq!(done(at, &["bench", "chart", "--results", "results"])["lines"], 1);
 }

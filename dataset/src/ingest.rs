@@ -253,7 +253,8 @@ fn undistorter<'a>(photo: &Photo, pinhole: Pinhole, lens: &'a mut Lens) -> Resul
     }
 }
 
-fn shrink(pinhole: Pinhole, factor: u32) -> Pinhole {
+/// The camera of a photo shrunk by [`IngestOptions::downscale`].
+pub fn shrink(pinhole: Pinhole, factor: u32) -> Pinhole {
     let n = f64::from(factor);
     Pinhole {
         width: pinhole.width / factor,

@@ -2,7 +2,8 @@
 //!
 //! The pinhole keeps the focal lengths and the pixel grid of the photo, so that pixels near the principal point, where
 //! lenses hardly bend rays, stay what they are. Its rectangle is the largest around the principal point that has no
-//! pixel outside the photo. Positions are computed, not stored: a table of them would be larger than the photo.
+//! pixel outside the photo; of a fisheye, which may see more than a half space, at most 55° to either side.
+//! Positions are computed, not stored: a table of them would be larger than the photo.
 
 use glam::{DMat2, DVec2};
 use scene::{CameraModel, Pinhole};
@@ -11,6 +12,11 @@ use scene::{CameraModel, Pinhole};
 const LARGEST: f64 = 2.0;
 /// A rectangle whose shorter side is less than this share of the photo's is no photo any more.
 const SMALLEST: f64 = 0.25;
+/// Tangent of the half field of view, along each axis, that is kept of a fisheye: beyond 55° a pinhole stretches pixels
+/// to more than three times their width.
+const FISHEYE_REACH: f64 = 1.428;
+/// Largest angle to the axis, radians, that is looked for in a fisheye: the ideal plane ends at a right angle.
+const FISHEYE_ANGLE: f64 = 1.55;
 /// Points on each edge of the photo that are followed to the ideal plane; edges bend smoothly.
 const EDGE_SAMPLES: u32 = 200;
 
@@ -26,6 +32,9 @@ pub fn ideal_pinhole(model: &CameraModel, width: u32, height: u32) -> Option<Pin
 pub fn undistort(model: &CameraModel, distorted: DVec2) -> Option<DVec2> {
     if !model.is_distorted() {
         return Some(distorted);
+    }
+    if let CameraModel::OpenCvFisheye([.., k1, k2, k3, k4]) = *model {
+        return undistort_fisheye([k1, k2, k3, k4], distorted).filter(|&ideal| !folds(model, ideal));
     }
     // Newton's method, damped: a step that does not bring the point nearer is halved.
     let mut ideal = distorted;
@@ -49,8 +58,47 @@ pub fn undistort(model: &CameraModel, distorted: DVec2) -> Option<DVec2> {
     (error.length() < 1e-10 * distorted.length().max(1.0) && !folds(model, ideal)).then_some(ideal)
 }
 
+/// By halving the range of angles, as only their polynomial has to be undone.
+fn undistort_fisheye([k1, k2, k3, k4]: [f64; 4], distorted: DVec2) -> Option<DVec2> {
+    let bent = distorted.length();
+    let bend = |a: f64| {
+        let a2 = a * a;
+        a * (1.0 + a2 * (k1 + a2 * (k2 + a2 * (k3 + a2 * k4))))
+    };
+    if bent < 1e-12 {
+        return Some(distorted);
+    }
+    // The first of the angles that reach so far, should the polynomial turn back.
+    const STEPS: u32 = 64;
+    let angle = |step: u32| FISHEYE_ANGLE * f64::from(step) / f64::from(STEPS);
+    let step = (1..=STEPS).find(|&step| bend(angle(step)) >= bent)?;
+    let (mut low, mut high) = (angle(step - 1), angle(step));
+    for _ in 0..60 {
+        let middle = 0.5 * (low + high);
+        *(if bend(middle) < bent { &mut low } else { &mut high }) = middle;
+    }
+    Some(distorted * ((0.5 * (low + high)).tan() / bent))
+}
+
+/// The derivative of [`CameraModel::distort`] of a fisheye: along the radius and across it.
+fn fisheye_jacobian([k1, k2, k3, k4]: [f64; 4], ideal: DVec2) -> DMat2 {
+    let radius = ideal.length();
+    if radius < 1e-9 {
+        return DMat2::IDENTITY;
+    }
+    let angle = radius.atan();
+    let a2 = angle * angle;
+    let across = angle * (1.0 + a2 * (k1 + a2 * (k2 + a2 * (k3 + a2 * k4)))) / radius;
+    let along = (1.0 + a2 * (3.0 * k1 + a2 * (5.0 * k2 + a2 * (7.0 * k3 + a2 * 9.0 * k4)))) / (1.0 + radius * radius);
+    let unit = ideal / radius;
+    DMat2::IDENTITY * across + DMat2::from_cols(unit * unit.x, unit * unit.y) * (along - across)
+}
+
 /// The derivative of [`CameraModel::distort`], from its formula.
 fn jacobian(model: &CameraModel, ideal: DVec2) -> DMat2 {
+    if let CameraModel::OpenCvFisheye([.., k1, k2, k3, k4]) = *model {
+        return fisheye_jacobian([k1, k2, k3, k4], ideal);
+    }
     let [k1, k2, p1, p2, k3, k4, k5, k6] = model.distortion();
     let DVec2 { x, y } = ideal;
     let r2 = ideal.length_squared();
@@ -173,6 +221,10 @@ impl Undistorter {
         }
         // How far the photo reaches to the left, right, top and bottom of the principal point, on the ideal plane.
         let mut reach = [LARGEST * cx, LARGEST * (w - cx), LARGEST * cy, LARGEST * (h - cy)];
+        if self.model.is_fisheye() {
+            let [x, y] = [FISHEYE_REACH * fx, FISHEYE_REACH * fy];
+            reach.iter_mut().zip([x, x, y, y]).for_each(|(reach, most)| *reach = reach.min(most));
+        }
         let mut limit = |x: f64, y: f64, side: usize| {
             if let Some(ideal) = undistort(&self.model, DVec2::new((x - cx) / fx, (y - cy) / fy)) {
                 let distance = [-ideal.x * fx, ideal.x * fx, -ideal.y * fy, ideal.y * fy][side];

@@ -1,11 +1,17 @@
 //! Opens a capture of any known format: what it says is checked, photos are found and their headers read, lenses become
 //! ideal pinholes. No pixel is decoded.
 //!
+//! A capture without sparse points gets some where its views overlap ([`frusta`]), as training has to start somewhere.
+//!
 //! What a capture names is looked for inside its own folder only: a path that leads out, by `..` or by a link, is
 //! refused. Photos that are missing are left out and reported, as captures often travel without all of them.
 
 mod colmap;
 mod files;
+mod frusta;
+mod kitti360;
+mod masks;
+mod opensfm;
 mod transforms;
 
 use std::collections::BTreeMap;
@@ -51,37 +57,76 @@ pub struct Source {
     pub photos: Vec<Photo>,
     /// Images that the capture names and that are not used, and why.
     pub left_out: Vec<(String, String)>,
-    /// What the capture was: `colmap` or `transforms`.
+    /// What the capture was: `colmap`, `transforms`, `opensfm` or `kitti360`, and ` without points` if its points were
+    /// made from the overlap of its views.
     pub format: &'static str,
 }
 
-/// Opens a capture: a folder, or the path of a `transforms.json`.
+/// Opens a capture: a folder, or the path of a `transforms.json` or `reconstruction.json`.
 ///
 /// # Errors
 /// What is wrong with which file, and what to do.
 pub fn open(path: &Path, options: &OpenOptions) -> Result<Source, BadInput> {
     let root = Root::new(path)?;
-    let (format, posed, points) = if path.is_file() {
-        transforms::read(&root, path)?
-    } else if let Some(folder) = colmap::find(&root, &["sparse/0", "sparse", "."]) {
-        colmap::read(&root, &folder, options)?
-    } else if let Some(path) = root.file("transforms.json") {
-        transforms::read(&root, &path)?
-    } else if let Some(folder) = colmap::find(&root, &["colmap/sparse/0"]) {
-        colmap::read(&root, &folder, options)?
-    } else {
-        let problem = "has neither a COLMAP model in sparse/0 nor a transforms.json";
-        return Err(BadInput::new(files::show(path), problem, "give a folder that has one of them"));
-    };
-    let (posed, photos, left_out) = find_photos(&root, posed, options)?;
-    let points = points.with_views(posed.iter().map(|posed| posed.id));
-    if points.is_empty() && !options.cameras_only {
-        let advice = "run structure from motion that writes points, as training starts from them";
-        return Err(BadInput::new(files::show(path), "has no sparse points", advice));
-    }
+    let Contents { mut format, posed, points, origin, left_out: unused } = read(&root, path, options)?;
+    let (posed, photos, mut left_out) = find_photos(&root, posed, options)?;
+    left_out.extend(unused);
     let views = views(&posed, &photos)?;
-    let capture = Capture { views, points, geo_origin: geo_origin(&root)? };
+    let mut points = points.with_views(posed.iter().map(|posed| posed.id));
+    if points.is_empty() && !options.cameras_only {
+        let cameras: Vec<Camera> = views.iter().map(|view| view.camera).collect();
+        points = frusta::points(&cameras).ok_or_else(|| {
+            let advice = "run structure from motion that writes points, as training starts from them";
+            BadInput::new(files::show(path), "has no sparse points, and its views do not overlap", advice)
+        })?;
+        format = match format {
+            "colmap" => "colmap without points",
+            "transforms" => "transforms without points",
+            "opensfm" => "opensfm without points",
+            _ => "kitti360 without points",
+        };
+    }
+    let capture = Capture { views, points, geo_origin: geo_origin(&root)?.or(origin) };
     Ok(Source { capture, photos, left_out, format })
+}
+
+/// What the files of a capture say, before its photos were looked for.
+struct Contents {
+    format: &'static str,
+    posed: Vec<Posed>,
+    points: Points,
+    origin: Option<GeoOrigin>,
+    /// Images that are not used, and why.
+    left_out: Vec<(String, String)>,
+}
+
+/// Finds out what the capture is, and reads it.
+fn read(root: &Root, path: &Path, options: &OpenOptions) -> Result<Contents, BadInput> {
+    if path.is_file() {
+        return match path.file_name() {
+            Some(name) if name == opensfm::FILE => opensfm::read(root, path),
+            _ => transforms::read(root, &[path.to_path_buf()]),
+        };
+    }
+    if let Some(folder) = colmap::find(root, &["sparse/0", "sparse", "."]) {
+        return colmap::read(root, &folder, options);
+    }
+    let transforms = transforms::find(root);
+    if !transforms.is_empty() {
+        return transforms::read(root, &transforms);
+    }
+    if let Some(path) = opensfm::find(root) {
+        return opensfm::read(root, &path);
+    }
+    if kitti360::is_there(root) {
+        return kitti360::read(root, options);
+    }
+    if let Some(folder) = colmap::find(root, &["colmap/sparse/0"]) {
+        return colmap::read(root, &folder, options);
+    }
+    let problem =
+        "has neither a COLMAP model in sparse/0 nor a transforms.json, reconstruction.json or KITTI-360's data_poses";
+    Err(BadInput::new(files::show(path), problem, "give a folder that has one of them"))
 }
 
 /// An image as the capture describes it.
@@ -130,9 +175,9 @@ fn find_photos(root: &Root, mut posed: Vec<Posed>, options: &OpenOptions) -> Res
         let advice = "remove one of them from the capture";
         return Err(BadInput::new(format!("image {}", pair[0].name), "is named twice by the capture", advice));
     }
-    let with_masks = root.path("masks").is_dir();
+    let masks = masks::folders(root);
     // All answers first, then the first error by name, whichever thread is faster.
-    let photos: Vec<_> = posed.par_iter().map(|posed| photo(root, posed, with_masks, options)).collect();
+    let photos: Vec<_> = posed.par_iter().map(|posed| photo(root, posed, &masks, options)).collect();
     let (mut kept, mut found, mut left_out) = (Vec::new(), Vec::new(), Vec::new());
     for (posed, photo) in posed.into_iter().zip(photos) {
         match photo? {
@@ -153,7 +198,7 @@ fn find_photos(root: &Root, mut posed: Vec<Posed>, options: &OpenOptions) -> Res
 }
 
 /// The photo of an image, `None` where its file is missing.
-fn photo(root: &Root, posed: &Posed, with_masks: bool, options: &OpenOptions) -> Result<Option<Photo>, BadInput> {
+fn photo(root: &Root, posed: &Posed, masks: &[&str], options: &OpenOptions) -> Result<Option<Photo>, BadInput> {
     let path = match root.image(&posed.file)? {
         Found::File(path) => path,
         Found::Missing => {
@@ -176,12 +221,7 @@ fn photo(root: &Root, posed: &Posed, with_masks: bool, options: &OpenOptions) ->
                 return Err(BadInput::new(files::show(&path), problem, "put the mask there or take it out"));
             }
         },
-        None if with_masks => {
-            let name = posed.file.strip_prefix("images/").unwrap_or(&posed.file);
-            let stem = name.rsplit_once('.').map_or(name, |(stem, _)| stem);
-            root.file(&format!("masks/{name}.png")).or_else(|| root.file(&format!("masks/{stem}.png")))
-        }
-        None => None,
+        None => masks::find(root, masks, &posed.file, &path, options),
     };
     Ok(Some(Photo { path, mask, model, width, height }))
 }
@@ -203,18 +243,19 @@ fn fitted(intrinsics: &Intrinsics, width: u32, height: u32) -> Option<CameraMode
         focal: [Some(Focal::Pixels(fx * x)), Some(Focal::Pixels(fy * y))],
         centre: [Some(cx * x), Some(cy * y)],
         distortion: model.distortion(),
+        fisheye: model.is_fisheye(),
     };
     Some(scaled.model(width, height))
 }
 
 fn views(posed: &[Posed], photos: &[Photo]) -> Result<Vec<View>, BadInput> {
-    let mut known: BTreeMap<([u64; 12], u32, u32), Option<Pinhole>> = BTreeMap::new();
+    let mut known: BTreeMap<([u64; 12], bool, u32, u32), Option<Pinhole>> = BTreeMap::new();
     let view = |(posed, photo): (&Posed, &Photo)| {
         let mut key = [0; 12];
         let parameters = photo.model.focal_and_centre().into_iter().chain(photo.model.distortion());
         key.iter_mut().zip(parameters).for_each(|(key, parameter)| *key = parameter.to_bits());
         let pinhole = *known
-            .entry((key, photo.width, photo.height))
+            .entry((key, photo.model.is_fisheye(), photo.width, photo.height))
             .or_insert_with(|| lens::ideal_pinhole(&photo.model, photo.width, photo.height));
         let pinhole = pinhole.ok_or_else(|| {
             let problem = "was taken with a lens whose distortion cannot be undone inside the photo";
@@ -232,7 +273,11 @@ fn geo_origin(root: &Root) -> Result<Option<GeoOrigin>, BadInput> {
         let Some(path) = root.file(name) else { return Ok(None) };
         Ok(serde_json::from_slice(&files::read(&path)?).ok().map(|value| (files::show(&path), value)))
     };
-    let (file, origin) = if let Some((file, value)) = json("reference_lla.json")? {
+    let reference = match json("reference_lla.json")? {
+        None => json("opensfm/reference_lla.json")?,
+        found => found,
+    };
+    let (file, origin) = if let Some((file, value)) = reference {
         (file, ["latitude", "longitude", "altitude"].map(|key| value[key].as_f64()))
     } else if let Some((file, value)) = json("info.json")? {
         let key = "gps_origin_lat_lon_alt";

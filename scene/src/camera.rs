@@ -137,7 +137,8 @@ impl Camera {
     }
 }
 
-/// COLMAP's perspective lens models with their parameters in COLMAP's order (`sensor/models.h`).
+/// COLMAP's perspective lens models, and the fisheye of OpenCV, with their parameters in COLMAP's order
+/// (`sensor/models.h`).
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub enum CameraModel {
     /// f, cx, cy
@@ -152,6 +153,8 @@ pub enum CameraModel {
     OpenCv([f64; 8]),
     /// fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6
     FullOpenCv([f64; 12]),
+    /// fx, fy, cx, cy, k1, k2, k3, k4
+    OpenCvFisheye([f64; 8]),
 }
 
 impl CameraModel {
@@ -161,11 +164,14 @@ impl CameraModel {
             Self::SimplePinhole([f, cx, cy]) => [f, f, cx, cy],
             Self::Pinhole(p) => p,
             Self::SimpleRadial([f, cx, cy, _]) | Self::Radial([f, cx, cy, ..]) => [f, f, cx, cy],
-            Self::OpenCv([fx, fy, cx, cy, ..]) | Self::FullOpenCv([fx, fy, cx, cy, ..]) => [fx, fy, cx, cy],
+            Self::OpenCv([fx, fy, cx, cy, ..])
+            | Self::FullOpenCv([fx, fy, cx, cy, ..])
+            | Self::OpenCvFisheye([fx, fy, cx, cy, ..]) => [fx, fy, cx, cy],
         }
     }
 
-    /// k1, k2, p1, p2, k3, k4, k5, k6 of the OpenCV rational model, which contains all the others.
+    /// k1, k2, p1, p2, k3, k4, k5, k6 of the OpenCV rational model, which contains all the other perspective ones; of a
+    /// fisheye its k1, k2, k3, k4 and zeros.
     pub fn distortion(&self) -> [f64; 8] {
         match *self {
             Self::SimplePinhole(_) | Self::Pinhole(_) => [0.0; 8],
@@ -173,17 +179,30 @@ impl CameraModel {
             Self::Radial([.., k1, k2]) => [k1, k2, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
             Self::OpenCv([.., k1, k2, p1, p2]) => [k1, k2, p1, p2, 0.0, 0.0, 0.0, 0.0],
             Self::FullOpenCv([.., k1, k2, p1, p2, k3, k4, k5, k6]) => [k1, k2, p1, p2, k3, k4, k5, k6],
+            Self::OpenCvFisheye([.., k1, k2, k3, k4]) => [k1, k2, k3, k4, 0.0, 0.0, 0.0, 0.0],
         }
     }
 
     /// True where the model bends rays.
     pub fn is_distorted(&self) -> bool {
-        self.distortion().iter().any(|&k| k != 0.0)
+        self.is_fisheye() || self.distortion().iter().any(|&k| k != 0.0)
+    }
+
+    /// True where pixels go with the angle to the axis instead of its tangent.
+    pub fn is_fisheye(&self) -> bool {
+        matches!(self, Self::OpenCvFisheye(_))
     }
 
     /// Distorts a point of the ideal image plane (`x/z, y/z`); source: OpenCV, "Camera Calibration and 3D
-    /// Reconstruction", rational model with tangential terms.
+    /// Reconstruction", rational model with tangential terms, and "Fisheye camera model".
     pub fn distort(&self, ideal: DVec2) -> DVec2 {
+        if let Self::OpenCvFisheye([.., k1, k2, k3, k4]) = *self {
+            let radius = ideal.length();
+            let angle = radius.atan();
+            let a2 = angle * angle;
+            let bent = angle * (1.0 + a2 * (k1 + a2 * (k2 + a2 * (k3 + a2 * k4))));
+            return if radius > 1e-12 { ideal * (bent / radius) } else { ideal };
+        }
         let [k1, k2, p1, p2, k3, k4, k5, k6] = self.distortion();
         let (x, y) = (ideal.x, ideal.y);
         let r2 = ideal.length_squared();

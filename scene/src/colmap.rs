@@ -1,7 +1,7 @@
 //! COLMAP sparse models: `cameras`, `images` and `points3D`, binary and text.
 //!
 //! Format: COLMAP's documentation ("Output Format") and `scene/reconstruction_io*.cc` there. Where features were seen
-//! in images is skipped: training does not need it. The `rigs` and `frames` that COLMAP 4 writes beside are not read,
+//! in images is skipped, as training does not need it; [`read_keypoints_bin`] reads it alone. The `rigs` and `frames` that COLMAP 4 writes beside are not read,
 //! as `images` has all poses.
 
 mod binary;
@@ -12,7 +12,8 @@ use std::collections::BTreeMap;
 use glam::{DQuat, DVec3};
 
 pub use self::binary::{
-    read_cameras_bin, read_images_bin, read_points_bin, write_cameras_bin, write_images_bin, write_points_bin,
+    read_cameras_bin, read_images_bin, read_keypoints_bin, read_points_bin, write_cameras_bin, write_images_bin,
+    write_points_bin,
 };
 pub use self::text::{read_cameras_txt, read_images_txt, read_points_txt};
 use crate::camera::{CameraModel, Rigid};
@@ -130,7 +131,9 @@ fn parameter_count(model: &str, camera: u32) -> Result<usize, CodecError> {
         "SIMPLE_PINHOLE" => Ok(3),
         "PINHOLE" | "SIMPLE_RADIAL" => Ok(4),
         "RADIAL" => Ok(5),
-        "OPENCV" => Ok(8),
+        "SIMPLE_RADIAL_FISHEYE" => Ok(4),
+        "RADIAL_FISHEYE" => Ok(5),
+        "OPENCV" | "OPENCV_FISHEYE" => Ok(8),
         "FULL_OPENCV" => Ok(12),
         other => Err(CodecError::new(format!(
             "camera {camera} has lens model {}, which is not supported: undistort with `colmap image_undistorter` first",
@@ -153,6 +156,13 @@ fn camera(id: u32, model: &str, width: u64, height: u64, parameters: &[f64]) -> 
         "SIMPLE_RADIAL" => exactly(parameters).map(CameraModel::SimpleRadial),
         "RADIAL" => exactly(parameters).map(CameraModel::Radial),
         "OPENCV" => exactly(parameters).map(CameraModel::OpenCv),
+        "OPENCV_FISHEYE" => exactly(parameters).map(CameraModel::OpenCvFisheye),
+        "SIMPLE_RADIAL_FISHEYE" => {
+            exactly(parameters).map(|[f, cx, cy, k]| CameraModel::OpenCvFisheye([f, f, cx, cy, k, 0.0, 0.0, 0.0]))
+        }
+        "RADIAL_FISHEYE" => {
+            exactly(parameters).map(|[f, cx, cy, k1, k2]| CameraModel::OpenCvFisheye([f, f, cx, cy, k1, k2, 0.0, 0.0]))
+        }
         _ => exactly(parameters).map(CameraModel::FullOpenCv),
     };
     let lens = lens.ok_or_else(|| wrong("has not as many parameters as its lens model"))?;

@@ -13,9 +13,12 @@ pub mod error;
 pub mod frame;
 pub mod ids;
 pub mod image;
+pub mod kitti360;
 pub mod npy;
+pub mod opensfm;
 pub mod ply;
 pub mod splats;
+pub mod spz;
 pub mod transforms;
 
 pub use camera::{Camera, CameraModel, Pinhole, Rect, Rigid};

@@ -1,4 +1,4 @@
-//! `transforms.json` of nerfstudio and instant-ngp: posed images of perspective cameras.
+//! `transforms.json` of nerfstudio and instant-ngp: posed images of perspective and fisheye cameras.
 //!
 //! A frame's `transform_matrix` is world_from_camera in OpenGL axes (x right, y up, z backward); ours is OpenCV
 //! camera_from_world. `applied_transform` needs nothing: nerfstudio has applied it to the frames and to the points of
@@ -49,8 +49,10 @@ pub struct Intrinsics {
     pub focal: [Option<Focal>; 2],
     /// Principal point in pixels; absent coordinates are the image's middle.
     pub centre: [Option<f64>; 2],
-    /// k1, k2, p1, p2, k3, k4, k5, k6 as in [`CameraModel::distortion`].
+    /// As [`CameraModel::distortion`] has it.
     pub distortion: [f64; 8],
+    /// [`CameraModel::OpenCvFisheye`], not a perspective lens.
+    pub fisheye: bool,
 }
 
 /// A focal length.
@@ -80,6 +82,7 @@ impl Intrinsics {
             focal: [Some(Focal::Pixels(fx)), Some(Focal::Pixels(fy))],
             centre: [Some(cx), Some(cy)],
             distortion: model.distortion(),
+            fisheye: model.is_fisheye(),
         }
     }
 
@@ -92,6 +95,7 @@ impl Intrinsics {
         let cx = self.centre[0].unwrap_or(0.5 * f64::from(width));
         let cy = self.centre[1].unwrap_or(0.5 * f64::from(height));
         match self.distortion {
+            [k1, k2, k3, k4, ..] if self.fisheye => CameraModel::OpenCvFisheye([fx, fy, cx, cy, k1, k2, k3, k4]),
             [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0] => CameraModel::Pinhole([fx, fy, cx, cy]),
             [k1, k2, p1, p2, 0.0, 0.0, 0.0, 0.0] => CameraModel::OpenCv([fx, fy, cx, cy, k1, k2, p1, p2]),
             [k1, k2, p1, p2, k3, k4, k5, k6] => {
@@ -104,7 +108,7 @@ impl Intrinsics {
 /// Frames and their intrinsics.
 ///
 /// # Errors
-/// Malformed JSON, no frames, a lens model that is not perspective, intrinsics without a focal length or out of
+/// Malformed JSON, no frames, a lens model that plat does not know, intrinsics without a focal length or out of
 /// range, or a `transform_matrix` whose 3×3 part is not a rotation times a scale (which is dropped).
 pub fn read(bytes: &[u8]) -> Result<Transforms, CodecError> {
     let file: File = serde_json::from_slice(bytes).map_err(|e| CodecError::new(format!("transforms.json: {e}")))?;
@@ -229,8 +233,12 @@ impl Lens {
         let pixels = |focal| if let Some(Focal::Pixels(f)) = focal { Some(f) } else { None };
         let angle = |focal| if let Some(Focal::Angle(a)) = focal { Some(a) } else { None };
         let [fx, fy] = intrinsics.focal;
-        let distortion = intrinsics.distortion;
+        let mut distortion = intrinsics.distortion;
         let model = match distortion {
+            [k1, k2, k3, k4, ..] if intrinsics.fisheye => {
+                distortion = [k1, k2, 0.0, 0.0, k3, k4, 0.0, 0.0];
+                "OPENCV_FISHEYE"
+            }
             [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0] => "PINHOLE",
             [.., 0.0, 0.0, 0.0] => "OPENCV",
             _ => "FULL_OPENCV",
@@ -261,11 +269,12 @@ impl Lens {
     fn resolve(&self) -> Result<Intrinsics, String> {
         const PERSPECTIVE: [&str; 6] =
             ["PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"];
-        let fisheye = self.is_fisheye == Some(true);
-        let model = if fisheye { "fisheye" } else { self.camera_model.as_deref().unwrap_or("OPENCV") };
-        if !PERSPECTIVE.contains(&model) {
+        let model = self.camera_model.as_deref().unwrap_or("OPENCV");
+        // instant-ngp says it beside a model of its own.
+        let fisheye = self.is_fisheye == Some(true) || model == "OPENCV_FISHEYE";
+        if !fisheye && !PERSPECTIVE.contains(&model) {
             let model: String = model.chars().take(40).collect();
-            return Err(format!("camera model {model:?} is not perspective; undistort the images first"));
+            return Err(format!("camera model {model:?} is not known; undistort the images first"));
         }
         let side = |key: &str, value: Option<f64>| match value {
             Some(v) if !(v >= 1.0 && v <= f64::from(u32::MAX) && v.fract() == 0.0) => {
@@ -285,10 +294,13 @@ impl Lens {
         if focal == [None, None] {
             return Err("neither 'fl_x' nor 'camera_angle_x'".into());
         }
-        let distortion =
+        let mut distortion =
             [self.k1, self.k2, self.p1, self.p2, self.k3, self.k4, self.k5, self.k6].map(Option::unwrap_or_default);
         // In nerfstudio k4 is the factor of r⁸, in OpenCV it stands below the line: without a name nobody can say.
-        if model != "FULL_OPENCV" && distortion[5..].iter().any(|&k| k != 0.0) {
+        if fisheye {
+            let [k1, k2, _, _, k3, k4, ..] = distortion;
+            distortion = [k1, k2, k3, k4, 0.0, 0.0, 0.0, 0.0];
+        } else if model != "FULL_OPENCV" && distortion[5..].iter().any(|&k| k != 0.0) {
             return Err(
                 "'k4' and above are clear only with camera_model FULL_OPENCV; undistort the images first".into()
             );
@@ -297,7 +309,7 @@ impl Lens {
         if !distortion.iter().chain(centre.iter().flatten()).all(|v| v.is_finite()) {
             return Err("intrinsics that are not finite".into());
         }
-        Ok(Intrinsics { size, focal, centre, distortion })
+        Ok(Intrinsics { size, focal, centre, distortion, fisheye })
     }
 }
 

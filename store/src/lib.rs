@@ -12,6 +12,7 @@ mod error;
 use std::ops::Range;
 use std::path::Path as FilePath;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 
 use bytes::Bytes;
 use object_store::local::LocalFileSystem;
@@ -31,6 +32,17 @@ pub const NAME_LIMIT: usize = 200;
 pub struct Store {
     objects: Arc<dyn ObjectStore>,
     url: Arc<str>,
+    read: Arc<AtomicU64>,
+    written: Arc<AtomicU64>,
+}
+
+/// Bytes that went from and to a store.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Traffic {
+    /// Bytes of artefacts, ranges and records that were read.
+    pub read: u64,
+    /// Bytes of artefacts and records that were written; an artefact that was there already is not.
+    pub written: u64,
 }
 
 impl Store {
@@ -55,7 +67,17 @@ impl Store {
                 return Err(BadInput::new(url, problem, ADVICE));
             }
         };
-        Ok(Self { objects, url: url.into() })
+        Ok(Self { objects, url: url.into(), read: Arc::default(), written: Arc::default() })
+    }
+
+    /// The same place with a count of its own, from 0, that its clones share.
+    pub fn metered(&self) -> Self {
+        Self { read: Arc::default(), written: Arc::default(), ..self.clone() }
+    }
+
+    /// What this store and its clones moved since it was opened or made by [`Store::metered`].
+    pub fn traffic(&self) -> Traffic {
+        Traffic { read: self.read.load(Ordering::Relaxed), written: self.written.load(Ordering::Relaxed) }
     }
 
     /// The URL that the store was opened with.
@@ -79,10 +101,8 @@ impl Store {
         if matches!(self.objects.head(&path).await, Ok(found) if found.size == bytes.len() as u64) {
             return Ok(id);
         }
-        match self.objects.put(&path, bytes.into()).await {
-            Ok(_) => Ok(id),
-            Err(error) => Err(self.failed("write", &path, &error)),
-        }
+        self.write(&path, bytes).await?;
+        Ok(id)
     }
 
     /// The bytes of an artefact, checked against its hash.
@@ -91,11 +111,7 @@ impl Store {
     /// Missing, damaged, or not readable.
     pub async fn get(&self, id: ArtefactId) -> Result<Bytes, StoreError> {
         let path = artefact_path(id);
-        let bytes = match self.objects.get(&path).await {
-            Ok(found) => found.bytes().await,
-            Err(error) => Err(error),
-        };
-        let bytes = bytes.map_err(|error| self.artefact_failed(id, &path, &error))?;
+        let bytes = self.read(&path).await.map_err(|error| self.artefact_failed(id, &path, &error))?;
         let found = ArtefactId::of(&bytes);
         if found == id { Ok(bytes) } else { Err(StoreError::Corrupt { id, store: self.url.to_string() }) }
     }
@@ -109,6 +125,7 @@ impl Store {
         let path = artefact_path(id);
         let parts = self.objects.get_ranges(&path, ranges).await;
         let parts = parts.map_err(|error| self.artefact_failed(id, &path, &error))?;
+        self.read.fetch_add(parts.iter().map(|part| part.len() as u64).sum(), Ordering::Relaxed);
         let whole = |(part, range): (&Bytes, &Range<u64>)| part.len() as u64 == range.end.saturating_sub(range.start);
         if parts.len() == ranges.len() && parts.iter().zip(ranges).all(whole) {
             Ok(parts)
@@ -144,10 +161,7 @@ impl Store {
     /// A name that is not made of ASCII letters, digits, `.`, `_`, `-` and `/`, or a store that refuses the write.
     pub async fn put_name(&self, name: &str, bytes: Bytes) -> Result<(), StoreError> {
         let path = name_path(name)?;
-        match self.objects.put(&path, bytes.into()).await {
-            Ok(_) => Ok(()),
-            Err(error) => Err(self.failed("write", &path, &error)),
-        }
+        self.write(&path, bytes).await
     }
 
     /// The record of this name, `None` if there is none.
@@ -156,15 +170,24 @@ impl Store {
     /// A name as [`Store::put_name`] refuses it, or a store that cannot be read.
     pub async fn get_name(&self, name: &str) -> Result<Option<Bytes>, StoreError> {
         let path = name_path(name)?;
-        let bytes = match self.objects.get(&path).await {
-            Ok(found) => found.bytes().await,
-            Err(error) => Err(error),
-        };
-        match bytes {
+        match self.read(&path).await {
             Ok(bytes) => Ok(Some(bytes)),
             Err(object_store::Error::NotFound { .. }) => Ok(None),
             Err(error) => Err(self.failed("read", &path, &error)),
         }
+    }
+
+    async fn read(&self, path: &Path) -> object_store::Result<Bytes> {
+        let bytes = self.objects.get(path).await?.bytes().await?;
+        self.read.fetch_add(bytes.len() as u64, Ordering::Relaxed);
+        Ok(bytes)
+    }
+
+    async fn write(&self, path: &Path, bytes: Bytes) -> Result<(), StoreError> {
+        let length = bytes.len() as u64;
+        self.objects.put(path, bytes.into()).await.map_err(|error| self.failed("write", path, &error))?;
+        self.written.fetch_add(length, Ordering::Relaxed);
+        Ok(())
     }
 
     fn artefact_failed(&self, id: ArtefactId, path: &Path, error: &object_store::Error) -> StoreError {

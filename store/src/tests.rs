@@ -31,6 +31,22 @@ fn what_is_put_is_got_whole_and_in_ranges() {
 }
 
 #[test]
+fn traffic_is_counted_apart() {
+    let all = Store::open("memory://").unwrap();
+    let (one, other) = (all.metered(), all.metered());
+    let id = one.blocking().put("the survey map").unwrap();
+    one.blocking().put("the survey map").unwrap();
+    other.blocking().get(id).unwrap();
+    other.blocking().get_ranges(id, &[11..14, 4..10]).unwrap();
+    assert!(other.blocking().get(ArtefactId::of(b"never put")).is_err());
+    other.blocking().put_name("a/b", "12345").unwrap();
+    other.blocking().get_name("a/b").unwrap();
+    assert_eq!(one.traffic(), Traffic { read: 0, written: 14 });
+    assert_eq!(other.clone().traffic(), Traffic { read: 14 + 9 + 5, written: 5 });
+    assert_eq!(all.traffic(), Traffic::default());
+}
+
+#[test]
 fn names_are_replaced_and_confined() {
     let (_folder, stores) = stores();
     for store in &stores {

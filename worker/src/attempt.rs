@@ -111,6 +111,7 @@ fn to_wire(report: Report) -> proto::Report {
         cpu_seconds: finite(report.cpu_seconds),
         wall_seconds: finite(report.wall_seconds),
         psnr: report.psnr.filter(|psnr| psnr.is_finite()),
+        merged_splats: report.merged_splats,
     }
 }
 

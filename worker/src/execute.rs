@@ -13,13 +13,14 @@ use blocks::{Mode, Plan, Task, ViewUse};
 use dataset::windows::WindowReader;
 use glam::Vec3;
 use rayon::prelude::*;
-use render::Options;
-use render::cpu::{Isa, Renderer};
+use render::cpu::Isa;
 use scene::{ArtefactId, BlockId, Capture, SparsePoints, Splats, frame};
 use store::BlockingStore;
-use train::{Recipe, TrainError, TrainView, metrics};
+use train::{Recipe, TrainError, TrainView};
 
+use crate::cap::{Cap, Limit};
 use crate::clock::Stopwatch;
+use crate::merged::{Finished, Judge};
 use crate::{Execute, ExecuteError, Flow, Report, TaskOrder};
 
 /// Steps between two reports.
@@ -30,16 +31,26 @@ const REPORT_EVERY: u32 = 10;
 pub struct TrainerOptions {
     /// Threads of the compute pool, at least 1.
     pub threads: usize,
-    /// Steps between two evaluations on the task's test views; 0 = only at its end.
+    /// Steps between two evaluations of the merged model so far; 0 = only at the end of a task.
     pub eval_every: u32,
     /// Bound on the windows kept in memory.
     pub cache_bytes: usize,
+}
+
+/// What the workers of one process know of a job together.
+#[derive(Debug, Default)]
+pub struct Shared {
+    /// What is finished.
+    pub finished: Finished,
+    /// A cap in wall time.
+    pub cap: Option<Cap>,
 }
 
 /// Trains blocks on the CPU backend.
 pub struct BlockTrainer {
     store: BlockingStore,
     options: TrainerOptions,
+    shared: Arc<Shared>,
     pool: rayon::ThreadPool,
 }
 
@@ -53,12 +64,12 @@ impl BlockTrainer {
     ///
     /// # Errors
     /// The operating system refused the threads.
-    pub fn new(store: BlockingStore, options: TrainerOptions) -> Result<Self, String> {
+    pub fn new(store: BlockingStore, options: TrainerOptions, shared: Arc<Shared>) -> Result<Self, String> {
         let pool = rayon::ThreadPoolBuilder::new()
             .num_threads(options.threads.max(1))
             .build()
             .map_err(|error| format!("cannot start {} threads: {error}", options.threads))?;
-        Ok(Self { store, options, pool })
+        Ok(Self { store, options, shared, pool })
     }
 }
 
@@ -75,9 +86,11 @@ impl Execute for BlockTrainer {
         let capture = Arc::new(dataset::ingest::load_capture(&self.store, plan.capture).map_err(failed)?);
         let reader = WindowReader::new(capture.clone(), self.store.clone(), self.options.cache_bytes);
         let results = self.results(&plan, task, order)?;
-        let block = Block { plan: &plan, task, capture: &capture, reader: &reader };
-        let splats = self.pool.install(|| block.train(results, self.options.eval_every, &mut stopwatch, report))?;
-        self.store.put(frame::encode_splats(&splats)).map_err(failed)
+        let block = Block { trainer: self, order, plan: &plan, task, capture: &capture, reader: &reader };
+        let splats = self.pool.install(|| block.train(results, &mut stopwatch, report))?;
+        let artefact = self.store.put(frame::encode_splats(&splats)).map_err(failed)?;
+        self.shared.cap.iter().for_each(|cap| cap.finish(order.task));
+        Ok(artefact)
     }
 }
 
@@ -98,9 +111,11 @@ impl BlockTrainer {
 
 /// A block about to be trained.
 struct Block<'a> {
+    trainer: &'a BlockTrainer,
+    order: &'a TaskOrder,
     plan: &'a Plan,
     task: &'a Task,
-    capture: &'a Capture,
+    capture: &'a Arc<Capture>,
     reader: &'a WindowReader,
 }
 
@@ -108,21 +123,29 @@ impl Block<'_> {
     fn train(
         &self,
         results: BTreeMap<BlockId, Splats>,
-        eval_every: u32,
         stopwatch: &mut Stopwatch,
         report: &mut (dyn FnMut(Report) -> Flow + Send),
     ) -> Result<Splats, ExecuteError> {
-        let task = self.task;
+        let Self { plan, task, .. } = *self;
+        let Shared { finished, cap } = &*self.trainer.shared;
+        let eval_every = self.trainer.options.eval_every;
         let recipe = self.recipe();
         let views = self.windows(&task.views)?;
-        let test_views = self.windows(&task.test_views)?;
         let budget = self.budget(&results);
+        let mut judge = Judge::new(plan, self.capture, &self.trainer.store);
+        if judge.is_some() {
+            finished.learn(self.order.plan, plan, &results);
+        }
+        let mut measure = |splats: &Splats| {
+            let judge = judge.as_mut()?;
+            let merged = finished.with(self.order.plan, plan, task.block, splats);
+            judge.psnr(&merged).map(|psnr| (psnr, merged.len() as u64))
+        };
         let (initial, context) = self.start(results, &views, &recipe)?;
-        let mut renderer = Renderer::default();
-        let counts = |p: Vec3| self.plan.ground.owns(task.block, p.as_dvec3());
+        let counts = |p: Vec3| plan.ground.owns(task.block, p.as_dvec3());
         let cut = task.context_cut();
         let keeps = |p: Vec3| self.trains(&cut, p.as_dvec3());
-        let job = train::Job {
+        let mut job = train::Job {
             initial,
             context: context.as_ref(),
             views: &views,
@@ -130,22 +153,26 @@ impl Block<'_> {
             keeps: &keeps,
             budget,
             steps: task.steps,
-            antialiased: self.plan.antialiased(),
+            antialiased: plan.antialiased(),
             seed: self.seed(),
             size_bounds_metres: self.size_bounds_metres(),
             recipe: &recipe,
             source: self.reader,
         };
-        let mut stopped = false;
+        let limit = cap.as_ref().map(|cap| {
+            let evaluate = |splats: &Splats| stopwatch.paused(|| measure(splats));
+            Limit::of(cap, plan, self.order.task, &mut job, eval_every, evaluate)
+        });
+        let (mut cancelled, mut late) = (false, false);
         let splats = train::train(job, &mut |now| {
-            let last = now.step == now.steps;
+            late = now.step < now.steps && limit.as_ref().is_some_and(Limit::is_over);
+            let last = now.step == now.steps || late;
             let evaluate = last || (eval_every > 0 && now.step.is_multiple_of(eval_every));
             if !evaluate && !now.step.is_multiple_of(REPORT_EVERY) {
                 return train::Flow::Continue;
             }
             let (cpu_seconds, wall_seconds) = (stopwatch.cpu_seconds(), stopwatch.wall_seconds());
-            let measure = || self.psnr(&test_views, now.splats, context.as_ref(), &mut renderer);
-            let psnr = if evaluate { stopwatch.paused(measure) } else { None };
+            let measured = if evaluate { stopwatch.paused(|| measure(now.splats)) } else { None };
             let flow = report(Report {
                 step: now.step.into(),
                 steps: now.steps.into(),
@@ -153,10 +180,11 @@ impl Block<'_> {
                 splats: now.splats.len() as u64,
                 cpu_seconds,
                 wall_seconds,
-                psnr,
+                psnr: measured.map(|(psnr, _)| psnr),
+                merged_splats: measured.map(|(_, splats)| splats),
             });
-            stopped |= flow == Flow::Stop && !last;
-            if stopped { train::Flow::Stop } else { train::Flow::Continue }
+            cancelled |= flow == Flow::Stop && !last;
+            if cancelled || late { train::Flow::Stop } else { train::Flow::Continue }
         })
         .map_err(|error| match error {
             TrainError::NoViews | TrainError::Empty(_) => {
@@ -164,8 +192,14 @@ impl Block<'_> {
             }
             TrainError::Source(_) => failed(error),
         })?;
-        if stopped {
+        if cancelled {
             return Err(failed("stopped before its end, as asked"));
+        }
+        if late {
+            cap.iter().for_each(Cap::shorten);
+        }
+        if judge.is_some() {
+            finished.insert(self.order.plan, plan, task.block, &splats);
         }
         Ok(splats)
     }
@@ -275,31 +309,6 @@ impl Block<'_> {
         distances.sort_by(f64::total_cmp);
         let far = distances.get(distances.len() * 98 / 100).copied().unwrap_or(1.0);
         (centre, 5.0 * far.max(self.plan.ground.edge_metres * 0.5))
-    }
-
-    /// Mean PSNR over the test windows, dB; `None` without any, or where one cannot be read (training will say why).
-    fn psnr(
-        &self,
-        views: &[TrainView],
-        splats: &Splats,
-        context: Option<&Splats>,
-        renderer: &mut Renderer,
-    ) -> Option<f64> {
-        let options = Options { antialiased: self.plan.antialiased(), ..Options::default() };
-        let mut total = 0.0;
-        let mut count = 0;
-        for view in views {
-            let (mip, rect, camera) = view.at(0)?;
-            let photo = self.reader.window(view.view, mip, rect).ok()?;
-            let frame = renderer.forward(splats, context, &camera, &options);
-            let photo_values: Vec<f32> = photo.rgb.iter().map(|&v| f32::from(v) / 255.0).collect();
-            let render: Vec<f32> = frame.colour.iter().map(|v| v.clamp(0.0, 1.0)).collect();
-            if let Some(psnr) = metrics::psnr(&render, &photo_values, photo.mask.as_deref()) {
-                total += psnr;
-                count += 1;
-            }
-        }
-        (count > 0).then(|| total / f64::from(count))
     }
 }
 

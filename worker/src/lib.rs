@@ -10,8 +10,10 @@
 //! attempt, and the coordinator may refuse it. The heartbeat and the news travel beside the compute and never hold it up.
 
 mod attempt;
+pub mod cap;
 pub mod clock;
 pub mod execute;
+mod merged;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -22,6 +24,8 @@ use scene::{ArtefactId, BadInput};
 use tokio_util::sync::CancellationToken;
 use tonic::transport::Endpoint;
 use tonic::{Code, Status};
+
+pub use merged::Finished;
 
 /// Longest pause between two tries to reach a coordinator that is away.
 const BACKOFF_LIMIT: Duration = Duration::from_secs(5);
@@ -58,8 +62,10 @@ pub struct Report {
     pub cpu_seconds: f64,
     /// Wall seconds the task has taken, evaluation left out.
     pub wall_seconds: f64,
-    /// Mean PSNR over the test views in dB, where it was measured at this step.
+    /// Mean PSNR of the merged model so far over the job's test views in dB, where it was measured at this step.
     pub psnr: Option<f64>,
+    /// Splats of what was measured.
+    pub merged_splats: Option<u64>,
 }
 
 /// The answer to a report.

@@ -1,49 +1,113 @@
-//! `plat bench pareto` and `plat bench chart`: figures that are kept, and pictures of them.
+//! `plat bench pareto`, `demo`, `ingest` and `chart`: figures that are kept, and pictures of them.
 
 use std::fs;
 use std::path::Path;
 
-use ::bench::{CurvePoint, append, read_folder, replace_table, table};
+use ::bench::parts::Ingest;
+use ::bench::{CurvePoint, PartLine, append, append_part, read_folder, replace_table, table};
 use serde::Serialize;
 use store::Store;
 
-use crate::args::{ChartArgs, ParetoArgs};
+use crate::args::{BenchDemoArgs, ChartArgs, IngestArgs, ParetoArgs};
+use crate::cameras;
+use crate::clock::{self, Stopwatch};
+use crate::commands::demo;
 use crate::commands::eval::{self, evaluate};
-use crate::commands::train::{make_folder, train};
+use crate::commands::train::{ingest_photos, make_folder, train};
 use crate::failure::Failure;
+use crate::lpips::Lpips;
 use crate::model::{save, save_json};
 use crate::output::Output;
+use crate::record::{Record, commit};
 
 /// The file of our own runs.
 const RUNS: &str = "plat.jsonl";
+/// The file of ingests alone.
+const INGESTS: &str = "ingest.jsonl";
 
 /// Trains, measures the merged model, and appends a line.
 pub(crate) fn pareto(args: &ParetoArgs, output: &Output) -> Result<(), Failure> {
+    let lpips = args.lpips.as_deref().map(Lpips::load).transpose()?;
     let trained = train(&args.train, output)?;
     let store_url = args.train.store.clone().unwrap_or_else(|| args.train.out.join("store").display().to_string());
     let store = Store::open(&store_url)?.blocking();
     let out = args.train.out.join("eval");
     let mut record = trained.report.record.clone();
-    let evaluated = evaluate(&trained.model, trained.capture, store, args.train.plan.test_every, &out, output)?;
+    let every = args.train.plan.test_every;
+    let evaluated = evaluate(&trained.model, trained.capture, store, every, lpips.as_ref(), &out, output)?;
     save_json(&out.join("report.json"), &evaluated)?;
     record.scene.clone_from(&args.scene);
-    (record.psnr, record.ssim, record.perceptual, record.fps) =
-        (evaluated.record.psnr, evaluated.record.ssim, evaluated.record.perceptual, evaluated.record.fps);
-    // The last point is the merged model at the end of all work.
-    let mut curve = trained.curve;
+    record.measured(&evaluated.record);
+    keep_run(&args.results, &args.label, &record, trained.curve, eval::text(&evaluated), output)
+}
+
+/// Builds the demo, and appends a line.
+pub(crate) fn demo(args: &BenchDemoArgs, output: &Output) -> Result<(), Failure> {
+    let built = demo::build(&args.demo, output)?;
+    let mut record = built.shown.report.record;
+    record.scene = if args.demo.quick { "demo quick" } else { "demo" }.to_owned();
+    keep_run(&args.results, &args.label, &record, built.curve, built.text, output)
+}
+
+/// Appends a run, whose curve ends with the merged model at the end of all work.
+fn keep_run(
+    results: &Path,
+    label: &str,
+    record: &Record,
+    mut curve: Vec<CurvePoint>,
+    text: String,
+    output: &Output,
+) -> Result<(), Failure> {
     if let (Some(cpu_seconds), Some(psnr)) = (record.cpu_seconds, record.psnr) {
         curve.pop();
         curve.push(CurvePoint { cpu_seconds, psnr, splats: Some(record.splats) });
     }
-    let line = record.line(&args.label, invoked(), curve);
+    let line = record.line(label, invoked(), curve);
+    make_folder(results)?;
+    append(&results.join(RUNS), &line)?;
+    output.result(&line, &format!("{text}\nappended to {}", results.join(RUNS).display()))
+}
+
+/// Ingests a capture into an empty store, and appends a line. This process does nothing else, so its peak is the ingest's.
+pub(crate) fn ingest(args: &IngestArgs, output: &Output) -> Result<(), Failure> {
+    let folder = tempfile::tempdir().map_err(|e| Failure::Work(format!("no temporary folder: {e}")))?;
+    let store = Store::open(&folder.path().display().to_string())?;
+    let clock = Stopwatch::start();
+    let source = cameras::open(&args.capture, output)?;
+    ingest_photos(&source, &store.blocking(), args.downscale, output)?;
+    let line = Ingest {
+        commit: commit().to_owned(),
+        machine: ::bench::machine(),
+        scene: args.scene.clone().unwrap_or_else(|| cameras::name_of(&args.capture)),
+        downscale: args.downscale,
+        threads: std::thread::available_parallelism().map_or(1, |n| n.get() as u32),
+        photos: source.photos.len() as u64,
+        pixels: source.photos.iter().map(|photo| u64::from(photo.width) * u64::from(photo.height)).sum(),
+        wall_seconds: clock.wall_seconds(),
+        cpu_seconds: clock.cpu_seconds(),
+        peak_memory_bytes: clock::peak_memory_bytes(),
+        bytes_written: store.traffic().written,
+        command: invoked(),
+    };
+    let file = args.results.join(INGESTS);
     make_folder(&args.results)?;
-    append(&args.results.join(RUNS), &line)?;
-    let text = format!("{}\nappended to {}", eval::text(&evaluated), args.results.join(RUNS).display());
+    let text = format!(
+        "{} photos of {:.1} megapixels in all: {:.1} CPU seconds, {:.1} seconds, {} MB at most, {} MB stored\nappended to {}",
+        line.photos,
+        line.pixels as f64 / 1e6,
+        line.cpu_seconds,
+        line.wall_seconds,
+        line.peak_memory_bytes.unwrap_or_default() / 1_000_000,
+        line.bytes_written / 1_000_000,
+        file.display(),
+    );
+    let line = PartLine::Ingest(line);
+    append_part(&file, &line)?;
     output.result(&line, &text)
 }
 
 /// The command line, with the program by its plain name.
-fn invoked() -> String {
+pub(crate) fn invoked() -> String {
     let words = std::env::args().skip(1);
     std::iter::once("plat".to_owned()).chain(words).collect::<Vec<_>>().join(" ")
 }

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use ::bench::{birdseye_camera, oblique_camera, write_png};
+use ::bench::{CurvePoint, birdseye_camera, oblique_camera, write_png};
 use ::render::cpu::Renderer;
 use dataset::synth::{CitySettings, write_city};
 use glam::DVec3;
@@ -20,11 +20,17 @@ use crate::output::Output;
 /// Width of the pictures from above, pixels.
 const PICTURE_WIDTH: u32 = 1200;
 
+/// The demo as it was built.
+pub(crate) struct Built {
+    pub(crate) shown: Shown,
+    pub(crate) text: String,
+    pub(crate) curve: Vec<CurvePoint>,
+}
+
 #[derive(Serialize)]
-struct Shown {
-    command: &'static str,
+pub(crate) struct Shown {
     #[serde(flatten)]
-    report: Report,
+    pub(crate) report: Report,
     sheet: PathBuf,
     birdseye: PathBuf,
     oblique: PathBuf,
@@ -32,6 +38,12 @@ struct Shown {
 }
 
 pub(crate) fn run(args: &DemoArgs, output: &Output) -> Result<(), Failure> {
+    let built = build(args, output)?;
+    output.result(&built.shown, &built.text)
+}
+
+/// Builds the city, trains it, measures it and draws it.
+pub(crate) fn build(args: &DemoArgs, output: &Output) -> Result<Built, Failure> {
     let city_folder = args.out.join("city");
     let (city, train_args) = settings(args);
     output.note(format!("building a city of {:.0} m and taking {} photos of it", city.extent_metres, city.views));
@@ -52,12 +64,12 @@ pub(crate) fn run(args: &DemoArgs, output: &Output) -> Result<(), Failure> {
         let frame = renderer.forward(&trained.model.splats, None, &camera, &trained.model.options());
         write_png(path, &to_image(frame))?;
     }
-    let evaluated = evaluate(&trained.model, trained.capture, store, train_args.plan.test_every, &eval_folder, output)?;
+    let every = train_args.plan.test_every;
+    let evaluated = evaluate(&trained.model, trained.capture, store, every, None, &eval_folder, output)?;
     save_json(&eval_folder.join("report.json"), &evaluated)?;
 
     let mut report = trained.report;
-    (report.record.psnr, report.record.ssim, report.record.perceptual, report.record.fps) =
-        (evaluated.record.psnr, evaluated.record.ssim, evaluated.record.perceptual, evaluated.record.fps);
+    report.record.measured(&evaluated.record);
     report.record.command = "demo";
     let text = format!(
         "a city of {:.0} m in {} splats and {} blocks, {:.1} dB PSNR and {:.3} SSIM on {} held-out photos,\n\
@@ -82,8 +94,8 @@ pub(crate) fn run(args: &DemoArgs, output: &Output) -> Result<(), Failure> {
         args.out.join("merged.ply").display(),
     );
     let merged = args.out.join("merged.ply");
-    let shown = Shown { command: "demo", report, sheet: evaluated.sheet, birdseye, oblique, merged };
-    output.result(&shown, &text)
+    let shown = Shown { report, sheet: evaluated.sheet, birdseye, oblique, merged };
+    Ok(Built { shown, text, curve: trained.curve })
 }
 
 /// The city and how it is trained.
@@ -111,6 +123,7 @@ fn settings(args: &DemoArgs) -> (CitySettings, TrainArgs) {
         workers: 1,
         threads: Auto(None),
         eval_every: 0,
+        minutes: None,
     };
     (city, train)
 }

@@ -21,6 +21,7 @@ use crate::clock::{self, Stopwatch};
 use crate::commands::render::to_image;
 use crate::commands::train::{ingest_photos, make_folder};
 use crate::failure::Failure;
+use crate::lpips::Lpips;
 use crate::model::{self, Model, save_json};
 use crate::output::Output;
 use crate::record::Record;
@@ -48,9 +49,12 @@ pub(crate) struct Figures {
     pub(crate) ssim: f64,
     /// SSIMULACRA2; null below 8 pixels a side.
     pub(crate) perceptual: Option<f64>,
+    /// Null without weights.
+    pub(crate) lpips: Option<f64>,
 }
 
 pub(crate) fn run(args: &EvalArgs, output: &Output) -> Result<(), Failure> {
+    let lpips = args.lpips.as_deref().map(Lpips::load).transpose()?;
     let model = model::read(&args.model)?;
     let source = cameras::open(&args.capture, output)?;
     let (trained, default_every, default_downscale) = match &model.trained {
@@ -68,7 +72,7 @@ pub(crate) fn run(args: &EvalArgs, output: &Output) -> Result<(), Failure> {
     let ingested = ingest_photos(&source, &store.blocking(), downscale, output)?;
     let out = args.out.clone().unwrap_or_else(|| model.folder(&args.model, "eval"));
     let test_every = args.test_every.unwrap_or(default_every);
-    let mut evaluated = evaluate(&model, ingested.capture, store.blocking(), test_every, &out, output)?;
+    let mut evaluated = evaluate(&model, ingested.capture, store.blocking(), test_every, lpips.as_ref(), &out, output)?;
     evaluated.record.scene = cameras::name_of(&args.capture);
     evaluated.record.downscale = downscale;
     save_json(&out.join("report.json"), &evaluated)?;
@@ -77,16 +81,18 @@ pub(crate) fn run(args: &EvalArgs, output: &Output) -> Result<(), Failure> {
 
 /// The figures as text, a line a view.
 pub(crate) fn text(evaluated: &Evaluated) -> String {
-    let line = |name: &str, psnr: Option<f64>, ssim: Option<f64>, perceptual: Option<f64>| {
-        let figure = |value: Option<f64>, digits: usize| value.map_or("-".into(), |v| format!("{v:.digits$}"));
-        format!("{:>8} {:>8} {:>8}  {name}\n", figure(psnr, 2), figure(ssim, 4), figure(perceptual, 2))
-    };
-    let mut text = format!("{:>8} {:>8} {:>8}\n", "PSNR", "SSIM", "SSIMULACRA2");
-    for view in &evaluated.views {
-        text += &line(&view.view, view.psnr, Some(view.ssim), view.perceptual);
-    }
     let record = &evaluated.record;
-    text += &line("mean", record.psnr, record.ssim, record.perceptual);
+    let line = |name: &str, [psnr, ssim, perceptual, lpips]: [Option<f64>; 4]| {
+        let figure = |value: Option<f64>, digits: usize| value.map_or("-".into(), |v| format!("{v:.digits$}"));
+        let lpips = record.lpips.map_or(String::new(), |_| format!(" {:>8}", figure(lpips, 4)));
+        format!("{:>8} {:>8} {:>11}{lpips}  {name}\n", figure(psnr, 2), figure(ssim, 4), figure(perceptual, 2))
+    };
+    let lpips = if record.lpips.is_some() { "    LPIPS" } else { "" };
+    let mut text = format!("{:>8} {:>8} {:>11}{lpips}\n", "PSNR", "SSIM", "SSIMULACRA2");
+    for view in &evaluated.views {
+        text += &line(&view.view, [view.psnr, Some(view.ssim), view.perceptual, view.lpips]);
+    }
+    text += &line("mean", [record.psnr, record.ssim, record.perceptual, record.lpips]);
     text + &evaluated.sheet.display().to_string()
 }
 
@@ -96,6 +102,7 @@ pub(crate) fn evaluate(
     capture: Capture,
     store: BlockingStore,
     test_every: u32,
+    lpips: Option<&Lpips>,
     out: &Path,
     output: &Output,
 ) -> Result<Evaluated, Failure> {
@@ -117,7 +124,7 @@ pub(crate) fn evaluate(
         let clock = Stopwatch::start();
         let frame = renderer.forward(&model.splats, None, &view.camera, &model.options());
         drawing.add(&clock);
-        let figures = measure(&view.name, &frame.colour, &photo);
+        let figures = measure(&view.name, &frame.colour, &photo, lpips)?;
         if i.is_multiple_of(shown_every) {
             rows.push(SheetRow {
                 label: view.name.clone(),
@@ -143,6 +150,7 @@ pub(crate) fn evaluate(
         psnr: mean(views.iter().map(|view| view.psnr)),
         ssim: mean(views.iter().map(|view| Some(view.ssim))),
         perceptual: mean(views.iter().map(|view| view.perceptual)),
+        lpips: mean(views.iter().map(|view| view.lpips)),
         splats: model.splats.len() as u64,
         fps: Some(views.len() as f64 / drawing.wall_seconds.max(1e-9)),
         peak_memory_bytes: clock::peak_memory_bytes(),
@@ -165,7 +173,7 @@ impl Drawing {
     }
 }
 
-fn measure(name: &str, colour: &[f32], photo: &Pixels) -> Figures {
+fn measure(name: &str, colour: &[f32], photo: &Pixels, lpips: Option<&Lpips>) -> Result<Figures, Failure> {
     let truth: Vec<f32> = photo.rgb.iter().map(|&value| f32::from(value) / 255.0).collect();
     let mut render: Vec<f32> = colour.iter().map(|value| value.clamp(0.0, 1.0)).collect();
     let psnr = metrics::psnr(&render, &truth, photo.mask.as_deref());
@@ -177,12 +185,13 @@ fn measure(name: &str, colour: &[f32], photo: &Pixels) -> Figures {
         }
     }
     let (width, height) = (photo.width as usize, photo.height as usize);
-    Figures {
+    Ok(Figures {
         view: name.to_owned(),
         psnr,
         ssim: metrics::ssim(&render, &truth, width, height),
         perceptual: metrics::ssimulacra2(&truth, &render, width, height),
-    }
+        lpips: lpips.map(|lpips| lpips.distance(&render, &truth, width, height)).transpose()?,
+    })
 }
 
 /// Mean of what there is.

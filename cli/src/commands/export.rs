@@ -23,6 +23,7 @@ pub(crate) fn run(args: &ExportArgs, output: &Output) -> Result<(), Failure> {
     let model = model::read(&args.model)?;
     let bytes = match args.to {
         Format::Ply => model.to_ply(),
+        Format::Spz => model.to_spz()?,
     };
     if let Some(folder) = args.out.parent().filter(|folder| !folder.as_os_str().is_empty()) {
         make_folder(folder)?;

@@ -12,11 +12,6 @@ use crate::failure::Failure;
 use crate::output::Output;
 use crate::{cameras, commands::train::check_plan};
 
-/// CPU seconds of one pixel in one training step, and of one splat in one step, as measured on the bench's captures on an
-/// AVX-512 core. An estimate for people: a plan does not depend on it.
-const CPU_SECONDS_PER_PIXEL: f64 = 0.2e-6;
-const CPU_SECONDS_PER_SPLAT: f64 = 0.35e-6;
-
 /// What a plan would take.
 #[derive(Debug, Clone, Copy, Serialize)]
 pub(crate) struct Estimate {
@@ -28,12 +23,8 @@ pub(crate) struct Estimate {
 
 impl Estimate {
     pub(crate) fn of(plan: &Plan) -> Self {
-        let seconds = plan.tasks.iter().map(|task| {
-            let pixels = task.window_pixels() as f64 / task.views.len().max(1) as f64;
-            f64::from(task.steps) * (CPU_SECONDS_PER_PIXEL * pixels + CPU_SECONDS_PER_SPLAT * f64::from(task.budget))
-        });
         let memory_bytes = plan.tasks.iter().map(|task| task.memory_bytes).max().unwrap_or(0);
-        Self { cpu_seconds: seconds.sum(), memory_bytes }
+        Self { cpu_seconds: plan.tasks.iter().map(worker::cap::estimated_cpu_seconds).sum(), memory_bytes }
     }
 }
 

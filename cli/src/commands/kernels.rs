@@ -2,37 +2,25 @@
 
 use ::render::cpu::Renderer;
 use ::render::{Options, Upstream};
+use bench::parts::Kernels;
+use bench::{PartLine, append_part};
 use glam::{DQuat, DVec3, Vec3};
 use scene::{Camera, Pinhole, Rigid, Splat, Splats};
-use serde::Serialize;
 use train::random;
 
 use crate::args::{KernelsArgs, Size};
 use crate::clock::Stopwatch;
+use crate::commands::bench::invoked;
+use crate::commands::train::make_folder;
 use crate::failure::Failure;
 use crate::output::Output;
+use crate::record::commit;
 use crate::{cameras, model};
 
 /// Passes before the clock counts: buffers grow, caches fill.
 const WARM_UP: usize = 2;
-
-#[derive(Serialize)]
-struct Timed {
-    command: &'static str,
-    machine: String,
-    backend: String,
-    threads: u32,
-    splats: usize,
-    width: u32,
-    height: u32,
-    /// Pairs of splat and tile.
-    pairs: usize,
-    /// Medians over the passes, milliseconds.
-    forward_cpu_millis: f64,
-    backward_cpu_millis: f64,
-    forward_wall_millis: f64,
-    backward_wall_millis: f64,
-}
+/// The file of these measurements.
+const LINES: &str = "kernels.jsonl";
 
 pub(crate) fn run(args: &KernelsArgs, output: &Output) -> Result<(), Failure> {
     let (splats, options, all) = match (&args.model, &args.cameras) {
@@ -60,10 +48,15 @@ pub(crate) fn run(args: &KernelsArgs, output: &Output) -> Result<(), Failure> {
         timed.forward_cpu_millis,
         timed.backward_cpu_millis,
     );
-    output.result(&timed, &text)
+    let line = PartLine::Kernels(timed);
+    if let Some(results) = &args.results {
+        make_folder(results)?;
+        append_part(&results.join(LINES), &line)?;
+    }
+    output.result(&line, &text)
 }
 
-fn time(args: &KernelsArgs, splats: &Splats, options: &Options, cameras: &[Camera]) -> Timed {
+fn time(args: &KernelsArgs, splats: &Splats, options: &Options, cameras: &[Camera]) -> Kernels {
     let mut renderer = Renderer::default();
     let upstream = Upstream {
         colour: vec![1e-3; 3 * args.size.width as usize * args.size.height as usize],
@@ -83,19 +76,20 @@ fn time(args: &KernelsArgs, splats: &Splats, options: &Options, cameras: &[Camer
         }
     }
     let [forward_cpu_millis, backward_cpu_millis, forward_wall_millis, backward_wall_millis] = millis.map(median);
-    Timed {
-        command: "bench kernels",
+    Kernels {
+        commit: commit().to_owned(),
         machine: bench::machine(),
         backend: renderer.name(),
         threads: args.threads,
-        splats: splats.len(),
+        splats: splats.len() as u64,
         width: args.size.width,
         height: args.size.height,
-        pairs: renderer.pairs(),
+        pairs: renderer.pairs() as u64,
         forward_cpu_millis,
         backward_cpu_millis,
         forward_wall_millis,
         backward_wall_millis,
+        command: invoked(),
     }
 }
 

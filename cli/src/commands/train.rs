@@ -14,7 +14,8 @@ use scene::{ArtefactId, BadInput, Capture};
 use serde::Serialize;
 use store::{BlockingStore, Store};
 use tokio_util::sync::CancellationToken;
-use worker::execute::{BlockTrainer, TrainerOptions};
+use worker::cap::Cap;
+use worker::execute::{BlockTrainer, Shared, TrainerOptions};
 
 use crate::args::{Backend, TrainArgs};
 use crate::clock::{self, Stopwatch};
@@ -33,7 +34,7 @@ pub(crate) struct Trained {
     pub(crate) capture: Capture,
     pub(crate) model: Model,
     pub(crate) report: Report,
-    /// Held-out PSNR on the way; only its end is known where the plan has several tasks.
+    /// Held-out PSNR of the merged model on the way.
     pub(crate) curve: Vec<CurvePoint>,
 }
 
@@ -48,6 +49,8 @@ pub(crate) struct Report {
     pub(crate) levels: u8,
     pub(crate) antialiased: bool,
     pub(crate) ingest_cpu_seconds: f64,
+    /// Whether `--minutes` left fewer steps than planned, so that another run may give other bytes.
+    pub(crate) capped: bool,
 }
 
 pub(crate) fn run(args: &TrainArgs, output: &Output) -> Result<(), Failure> {
@@ -92,10 +95,20 @@ pub(crate) fn train(args: &TrainArgs, output: &Output) -> Result<Trained, Failur
 
     let progress = output.progress("training", plan.tasks.iter().map(|task| u64::from(task.steps)).sum());
     let mut journal = Journal::create(&args.out.join("metrics.jsonl"), &plan, args.workers, clock.clone(), &progress)?;
-    let outcome = train_blocks(args, threads, &store, plan_id, &mut journal, output);
+    let cap = args.minutes.map(|minutes| cap_of(minutes, clock.clone(), &plan, args.workers));
+    let shared = Arc::new(Shared { cap, ..Shared::default() });
+    let metered = store.metered();
+    let options = TrainerOptions { threads: threads as usize, eval_every: args.eval_every, cache_bytes: CACHE_BYTES };
+    let trainers = (0..args.workers).map(|_| BlockTrainer::new(metered.blocking(), options, shared.clone()));
+    let trainers = trainers.map(|trainer| trainer.map(Arc::new)).collect::<Result<_, _>>().map_err(Failure::Work)?;
+    let outcome = train_blocks(trainers, &store, plan_id, &mut journal, output);
     let spent = journal.close()?;
     drop(progress);
     let results = outcome?;
+    let capped = shared.cap.as_ref().is_some_and(Cap::shortened);
+    if capped {
+        output.note("fewer steps than planned were taken to be done in time: another run may give other bytes");
+    }
 
     clock = Stopwatch::start();
     let model = model::write(&args.out, &plan, &results, &store.blocking(), capture.geo_origin, args.plan.downscale)?;
@@ -109,10 +122,12 @@ pub(crate) fn train(args: &TrainArgs, output: &Output) -> Result<Trained, Failur
         threads,
         wall_seconds: Some(spent.wall_seconds + clock.wall_seconds()),
         cpu_seconds: Some(spent.cpu_seconds + clock.cpu_seconds()),
-        psnr: if plan.tasks.len() == 1 { spent.last_psnr } else { None },
+        // Tasks that end side by side do not see each other's last splats.
+        psnr: spent.last_psnr.filter(|_| args.workers == 1 || plan.tasks.len() == 1),
         splats: model.splats.len() as u64,
         bytes,
         peak_memory_bytes: clock::peak_memory_bytes(),
+        bytes_moved: Some(metered.traffic().read + metered.traffic().written),
         seed: Some(args.plan.seed),
         ..Record::new("train")
     };
@@ -124,10 +139,19 @@ pub(crate) fn train(args: &TrainArgs, output: &Output) -> Result<Trained, Failur
         levels: plan.levels,
         antialiased: model.antialiased,
         ingest_cpu_seconds,
+        capped,
     };
     save_json(&args.out.join("report.json"), &report)?;
-    let curve = if plan.tasks.len() == 1 { spent.curve } else { Vec::new() };
-    Ok(Trained { capture, model, report, curve })
+    Ok(Trained { capture, model, report, curve: spent.curve })
+}
+
+/// What lets the whole job end when its clock shows so many minutes: training has to end before.
+fn cap_of(minutes: f64, clock: Stopwatch, plan: &Plan, workers: u32) -> Cap {
+    /// Wall seconds of sewing and writing a splat.
+    const SECONDS_PER_SPLAT: f64 = 2e-6;
+    let seconds = 60.0 * minutes;
+    let writing = SECONDS_PER_SPLAT * f64::from(plan.settings.budget);
+    Cap::new(clock, seconds - writing.min(0.1 * seconds), workers)
 }
 
 fn check_backend(backend: Backend) -> Result<(), BadInput> {
@@ -171,18 +195,12 @@ pub(crate) fn check_plan(plan: &Plan, capture: &Capture, output: &Output) -> Res
 
 /// Runs the plan on workers in this process; Ctrl-C cancels the job.
 fn train_blocks(
-    args: &TrainArgs,
-    threads: u32,
+    trainers: Vec<Arc<BlockTrainer>>,
     store: &Store,
     plan: ArtefactId,
     journal: &mut Journal,
     output: &Output,
 ) -> Result<Vec<ArtefactId>, Failure> {
-    let options = TrainerOptions { threads: threads as usize, eval_every: args.eval_every, cache_bytes: CACHE_BYTES };
-    let trainers = (0..args.workers)
-        .map(|_| BlockTrainer::new(store.blocking(), options).map(Arc::new))
-        .collect::<Result<Vec<_>, _>>()
-        .map_err(Failure::Work)?;
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build();
     let runtime = runtime.map_err(|error| Failure::Work(format!("cannot start threads: {error}")))?;
     let start_worker = |coordinator_url, number: usize, shutdown| {

@@ -7,7 +7,7 @@ use scene::transforms::Intrinsics;
 use scene::{BadInput, CodecError, SparsePoints};
 
 use super::files::{self, Root};
-use super::{OpenOptions, Points, Posed};
+use super::{Contents, OpenOptions, Points, Posed};
 
 /// The first of these folders that has a model.
 pub(super) fn find(root: &Root, folders: &[&str]) -> Option<String> {
@@ -18,11 +18,7 @@ pub(super) fn find(root: &Root, folders: &[&str]) -> Option<String> {
 }
 
 /// Reads the model of a folder that [`find`] found.
-pub(super) fn read(
-    root: &Root,
-    folder: &str,
-    options: &OpenOptions,
-) -> Result<(&'static str, Vec<Posed>, Points), BadInput> {
+pub(super) fn read(root: &Root, folder: &str, options: &OpenOptions) -> Result<Contents, BadInput> {
     let has_bin = ["cameras", "images"].iter().all(|name| root.file(&format!("{folder}/{name}.bin")).is_some());
     let cameras = load(root, folder, "cameras", has_bin, colmap::read_cameras_bin, colmap::read_cameras_txt)?;
     let images = load(root, folder, "images", has_bin, colmap::read_images_bin, colmap::read_images_txt)?;
@@ -57,7 +53,8 @@ pub(super) fn read(
         return Err(BadInput::new(format!("{root}: {folder}"), "has no images", "give a model with registered images"));
     }
     let ColmapPoints { positions, colours, track_start, track_images, .. } = points;
-    Ok(("colmap", posed, Points(SparsePoints { positions, colours, track_start, seen_by: track_images })))
+    let points = Points(SparsePoints { positions, colours, track_start, seen_by: track_images });
+    Ok(Contents { format: "colmap", posed, points, origin: None, left_out: Vec::new() })
 }
 
 type Codec<T> = fn(&[u8]) -> Result<T, CodecError>;

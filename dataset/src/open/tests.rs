@@ -4,6 +4,10 @@ use glam::DVec3;
 use image::{GrayImage, RgbImage};
 
 use super::*;
+
+mod formats;
+mod reprojection;
+
 use crate::synth::{CitySettings, write_city};
 
 const CITY: CitySettings = CitySettings { seed: 3, extent_metres: 90.0, views: 24, width: 48, height: 32 };
@@ -139,7 +143,7 @@ fn transforms_are_opened_by_folder_or_file() {
     let (pixel, depth) = source.capture.views[0].camera.project(DVec3::new(0.0, 0.0, -3.0));
     assert!(pixel == glam::DVec2::new(24.0, 16.0) && depth == 3.0);
     std::fs::remove_file(folder.path().join("sparse_pc.ply")).unwrap();
-    refused(folder.path(), &["no sparse points"]);
+    refused(folder.path(), &["no sparse points", "do not overlap"]);
 }
 
 #[test]

@@ -1,39 +1,57 @@
-//! A `transforms.json` of nerfstudio or instant-ngp.
+//! A `transforms.json` of nerfstudio or instant-ngp, or the `transforms_train.json` of captures that come in splits.
 
-use std::path::Path;
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::PathBuf;
 
 use scene::{BadInput, SparsePoints, ply, transforms};
 
 use super::colmap;
 use super::files::{self, Found, Root};
-use super::{OpenOptions, Points, Posed};
+use super::{Contents, OpenOptions, Points, Posed};
 
 /// Point clouds that tools leave beside the file.
 const CLOUDS: [&str; 2] = ["sparse_pc.ply", "points3D.ply"];
 
-/// Reads the file and the points that belong to it.
-pub(super) fn read(root: &Root, path: &Path) -> Result<(&'static str, Vec<Posed>, Points), BadInput> {
+/// The splits of a capture, whose views plat holds out by its own rule.
+const SPLITS: [&str; 3] = ["transforms_train.json", "transforms_val.json", "transforms_test.json"];
+
+/// The files of a capture: `transforms.json`, or its splits where there is one for training; none if it is no such
+/// capture.
+pub(super) fn find(root: &Root) -> Vec<PathBuf> {
+    match root.file("transforms.json") {
+        Some(path) => vec![path],
+        None if root.file(SPLITS[0]).is_some() => SPLITS.iter().filter_map(|name| root.file(name)).collect(),
+        None => Vec::new(),
+    }
+}
+
+/// Reads the files and the points that belong to them. A frame that several have is that of the first.
+pub(super) fn read(root: &Root, paths: &[PathBuf]) -> Result<Contents, BadInput> {
     let advice = "correct the file or export it again";
-    let file =
-        transforms::read(&files::read(path)?).map_err(|e| BadInput::new(files::show(path), e.to_string(), advice))?;
-    let posed: Vec<Posed> = file
-        .frames
-        .into_iter()
-        .zip(0..)
-        .map(|(frame, id)| {
+    let (mut posed, mut names, mut cloud) = (Vec::new(), BTreeSet::new(), None);
+    for path in paths {
+        let file = transforms::read(&files::read(path)?)
+            .map_err(|e| BadInput::new(files::show(path), e.to_string(), advice))?;
+        cloud = cloud.or(file.ply_file_path.map(|name| (path, name)));
+        let earlier = names.clone();
+        for frame in file.frames {
             let name = frame.file_path.trim_start_matches("./").to_string();
-            Posed {
-                id,
+            if earlier.contains(&name) {
+                continue;
+            }
+            names.insert(name.clone());
+            posed.push(Posed {
+                id: posed.len() as u32,
                 file: name.clone(),
                 name,
                 mask: frame.mask_path,
                 intrinsics: frame.intrinsics,
                 camera_from_world: frame.camera_from_world,
-            }
-        })
-        .collect();
-    let cloud = match &file.ply_file_path {
-        Some(name) => match root.image(name)? {
+            });
+        }
+    }
+    let cloud = match cloud {
+        Some((path, name)) => match root.image(&name)? {
             Found::File(path) => Some(path),
             Found::Missing => {
                 let problem = format!("names the points {name}, which are not there");
@@ -50,16 +68,16 @@ pub(super) fn read(root: &Root, path: &Path) -> Result<(&'static str, Vec<Posed>
         }
         None => beside(root, &posed)?,
     };
-    Ok(("transforms", posed, points))
+    Ok(Contents { format: "transforms", posed, points, origin: None, left_out: Vec::new() })
 }
 
 /// The points of a COLMAP model beside the file, if its images lie where the frames do: many exporters move the world.
 fn beside(root: &Root, posed: &[Posed]) -> Result<Points, BadInput> {
     let Some(folder) = colmap::find(root, &["sparse/0"]) else { return Ok(Points::default()) };
-    let (_, images, mut points) = colmap::read(root, &folder, &OpenOptions::default())?;
-    let by_name: std::collections::BTreeMap<&str, &Posed> =
+    let Contents { posed: images, mut points, .. } = colmap::read(root, &folder, &OpenOptions::default())?;
+    let by_name: BTreeMap<&str, &Posed> =
         posed.iter().map(|frame| (frame.name.strip_prefix("images/").unwrap_or(&frame.name), frame)).collect();
-    let mut ids = std::collections::BTreeMap::new();
+    let mut ids = BTreeMap::new();
     for image in &images {
         let Some(frame) = by_name.get(image.name.as_str()) else { continue };
         let (a, b) = (image.camera_from_world, frame.camera_from_world);

@@ -31,6 +31,30 @@ pub fn read_cameras_bin(bytes: &[u8]) -> Result<BTreeMap<u32, ColmapCamera>, Cod
 /// # Errors
 /// Cut short or padded, or an image without a name or a finite pose.
 pub fn read_images_bin(bytes: &[u8]) -> Result<Vec<ColmapImage>, CodecError> {
+    images(bytes, |_, _| ())
+}
+
+/// Reads where `images.bin` says that points were seen: by image id, pixels of the distorted image and ids of points.
+///
+/// # Errors
+/// As [`read_images_bin`].
+pub fn read_keypoints_bin(bytes: &[u8]) -> Result<BTreeMap<u32, Vec<(DVec2, u64)>>, CodecError> {
+    let mut keypoints = BTreeMap::new();
+    images(bytes, |image, observations| {
+        let (observations, _) = observations.as_chunks::<24>();
+        let keypoint = |bytes: &[u8; 24]| {
+            let [x, y, point] = [0, 8, 16].map(|at| bytes[at..at + 8].try_into().expect("eight bytes"));
+            (DVec2::new(f64::from_le_bytes(x), f64::from_le_bytes(y)), u64::from_le_bytes(point))
+        };
+        // A feature that belongs to no point has the highest id.
+        let seen = observations.iter().map(keypoint).filter(|&(_, point)| point != u64::MAX).collect();
+        keypoints.insert(image, seen);
+    })?;
+    Ok(keypoints)
+}
+
+/// Reads images; `observed` gets the id and the observations, of 24 bytes each, of every one.
+fn images<'a>(bytes: &'a [u8], mut observed: impl FnMut(u32, &'a [u8])) -> Result<Vec<ColmapImage>, CodecError> {
     let mut from = Reader(bytes);
     let mut images = Vec::new();
     for _ in 0..from.count(73)? {
@@ -43,7 +67,7 @@ pub fn read_images_bin(bytes: &[u8]) -> Result<Vec<ColmapImage>, CodecError> {
         let name = from.text()?;
         images.push(super::image(id, pose, camera_id, name)?);
         let observations = from.count(24)?;
-        from.take(24 * observations)?;
+        observed(id, from.take(24 * observations)?);
     }
     super::each_once(from.end(images)?)
 }
@@ -77,6 +101,7 @@ pub fn write_cameras_bin(model: &Reconstruction) -> Vec<u8> {
             CameraModel::SimpleRadial(p) => (2, p),
             CameraModel::Radial(p) => (3, p),
             CameraModel::OpenCv(p) => (4, p),
+            CameraModel::OpenCvFisheye(p) => (5, p),
             CameraModel::FullOpenCv(p) => (6, p),
         };
         to.u32(id).u32(lens).u64(u64::from(camera.width)).u64(u64::from(camera.height)).f64s(parameters);

@@ -63,9 +63,36 @@ fn text_says_what_binary_says() {
     assert_eq!(read_cameras_txt(cameras.as_bytes()), Ok(model.cameras.clone()));
     assert!(near(&read_images_txt(images.as_bytes()).unwrap(), &model.images));
     assert_eq!(read_points_txt(points.as_bytes()), Ok(model.points.clone()));
-    // An image that observes nothing is followed by an empty line, the last one by none at all.
+    // An image that observes nothing is followed by an empty line, the last one too.
     let bare = images.replace("1.5 2.5 10 3 4 -1\n", "\n");
-    assert!(near(&read_images_txt(bare.trim_end().as_bytes()).unwrap(), &model.images));
+    assert!(near(&read_images_txt(bare.as_bytes()).unwrap(), &model.images));
+    assert!(read_images_txt(bare.trim_end().as_bytes()).unwrap_err().to_string().contains("cut short"));
+}
+
+#[test]
+fn text_that_was_cut_is_noticed() {
+    let [cameras, images, points] = texts(&example());
+    let said = |what: &str, count: usize| format!("# List\n# Number of {what}: {count}, mean of something: 2.5\n");
+    let (cameras, images, points) =
+        (said("cameras", 1) + &cameras, said("images", 3) + &images, said("points", 3) + &points);
+    let check = |text: &str, is_err: &dyn Fn(&[u8]) -> bool| {
+        assert!(!is_err(text.as_bytes()));
+        let header = text.find("# Number").unwrap() + 40;
+        assert!((header..text.len()).all(|end| is_err(&text.as_bytes()[..end])));
+    };
+    check(&cameras, &|bytes| read_cameras_txt(bytes).is_err());
+    check(&images, &|bytes| read_images_txt(bytes).is_err());
+    check(&points, &|bytes| read_points_txt(bytes).is_err());
+    let error = read_images_txt(images.replace("images: 3", "images: 4").as_bytes()).unwrap_err().to_string();
+    assert!(error.contains('4') && error.contains('3') && !error.contains('\n'), "{error}");
+}
+
+#[test]
+fn keypoints_are_those_of_the_tracks() {
+    let model = example();
+    let keypoints = read_keypoints_bin(&write_images_bin(&model)).unwrap();
+    assert_eq!(keypoints.values().map(Vec::len).collect::<Vec<_>>(), [2, 1, 2]);
+    assert_eq!(keypoints[&8][0].1, 12);
 }
 
 #[test]
@@ -99,16 +126,24 @@ fn what_is_cut_or_padded_is_refused() {
 }
 
 #[test]
+fn fisheyes_of_fewer_parameters_are_opencv_s() {
+    let lens = |line: &str| read_cameras_txt(line.as_bytes()).unwrap()[&1].model;
+    let bent = |k1, k2| CameraModel::OpenCvFisheye([9.0, 9.0, 5.0, 4.0, k1, k2, 0.0, 0.0]);
+    assert_eq!(lens("1 SIMPLE_RADIAL_FISHEYE 10 8 9 5 4 0.1"), bent(0.1, 0.0));
+    assert_eq!(lens("1 RADIAL_FISHEYE 10 8 9 5 4 0.1 0.2"), bent(0.1, 0.2));
+}
+
+#[test]
 fn what_is_wrong_is_named() {
     let images = |line: &str| read_images_txt(line.as_bytes()).unwrap_err().to_string();
     assert!(images("3 0 0 0 0 1 2 3 1 a.jpg\n\n").contains("a.jpg"));
     assert!(images("3 1 0 0 0 1 NaN 3 1 b c.jpg\n\n").contains("b c.jpg"));
     assert!(images("3 1 0 0 0 1 2 3 1\n\n").contains("image 3 has no name"));
-    assert!(images("3 1 0 0 0 1 2 3 1 a\n\n3 1 0 0 0 1 2 3 1 b\n").contains("twice"));
+    assert!(images("3 1 0 0 0 1 2 3 1 a\n\n3 1 0 0 0 1 2 3 1 b\n\n").contains("twice"));
     assert!(images("3 1 0 0 0 1 2 3 1 a\n1 2\n").contains("line 2"));
     let cameras = |line: &str| read_cameras_txt(line.as_bytes()).unwrap_err().to_string();
-    let fisheye = cameras("1 OPENCV_FISHEYE 10 10 1 2 3 4 5 6 7 8");
-    assert!(fisheye.contains("OPENCV_FISHEYE") && fisheye.contains("colmap image_undistorter"), "{fisheye}");
+    let fisheye = cameras("1 THIN_PRISM_FISHEYE 10 10 1 2 3 4 5 6 7 8 9 10 11 12");
+    assert!(fisheye.contains("THIN_PRISM_FISHEYE") && fisheye.contains("colmap image_undistorter"), "{fisheye}");
     for bad in
         ["1 PINHOLE 10 10 1 2 3", "1 PINHOLE 0 10 1 1 1 1", "1 PINHOLE 10 10 -1 1 1 1", "1 PINHOLE 10 10 inf 1 1 1"]
     {
@@ -118,7 +153,9 @@ fn what_is_wrong_is_named() {
     assert!(read_points_txt(b"1 0 0 0 1 2 256 0").is_err() && read_points_txt(b"1 0 0 0 1 2 3 0 4").is_err());
     let mut bytes = write_cameras_bin(&example());
     bytes[12] = 5;
-    assert!(read_cameras_bin(&bytes).unwrap_err().to_string().contains("OPENCV_FISHEYE"));
+    assert!(matches!(read_cameras_bin(&bytes).unwrap()[&5].model, CameraModel::OpenCvFisheye(_)));
+    bytes[12] = 7;
+    assert!(read_cameras_bin(&bytes).unwrap_err().to_string().contains("FOV"));
     bytes[12] = 99;
     assert!(read_cameras_bin(&bytes).unwrap_err().to_string().contains("number 99"));
 }
@@ -126,7 +163,7 @@ fn what_is_wrong_is_named() {
 proptest! {
     #[test]
     fn round_trips(
-        kind in 0usize..6,
+        kind in 0usize..7,
         lens in prop::array::uniform12(0.01f64..2e3),
         turn in prop::array::uniform4(-1.0f64..1.0),
         at in prop::array::uniform3(-1e4f64..1e4),
@@ -140,6 +177,7 @@ proptest! {
             2 => CameraModel::SimpleRadial([a, b, c, d]),
             3 => CameraModel::Radial([a, b, c, d, e]),
             4 => CameraModel::OpenCv([a, b, c, d, e, f, g, h]),
+            5 => CameraModel::OpenCvFisheye([a, b, c, d, e, f, g, h]),
             _ => CameraModel::FullOpenCv(lens),
         };
         let model = model(lens, turn, at, &tracks);

@@ -1,4 +1,5 @@
-//! The text files: a line for each thing, two for an image; `#` starts a comment.
+//! The text files: a line for each thing, two for an image; `#` starts a comment. Where COLMAP's comment says how many
+//! things there are, as many have to be there, and the last line has to end: a file that was cut short is noticed.
 
 use std::collections::BTreeMap;
 use std::str::FromStr;
@@ -21,6 +22,7 @@ pub fn read_cameras_txt(bytes: &[u8]) -> Result<BTreeMap<u32, ColmapCamera>, Cod
         let parameters = words.rest()?;
         super::insert(&mut cameras, id, super::camera(id, model, width, height, &parameters)?)?;
     }
+    check_count(bytes, "cameras", cameras.len())?;
     Ok(cameras)
 }
 
@@ -48,13 +50,17 @@ pub fn read_images_txt(bytes: &[u8]) -> Result<Vec<ColmapImage>, CodecError> {
             name = name.trim_start_matches(|c: char| !c.is_ascii_whitespace()).trim_start();
         }
         images.push(super::image(id, pose, camera_id, name.trim_end())?);
-        // Then x, y and point of each observation, often none.
-        if let Some((number, line)) = lines.next()
-            && !line.split_ascii_whitespace().count().is_multiple_of(3)
-        {
+        // Then x, y and point of each observation, often none: the line is there all the same.
+        let Some((number, line)) = lines.next() else {
+            let problem =
+                format!("is cut short: line {number} is the last, but an image has two (the second may be empty)");
+            return Err(CodecError::new(problem));
+        };
+        if !line.split_ascii_whitespace().count().is_multiple_of(3) {
             return Err(CodecError::new(format!("line {number} is no list of x, y and point id of observations")));
         }
     }
+    check_count(bytes, "images", images.len())?;
     super::each_once(images)
 }
 
@@ -77,6 +83,7 @@ pub fn read_points_txt(bytes: &[u8]) -> Result<ColmapPoints, CodecError> {
         }
         points.push(id, position, colour, pairs.iter().map(|pair| pair[0]))?;
     }
+    check_count(bytes, "points", points.len())?;
     Ok(points)
 }
 
@@ -84,6 +91,22 @@ pub fn read_points_txt(bytes: &[u8]) -> Result<ColmapPoints, CodecError> {
 fn lines(bytes: &[u8]) -> Result<impl Iterator<Item = (usize, &str)>, CodecError> {
     let text = std::str::from_utf8(bytes).map_err(|_| CodecError::new("is not UTF-8 text"))?;
     Ok(text.lines().enumerate().map(|(i, line)| (i + 1, line)))
+}
+
+/// Compares with `# Number of images: 50, mean observations per image: 9.5`, if a comment at the start says so.
+fn check_count(bytes: &[u8], what: &str, count: usize) -> Result<(), CodecError> {
+    let comments = lines(bytes)?.take_while(|(_, line)| !is_content(line));
+    let said = comments.filter_map(|(_, line)| {
+        let rest = line.trim_start_matches(['#', ' ']).strip_prefix("Number of ")?.strip_prefix(what)?;
+        rest.strip_prefix(':')?.split(',').next()?.trim().parse::<usize>().ok()
+    });
+    match said.last() {
+        Some(said) if said != count => Err(CodecError::new(format!(
+            "is cut short or was changed: its comment says {said} {what}, {count} are there"
+        ))),
+        Some(_) if !bytes.ends_with(b"\n") => Err(CodecError::new("is cut short: its last line does not end")),
+        _ => Ok(()),
+    }
 }
 
 fn is_content(line: &str) -> bool {

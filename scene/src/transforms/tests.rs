@@ -76,11 +76,20 @@ fn scaled_rotations_lose_their_scale_and_others_are_refused() {
 }
 
 #[test]
+fn fisheyes_are_known_by_either_name() {
+    let expected = CameraModel::OpenCvFisheye([9.0, 9.0, 10.0, 5.0, 0.1, 0.2, 0.3, 0.4]);
+    let bend = r#""fl_x": 9, "k1": 0.1, "k2": 0.2, "k3": 0.3, "k4": 0.4,"#;
+    for name in [r#""camera_model": "OPENCV_FISHEYE","#, r#""is_fisheye": true,"#] {
+        assert_eq!(frame(&format!("{bend} {name}"), "").unwrap().intrinsics.model(20, 10), expected);
+    }
+    let transforms = read(&file(bend, r#""is_fisheye": true,"#, IDENTITY)).unwrap();
+    assert_eq!(read(&write(&transforms)).unwrap().frames[0].intrinsics.model(20, 10), expected);
+}
+
+#[test]
 fn lenses_that_plat_does_not_know_are_refused() {
     for bad in [
-        r#""fl_x": 9, "camera_model": "OPENCV_FISHEYE","#,
         r#""fl_x": 9, "camera_model": "EQUIRECTANGULAR","#,
-        r#""fl_x": 9, "is_fisheye": true,"#,
         r#""fl_x": 9, "k4": 0.1,"#,
         r#""fl_x": 0,"#,
         r#""fl_x": -9,"#,
@@ -128,6 +137,7 @@ proptest! {
             focal: [Some(Focal::Pixels(fx)), Some(fy)],
             centre: [Some(cx), Some(cy)],
             distortion,
+            fisheye: false,
         };
         let frame =
             Frame { file_path: "images/\"ä\".png".into(), mask_path: None, intrinsics, camera_from_world };
@@ -157,6 +167,7 @@ proptest! {
             CameraModel::FullOpenCv(values),
             CameraModel::OpenCv(*values.first_chunk().unwrap()),
             CameraModel::Pinhole(*values.first_chunk().unwrap()),
+            CameraModel::OpenCvFisheye(*values.first_chunk().unwrap()),
         ] {
             prop_assert_eq!(Intrinsics::from_model(&model, None).model(1, 1), model);
         }

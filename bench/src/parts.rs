@@ -1,0 +1,98 @@
+//! What was measured of one part of plat: lines beside those of the runs, told from them by their `kind`, that chart
+//! and table leave out.
+
+use std::path::Path;
+
+use scene::BadInput;
+use serde::{Deserialize, Serialize};
+
+/// A measurement of a part, as one line of JSON.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "kind", rename_all = "lowercase")]
+pub enum PartLine {
+    /// The renderer's passes.
+    Kernels(Kernels),
+    /// Photos to artefacts.
+    Ingest(Ingest),
+}
+
+/// How long the renderer's passes take: medians.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Kernels {
+    /// The program's git commit.
+    pub commit: String,
+    /// See [`crate::machine`].
+    pub machine: String,
+    /// Backend and its instruction set or adapter.
+    pub backend: String,
+    /// Threads.
+    pub threads: u32,
+    /// Splats drawn.
+    pub splats: u64,
+    /// Pixels.
+    pub width: u32,
+    /// Pixels.
+    pub height: u32,
+    /// Pairs of splat and tile.
+    pub pairs: u64,
+    /// CPU time, milliseconds.
+    pub forward_cpu_millis: f64,
+    /// CPU time, milliseconds.
+    pub backward_cpu_millis: f64,
+    /// Wall time, milliseconds.
+    pub forward_wall_millis: f64,
+    /// Wall time, milliseconds.
+    pub backward_wall_millis: f64,
+    /// The command that made the line.
+    pub command: String,
+}
+
+/// What an ingest into an empty store took.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Ingest {
+    /// The program's git commit.
+    pub commit: String,
+    /// See [`crate::machine`].
+    pub machine: String,
+    /// The capture's name.
+    pub scene: String,
+    /// Photos were used at one over this of their size.
+    pub downscale: u32,
+    /// Threads.
+    pub threads: u32,
+    /// Photos.
+    pub photos: u64,
+    /// Their pixels at full size.
+    pub pixels: u64,
+    /// Seconds, the capture's cameras and points included.
+    pub wall_seconds: f64,
+    /// User and system time of all threads, likewise.
+    pub cpu_seconds: f64,
+    /// Largest resident memory of the process, bytes.
+    pub peak_memory_bytes: Option<u64>,
+    /// Bytes written to the store.
+    pub bytes_written: u64,
+    /// The command that made the line.
+    pub command: String,
+}
+
+impl PartLine {
+    fn is_finite(&self) -> bool {
+        match self {
+            Self::Kernels(line) => {
+                [line.forward_cpu_millis, line.backward_cpu_millis, line.forward_wall_millis, line.backward_wall_millis]
+                    .iter()
+                    .all(|millis| millis.is_finite())
+            }
+            Self::Ingest(line) => line.wall_seconds.is_finite() && line.cpu_seconds.is_finite(),
+        }
+    }
+}
+
+/// Appends a measurement to a results file, which it makes if need be.
+///
+/// # Errors
+/// As [`crate::append`].
+pub fn append_part(path: &Path, line: &PartLine) -> Result<(), BadInput> {
+    crate::append_line(path, line, line.is_finite())
+}

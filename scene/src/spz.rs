@@ -1,0 +1,308 @@
+//! SPZ, Niantic's compressed splats: versions 2 to 4 are read, 2 and 3 written.
+//!
+//! Versions 2 and 3 are one gzip stream: a header of 16 bytes, then by attribute positions (24 bits of fixed point),
+//! opacities, colours, log scales, rotations (version 2: x, y, z of 8 bits; version 3: the three smaller components of
+//! 10 bits) and spherical harmonics. Version 4 has a plain header and one zstd stream for each attribute.
+//!
+//! SPZ's axes are right, up and back, those of an INRIA PLY right, down and forward: y and z change sign on the way, as
+//! in Niantic's own converter, so that a model shows the same way up in a viewer whichever of the two it is given.
+//!
+//! Source: `load-spz.cc` and `splat-types.h` of the SPZ library.
+
+mod quantise;
+
+use std::io::{self, Read, Write};
+
+use flate2::{Compression, bufread::GzDecoder, write::GzEncoder};
+
+use self::quantise::{Rotation, flipped_sh};
+use crate::error::CodecError;
+use crate::splats::{Splats, column, sh_coefficients};
+
+const MAGIC: u32 = 0x5053_474e;
+const GZIP: [u8; 2] = [0x1f, 0x8b];
+const ANTIALIASED: u8 = 1;
+const EXTENSIONS: u8 = 2;
+/// Fractional bits of positions that are written where their range allows it: a quarter of a millimetre.
+const FRACTIONAL_BITS: u8 = 12;
+/// Splats may take this many bytes in memory, and this many times those of the file: trained ones take 12 times as many
+/// or fewer. More is a decompression bomb.
+const MEMORY_BYTES: u64 = 32 << 20;
+const MEMORY_FACTOR: u64 = 20;
+/// The largest SH degree of the format; bands above the third are left out.
+const HIGHEST_DEGREE: u8 = 4;
+
+/// A version that can be written.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Version {
+    /// Rotations of 24 bits; for old readers.
+    V2,
+    /// Rotations of 32 bits; what all readers of today accept.
+    V3,
+}
+
+struct Header {
+    version: u32,
+    count: usize,
+    sh_degree: u8,
+    fractional_bits: u8,
+    antialiased: bool,
+}
+
+impl Header {
+    fn parse(bytes: [u8; 16]) -> Result<Self, CodecError> {
+        let word = |at: usize| u32::from_le_bytes(bytes[at..at + 4].try_into().expect("four bytes"));
+        let [sh_degree, fractional_bits, flags] = [bytes[12], bytes[13], bytes[14]];
+        let version = word(4);
+        if word(0) != MAGIC {
+            return Err(CodecError::new("not an SPZ file"));
+        }
+        if !(2..=4).contains(&version) {
+            return Err(CodecError::new(format!("SPZ of version {version}; versions 2 to 4 can be read")));
+        }
+        if sh_degree > HIGHEST_DEGREE || fractional_bits > 24 {
+            let problem = format!("SPZ header with SH degree {sh_degree} and {fractional_bits} fractional bits");
+            return Err(CodecError::new(problem));
+        }
+        if version < 4 && flags & EXTENSIONS != 0 {
+            return Err(CodecError::new("SPZ with extensions before version 4, which cannot be read"));
+        }
+        let antialiased = flags & ANTIALIASED != 0;
+        Ok(Self { version, count: word(8) as usize, sh_degree, fractional_bits, antialiased })
+    }
+
+    /// Refuses more splats than a file of this length can have: nothing is allocated for a count that lies.
+    fn check_memory(&self, file_bytes: usize) -> Result<(), CodecError> {
+        let columns = column::SH + 3 * sh_coefficients(self.sh_degree.min(3));
+        if 4 * columns as u64 * self.count as u64 > MEMORY_BYTES + MEMORY_FACTOR * file_bytes as u64 {
+            let count = self.count;
+            return Err(CodecError::new(format!(
+                "{file_bytes} bytes do not hold the {count} splats that they announce"
+            )));
+        }
+        Ok(())
+    }
+
+    fn rotation(&self) -> Rotation {
+        if self.version == 2 { Rotation::FirstThree } else { Rotation::SmallestThree }
+    }
+
+    /// Bytes of a splat in each plane.
+    fn planes(&self) -> [usize; 6] {
+        [9, 1, 3, 3, self.rotation().bytes(), 3 * (sh_coefficients_of(self.sh_degree) - 1)]
+    }
+}
+
+/// As [`sh_coefficients`], for the format's degree 4 too.
+fn sh_coefficients_of(degree: u8) -> usize {
+    (usize::from(degree) + 1).pow(2)
+}
+
+/// Splats, and whether they are to be drawn anti-aliased.
+///
+/// # Errors
+/// Not SPZ, of another version, cut short, damaged, or with more splats than the file can hold.
+pub fn read(bytes: &[u8]) -> Result<(Splats, bool), CodecError> {
+    let short = || CodecError::new("SPZ file is cut short");
+    if bytes.starts_with(&GZIP) {
+        let mut stream = GzDecoder::new(bytes);
+        let mut header = [0; 16];
+        stream.read_exact(&mut header).map_err(|e| damaged(&e))?;
+        let header = Header::parse(header)?;
+        if header.version > 3 {
+            return Err(CodecError::new("SPZ of version 4 inside gzip"));
+        }
+        header.check_memory(bytes.len())?;
+        let splats = decode(&header, &mut stream)?;
+        return match stream.read(&mut [0]) {
+            Ok(0) => Ok((splats, header.antialiased)),
+            Ok(_) => Err(CodecError::new("SPZ file has bytes too many at its end")),
+            Err(error) => Err(damaged(&error)),
+        };
+    }
+    let header = Header::parse(*bytes.first_chunk().ok_or_else(short)?)?;
+    if header.version < 4 {
+        return Err(CodecError::new("SPZ of a version below 4 that is not gzip"));
+    }
+    header.check_memory(bytes.len())?;
+    let mut streams = Streams::new(bytes, &header)?;
+    let splats = decode(&header, &mut streams)?;
+    Ok((splats, header.antialiased))
+}
+
+/// Splats as SPZ.
+///
+/// # Errors
+/// A splat that is not finite or lies further than 8,388 km from the origin, or four billion splats.
+pub fn write(splats: &Splats, antialiased: bool, version: Version) -> Result<Vec<u8>, CodecError> {
+    if let Some(row) = (0..splats.len()).find(|&i| !splats.is_finite(i)) {
+        return Err(CodecError::new(format!("splat {row} is not finite")));
+    }
+    let count = u32::try_from(splats.len()).map_err(|_| CodecError::new("more splats than SPZ can count"))?;
+    let farthest = splats.columns()[..3].iter().flatten().fold(0.0f64, |far, &v| far.max(f64::from(v).abs()));
+    let fits = |bits: &u8| (farthest * f64::from(1u32 << bits)).round() < f64::from(1 << 23);
+    let fractional_bits = (0..=FRACTIONAL_BITS).rev().find(fits);
+    let fractional_bits =
+        fractional_bits.ok_or_else(|| CodecError::new(format!("a splat {farthest} m out, too far for SPZ")))?;
+
+    let mut header = Vec::with_capacity(16);
+    header.extend(MAGIC.to_le_bytes());
+    header.extend(if version == Version::V2 { 2u32 } else { 3 }.to_le_bytes());
+    header.extend(count.to_le_bytes());
+    header.extend([splats.sh_degree(), fractional_bits, if antialiased { ANTIALIASED } else { 0 }, 0]);
+    let rotation = if version == Version::V2 { Rotation::FirstThree } else { Rotation::SmallestThree };
+    encode(splats, &header, fractional_bits, rotation).map_err(|e| CodecError::new(format!("gzip: {e}")))
+}
+
+fn encode(splats: &Splats, header: &[u8], fractional_bits: u8, rotation: Rotation) -> io::Result<Vec<u8>> {
+    let mut to = io::BufWriter::with_capacity(1 << 16, GzEncoder::new(Vec::new(), Compression::default()));
+    to.write_all(header)?;
+    let rows = 0..splats.len();
+    let col = |k: usize| splats.col(k);
+    for i in rows.clone() {
+        for (axis, sign) in quantise::FLIP.into_iter().enumerate() {
+            to.write_all(&quantise::position(sign * col(axis)[i], fractional_bits))?;
+        }
+    }
+    for i in rows.clone() {
+        to.write_all(&[quantise::opacity(col(column::OPACITY)[i])])?;
+    }
+    for i in rows.clone() {
+        to.write_all(&[0, 1, 2].map(|c| quantise::colour(col(column::SH + c)[i])))?;
+    }
+    for i in rows.clone() {
+        to.write_all(&[0, 1, 2].map(|k| quantise::log_scale(col(column::LOG_SCALE + k)[i])))?;
+    }
+    for i in rows.clone() {
+        let word = rotation.pack([0, 1, 2, 3].map(|k| col(column::QUAT + k)[i]));
+        to.write_all(&word.to_le_bytes()[..rotation.bytes()])?;
+    }
+    for i in rows {
+        for k in 1..sh_coefficients(splats.sh_degree()) {
+            to.write_all(&[0, 1, 2].map(|c| quantise::sh(flipped_sh(k) * col(column::SH + 3 * k + c)[i], k)))?;
+        }
+    }
+    to.into_inner().map_err(io::IntoInnerError::into_error)?.finish()
+}
+
+fn decode(header: &Header, from: &mut impl Read) -> Result<Splats, CodecError> {
+    let Header { count, .. } = *header;
+    let mut splats = Splats::new(header.sh_degree.min(3));
+    let columns = splats.columns_mut();
+    columns.iter_mut().for_each(|column| column.reserve_exact(count));
+    let [positions, opacities, colours, scales, rotations, sh] = header.planes();
+    rows(from, count, positions, |row| {
+        for axis in 0..3 {
+            let value =
+                quantise::from_position([row[3 * axis], row[3 * axis + 1], row[3 * axis + 2]], header.fractional_bits);
+            columns[axis].push(quantise::FLIP[axis] * value);
+        }
+    })?;
+    rows(from, count, opacities, |row| columns[column::OPACITY].push(crate::ply::logit_of_byte(row[0])))?;
+    rows(from, count, colours, |row| {
+        (0..3).for_each(|c| columns[column::SH + c].push(quantise::from_colour(row[c])));
+    })?;
+    rows(from, count, scales, |row| {
+        (0..3).for_each(|k| columns[column::LOG_SCALE + k].push(quantise::from_log_scale(row[k])));
+    })?;
+    let rotation = header.rotation();
+    rows(from, count, rotations, |row| {
+        let word = row.iter().rev().fold(0, |word, &byte| word << 8 | u32::from(byte));
+        rotation.unpack(word).into_iter().enumerate().for_each(|(k, v)| columns[column::QUAT + k].push(v));
+    })?;
+    rows(from, count, sh, |row| {
+        for (place, column) in columns[column::SH + 3..].iter_mut().enumerate() {
+            column.push(flipped_sh(place / 3 + 1) * quantise::from_sh(row[place]));
+        }
+    })?;
+    Ok(splats)
+}
+
+/// Calls `each` with every row of a plane.
+fn rows(from: &mut impl Read, count: usize, size: usize, mut each: impl FnMut(&[u8])) -> Result<(), CodecError> {
+    const AT_ONCE: usize = 512;
+    if size == 0 {
+        return Ok(());
+    }
+    let mut buffer = vec![0; AT_ONCE * size];
+    let mut left = count;
+    while left > 0 {
+        let some = &mut buffer[..left.min(AT_ONCE) * size];
+        from.read_exact(some).map_err(|e| damaged(&e))?;
+        some.chunks_exact(size).for_each(&mut each);
+        left -= left.min(AT_ONCE);
+    }
+    Ok(())
+}
+
+fn damaged(error: &io::Error) -> CodecError {
+    match error.kind() {
+        io::ErrorKind::UnexpectedEof => CodecError::new("SPZ file is cut short"),
+        _ => CodecError::new(format!("SPZ file is damaged ({error})")),
+    }
+}
+
+/// The zstd streams of version 4, one after the other: together they read like version 3.
+struct Streams<'a> {
+    /// Compressed bytes and length of those to come, last first.
+    rest: Vec<(&'a [u8], usize)>,
+    now: Option<(zstd::stream::read::Decoder<'static, &'a [u8]>, usize)>,
+}
+
+impl<'a> Streams<'a> {
+    /// From the table of contents behind the 32 bytes of the header and the extensions, which are left out.
+    fn new(bytes: &'a [u8], header: &Header) -> Result<Self, CodecError> {
+        let wrong = || CodecError::new("SPZ file's table of contents does not fit it");
+        let expected: Vec<usize> = header.planes().into_iter().filter(|&size| size > 0).collect();
+        let (streams, at) = (*bytes.get(15).ok_or_else(wrong)?, bytes.get(16..20).ok_or_else(wrong)?);
+        let at = u32::from_le_bytes(at.try_into().expect("four bytes")) as usize;
+        if usize::from(streams) != expected.len() || at < 32 {
+            return Err(wrong());
+        }
+        let contents = bytes.get(at..).and_then(|rest| rest.split_at_checked(16 * expected.len())).ok_or_else(wrong)?;
+        let (contents, mut body) = contents;
+        let mut rest = Vec::with_capacity(expected.len());
+        for (entry, size) in contents.chunks_exact(16).zip(expected) {
+            let [compressed, length] = [0, 8].map(|k| u64::from_le_bytes(entry[k..k + 8].try_into().expect("eight")));
+            let compressed = usize::try_from(compressed).map_err(|_| wrong())?;
+            let (stream, others) = body.split_at_checked(compressed).ok_or_else(wrong)?;
+            if length != (size * header.count) as u64 {
+                return Err(wrong());
+            }
+            rest.push((stream, size * header.count));
+            body = others;
+        }
+        rest.reverse();
+        Ok(Self { rest, now: None })
+    }
+}
+
+impl Read for Streams<'_> {
+    fn read(&mut self, to: &mut [u8]) -> io::Result<usize> {
+        loop {
+            match &mut self.now {
+                Some((_, 0)) => self.now = None,
+                Some((decoder, left)) => {
+                    let some = to.len().min(*left);
+                    let read = decoder.read(&mut to[..some])?;
+                    if read == 0 && some > 0 {
+                        return Err(io::ErrorKind::UnexpectedEof.into());
+                    }
+                    *left -= read;
+                    return Ok(read);
+                }
+                None => {
+                    let Some((stream, length)) = self.rest.pop() else { return Ok(0) };
+                    let mut decoder = zstd::stream::read::Decoder::with_buffer(stream)?;
+                    // What a frame holds was checked; a window may be larger than that only up to 8 MiB, as the format
+                    // (RFC 8878, 3.1.1.1.2) asks decoders to accept.
+                    decoder.window_log_max(length.max(8 << 20).next_power_of_two().ilog2().min(31))?;
+                    self.now = Some((decoder, length));
+                }
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;

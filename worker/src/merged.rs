@@ -1,0 +1,178 @@
+//! The merged model on the way: what the job would end with if every block stayed as it is now, measured on the job's
+//! held-out photos. So figures of different tasks are of one thing and may stand on one curve.
+//!
+//! Architecture invariant: this only looks. No result depends on it.
+
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex, PoisonError};
+
+use blocks::{Cut, Mode, Plan};
+use dataset::windows::WindowReader;
+use render::Options;
+use render::cpu::Renderer;
+use scene::{ArtefactId, BlockId, Capture, Splats};
+use store::BlockingStore;
+use train::metrics;
+
+/// Photos are compared at the finest mip of at most this many pixels, which bounds the memory that it takes.
+const PIXELS_LIMIT: u64 = 4 << 20;
+/// Photos kept decoded.
+const CACHE_BYTES: usize = 32 << 20;
+
+/// What is finished of a job, as far as the workers that share this know: those of one process know all of it, others
+/// what their tasks were given.
+#[derive(Debug, Default)]
+pub struct Finished {
+    /// Of the plan with this name, each block's splats without those that a deeper finished block owns.
+    parts: Mutex<(Option<ArtefactId>, BTreeMap<BlockId, Splats>)>,
+}
+
+impl Finished {
+    /// Notes a result.
+    pub(crate) fn insert(&self, id: ArtefactId, plan: &Plan, block: BlockId, splats: &Splats) {
+        self.parts(id, |parts| {
+            let cut = cut_of(plan, parts.keys().copied().chain([block]));
+            parts.insert(block, Splats::new(plan.settings.sh_degree));
+            for (&of, part) in parts.iter_mut() {
+                *part = cut.keep(if of == block { splats } else { part }, &plan.ground, of);
+            }
+        });
+    }
+
+    /// Notes the results that a task was given, where they are not known.
+    pub(crate) fn learn(&self, id: ArtefactId, plan: &Plan, results: &BTreeMap<BlockId, Splats>) {
+        for (&block, splats) in results {
+            if !self.parts(id, |parts| parts.contains_key(&block)) {
+                self.insert(id, plan, block, splats);
+            }
+        }
+    }
+
+    /// The merged model with `block` as it is now.
+    pub(crate) fn with(&self, id: ArtefactId, plan: &Plan, block: BlockId, splats: &Splats) -> Splats {
+        self.parts(id, |parts| {
+            let cut = cut_of(plan, parts.keys().copied().chain([block]));
+            let others = parts.iter().filter(|(of, _)| **of != block).map(|(&of, part)| (of, part));
+            let all = others.chain([(block, splats)]);
+            blocks::merge(all.map(|(of, part)| (of, cut.keep(part, &plan.ground, of))))
+        })
+    }
+
+    fn parts<T>(&self, id: ArtefactId, f: impl FnOnce(&mut BTreeMap<BlockId, Splats>) -> T) -> T {
+        // A thread that panicked left at worst a block with too many splats, in figures only.
+        let mut parts = self.parts.lock().unwrap_or_else(PoisonError::into_inner);
+        if parts.0 != Some(id) {
+            *parts = (Some(id), BTreeMap::new());
+        }
+        f(&mut parts.1)
+    }
+}
+
+/// Who owns what among some blocks of a plan, as [`Plan::leaves`] says of all.
+fn cut_of(plan: &Plan, blocks: impl Iterator<Item = BlockId>) -> Cut {
+    match plan.settings.mode {
+        Mode::Flat => Cut::nearest(&plan.ground, blocks),
+        Mode::Tree | Mode::Whole => blocks.collect(),
+    }
+}
+
+/// Compares models with the held-out photos.
+pub(crate) struct Judge {
+    reader: WindowReader,
+    antialiased: bool,
+    /// Held-out views and the mips at which they are looked at.
+    views: Vec<(u32, u8)>,
+    renderer: Renderer,
+}
+
+impl Judge {
+    /// `None` where no view is held out. What it reads is not counted among what the store moved.
+    pub(crate) fn new(plan: &Plan, capture: &Arc<Capture>, store: &BlockingStore) -> Option<Self> {
+        let held_out = capture.views.iter().enumerate().filter(|(i, _)| Capture::is_test(*i, plan.settings.test_every));
+        let mip = |camera: &scene::Camera| {
+            (0..31).find(|&mip| camera.mip(mip).full().area() <= PIXELS_LIMIT).unwrap_or_default()
+        };
+        let views: Vec<_> = held_out.map(|(i, view)| (i as u32, mip(&view.camera))).collect();
+        let reader = WindowReader::new(capture.clone(), store.store().metered().blocking(), CACHE_BYTES);
+        let antialiased = plan.antialiased();
+        (!views.is_empty()).then(|| Self { reader, antialiased, views, renderer: Renderer::default() })
+    }
+
+    /// Mean PSNR, dB; `None` where masks leave nothing or a photo cannot be read (training will say why).
+    pub(crate) fn psnr(&mut self, model: &Splats) -> Option<f64> {
+        let options = Options { antialiased: self.antialiased, sh_degree: model.sh_degree(), ..Options::default() };
+        let (mut sum, mut count) = (0.0, 0);
+        for &(index, mip) in &self.views {
+            let camera = self.reader.capture().views[index as usize].camera.mip(mip);
+            let photo = self.reader.window(index, mip, camera.full()).ok()?;
+            let frame = self.renderer.forward(model, None, &camera, &options);
+            let truth: Vec<f32> = photo.rgb.iter().map(|&value| f32::from(value) / 255.0).collect();
+            let render: Vec<f32> = frame.colour.iter().map(|value| value.clamp(0.0, 1.0)).collect();
+            if let Some(psnr) = metrics::psnr(&render, &truth, photo.mask.as_deref()) {
+                sum += psnr;
+                count += 1;
+            }
+        }
+        (count > 0).then(|| sum / f64::from(count))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use blocks::{Ground, PlanSettings};
+    use glam::{DQuat, DVec2, Vec3};
+    use scene::Splat;
+
+    use super::*;
+
+    fn plan(mode: Mode) -> Plan {
+        Plan {
+            version: blocks::plan::VERSION,
+            capture: ArtefactId([1; 32]),
+            settings: PlanSettings { mode, sh_degree: 0, ..PlanSettings::default() },
+            backend: "none".into(),
+            ground: Ground { ground_from_world: DQuat::IDENTITY, min: DVec2::ZERO, edge_metres: 8.0 },
+            levels: 1,
+            rho_metres: vec![2.0, 1.0],
+            tasks: Vec::new(),
+        }
+    }
+
+    /// A splat at the centre of each quarter of the ground, as large as `size`.
+    fn four(size: f32) -> Splats {
+        let mut splats = Splats::new(0);
+        for (x, y) in [(2.0, 2.0), (6.0, 2.0), (2.0, 6.0), (6.0, 6.0)] {
+            splats.push(&Splat::round(Vec3::new(x, y, 0.0), size, Vec3::ONE, 0.5));
+        }
+        splats
+    }
+
+    #[test]
+    fn every_place_shows_the_deepest_that_is_finished() {
+        let [a, b] = [BlockId { level: 1, x: 0, y: 0 }, BlockId { level: 1, x: 1, y: 0 }];
+        let (finished, plan, id) = (Finished::default(), plan(Mode::Tree), ArtefactId([2; 32]));
+        let sizes = |splats: &Splats| {
+            let mut sizes: Vec<i32> = (0..splats.len()).map(|i| splats.get(i).log_scale.x as i32).collect();
+            sizes.sort_unstable();
+            sizes
+        };
+        assert_eq!(sizes(&finished.with(id, &plan, BlockId::ROOT, &four(1.0))), [1, 1, 1, 1]);
+        finished.learn(id, &plan, &BTreeMap::from([(BlockId::ROOT, four(1.0))]));
+        finished.insert(id, &plan, a, &four(2.0));
+        finished.learn(id, &plan, &BTreeMap::from([(BlockId::ROOT, four(9.0)), (a, four(9.0))]));
+        assert_eq!(sizes(&finished.with(id, &plan, b, &four(3.0))), [1, 1, 2, 3]);
+        // Looking at it changes nothing, and another attempt takes the place of the last.
+        assert_eq!(sizes(&finished.with(id, &plan, a, &four(4.0))), [1, 1, 1, 4]);
+        // Another job starts anew.
+        assert_eq!(sizes(&finished.with(ArtefactId([3; 32]), &plan, b, &four(3.0))), [3]);
+    }
+
+    #[test]
+    fn of_a_flat_plan_the_nearest_fills_in() {
+        let [a, b] = [BlockId { level: 1, x: 0, y: 0 }, BlockId { level: 1, x: 1, y: 1 }];
+        let (finished, plan, id) = (Finished::default(), plan(Mode::Flat), ArtefactId([2; 32]));
+        finished.insert(id, &plan, a, &four(1.0));
+        assert_eq!(finished.with(id, &plan, a, &four(1.0)).len(), 4);
+        assert_eq!(finished.with(id, &plan, b, &four(2.0)).len(), 4);
+    }
+}
