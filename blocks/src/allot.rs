@@ -13,8 +13,8 @@ use crate::select::Sightings;
 const INNER_BUDGET_RATIO: f64 = 1.0 / 2.5;
 /// Splats that a task gets at least, where the whole budget allows it.
 const MIN_BUDGET: u32 = 500;
-/// Work of all blocks of a level, against the level below it: leaves get 80 % of a deep tree.
-const INNER_WORK_RATIO: f64 = 0.2;
+/// Work of all blocks of a level, against the level below it: leaves get 90 % of a deep tree.
+const INNER_WORK_RATIO: f64 = 0.1;
 /// A step costs its pixels and, for the projection and the optimiser, this many pixels for each splat.
 pub(crate) const PIXELS_PER_SPLAT: f64 = 0.25;
 /// Steps of a task at least.

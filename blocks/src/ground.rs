@@ -10,9 +10,6 @@ use serde::{Deserialize, Serialize};
 
 /// A halo is the core scaled by this about its centre (DOGS, Rubble: 1.2 gives 24.25 dB, 1.4 gives 25.78, 1.5 25.97).
 pub const HALO_SCALE: f64 = 1.4;
-/// Edge of what a block's windows show, relative to its core. Pixels farther out teach splats that the merge drops; a
-/// rim of them is needed, as a splat outside the core may reach into it.
-pub const FOCUS_SCALE: f64 = 1.1;
 /// A direction nearer to world z than this is taken to be world z: cos 20°.
 const SNAP_COSINE: f64 = 0.939_692_6;
 /// Cameras whose mean up vector is shorter than this do not agree on what is up.
@@ -128,16 +125,6 @@ impl Ground {
     /// The core scaled by [`HALO_SCALE`] about its centre, finite.
     pub fn nominal_halo(&self, block: BlockId) -> Square {
         self.grown(block, HALO_SCALE)
-    }
-
-    /// What a block's windows show: its core scaled by [`FOCUS_SCALE`].
-    pub fn nominal_focus(&self, block: BlockId) -> Square {
-        self.grown(block, FOCUS_SCALE)
-    }
-
-    /// As [`Ground::nominal_focus`], with sides at the scene's rim moved to infinity.
-    pub fn focus(&self, block: BlockId) -> Square {
-        self.open_at_rim(block, self.nominal_focus(block))
     }
 
     fn grown(&self, block: BlockId, scale: f64) -> Square {

@@ -45,6 +45,9 @@ pub struct PlanSettings {
     pub test_every: u32,
     /// Degree of the spherical harmonics, 0 to 3.
     pub sh_degree: u8,
+    /// Opacity compensated for the pixel's blur, so that the model may be drawn at any resolution (Mip-Splatting's 2D filter);
+    /// else a plain 3DGS model.
+    pub antialiased: bool,
     /// What one task may take, bytes.
     pub memory_limit_bytes: u64,
 }
@@ -59,6 +62,7 @@ impl Default for PlanSettings {
             budget: 200_000,
             test_every: 8,
             sh_degree: 3,
+            antialiased: false,
             memory_limit_bytes: 4 << 30,
         }
     }
@@ -185,12 +189,6 @@ impl Plan {
             return bad("without tasks or with tasks out of order".into());
         }
         Ok(())
-    }
-
-    /// Whether the model is drawn with opacity compensated for the pixel's blur: where it has more than one level, its splats
-    /// are looked at from distances they were not trained at. A model of one level is a plain 3DGS model.
-    pub fn antialiased(&self) -> bool {
-        self.levels > 0
     }
 
     /// The task of a block.

@@ -243,7 +243,7 @@ impl Seen {
         Self { view, count: depth.len(), depth_metres, footprint_metres, bounds }
     }
 
-    /// The window of the mip that fits, around the box of the block's focus (around the seen points where that cannot be
+    /// The window of the mip that fits, around the box of the block's core (around the seen points where that cannot be
     /// projected); `None` where it is a sliver.
     fn window(&self, capture: &Capture, content: &Content, rho_metres: f64) -> Option<ViewUse> {
         let camera = &capture.views[self.view as usize].camera;
@@ -288,7 +288,7 @@ struct Content {
 }
 
 impl Content {
-    /// The nominal focus, out to the points where the rim has none, and the height range of the points in it.
+    /// The core, out to the points where it lies at the scene's rim, and the height range of the points in it.
     fn new(capture: &Capture, ground: &Ground, block: BlockId, points: impl Iterator<Item = u32>) -> Self {
         let mut indices: Vec<u32> = points.collect();
         indices.sort_unstable();
@@ -297,11 +297,10 @@ impl Content {
             indices.iter().map(|&i| ground.from_world(capture.points.positions[i as usize])).collect();
         let axis = |k: usize| places.iter().map(|p| p[k]).collect::<Vec<f64>>();
         let (mut x, mut y, mut z) = (axis(0), axis(1), axis(2));
-        let (nominal, halo) = (ground.nominal_focus(block), ground.focus(block));
+        let (core, halo) = (ground.core(block), ground.halo(block));
         let reach = |values: &mut [f64], k: usize| {
-            let low = if halo.min[k].is_finite() { nominal.min[k] } else { nominal.min[k].min(quantile(values, 0.01)) };
-            let high =
-                if halo.max[k].is_finite() { nominal.max[k] } else { nominal.max[k].max(quantile(values, 0.99)) };
+            let low = if halo.min[k].is_finite() { core.min[k] } else { core.min[k].min(quantile(values, 0.01)) };
+            let high = if halo.max[k].is_finite() { core.max[k] } else { core.max[k].max(quantile(values, 0.99)) };
             [low, high]
         };
         let (x, y) = (reach(&mut x, 0), reach(&mut y, 1));
@@ -395,11 +394,11 @@ mod tests {
                 let (window, full) = (used.window, image.full());
                 assert!(window.x + window.width <= full.width && window.y + window.height <= full.height);
                 assert!(window.x % TILE == 0 && window.y % TILE == 0);
-                // All but stray points of the focus that this view sees lie in the window.
+                // All but stray points of the core that this view sees lie in the window.
                 let (mut inside, mut all) = (0, 0);
                 for s in sightings.all.iter().filter(|s| s.view == used.view) {
                     let place = capture.points.positions[s.point as usize];
-                    if ground.focus(block).contains(ground.from_world(place).truncate()) {
+                    if ground.owns(block, place) {
                         let (pixel, _) = image.window(window).project(place);
                         all += 1;
                         inside += i32::from(

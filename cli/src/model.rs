@@ -127,7 +127,7 @@ pub(crate) fn write(
     let manifest = Manifest {
         version: VERSION,
         plan: plan.id(),
-        antialiased: plan.antialiased(),
+        antialiased: plan.settings.antialiased,
         sh_degree: plan.settings.sh_degree,
         geo_origin,
         ground: plan.ground,

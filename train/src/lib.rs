@@ -3,6 +3,7 @@
 //! Architecture invariant: no files, no network, no clock. Pixels come through [`WindowSource`]; randomness is counter-based
 //! ([`random`]), so the same job gives the same splats whatever the number of threads.
 
+pub mod blur;
 pub mod growth;
 pub mod init;
 pub mod loss;

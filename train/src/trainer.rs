@@ -70,18 +70,19 @@ impl Default for Recipe {
 }
 
 impl Recipe {
-    /// For splats that already fit one mip coarser: no coarse beginning, full SH degree at once, smaller steps.
+    /// For splats that already fit one mip coarser: no coarse beginning, full SH degree at once, and longer first steps, as
+    /// there are fewer of them.
     pub fn refinement() -> Self {
         let recipe = Self::default();
+        let longer = |[first, last]: [f32; 2]| [1.5 * first, last];
         Self {
-            mean: [recipe.mean[0] * 0.5, recipe.mean[1]],
-            log_scale: [recipe.log_scale[1], recipe.log_scale[1] * 0.5],
-            quat: [recipe.quat[1], recipe.quat[1]],
-            opacity: [recipe.opacity[1], recipe.opacity[1] * 0.5],
-            sh_dc: [recipe.sh_dc[0] * 0.5, recipe.sh_dc[1] * 0.5],
+            mean: longer(recipe.mean),
+            log_scale: longer(recipe.log_scale),
+            quat: longer(recipe.quat),
+            opacity: longer(recipe.opacity),
+            sh_dc: longer(recipe.sh_dc),
             sh_from: [0.0; 3],
             coarse: Vec::new(),
-            growth: Growth { from: 0.0, until: 0.5, every: 25, ..recipe.growth },
             ..recipe
         }
     }

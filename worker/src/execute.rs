@@ -138,7 +138,7 @@ impl Block<'_> {
         }
         let mut measure = |splats: &Splats| {
             let judge = judge.as_mut()?;
-            let merged = finished.with(self.order.plan, plan, task.block, splats);
+            let merged = finished.with(self.order.plan, plan, task.block, &self.handed_on(splats.clone(), &views));
             judge.psnr(&merged).map(|psnr| (psnr, merged.len() as u64))
         };
         let (initial, context) = self.start(results, &views, &recipe)?;
@@ -153,7 +153,7 @@ impl Block<'_> {
             keeps: &keeps,
             budget,
             steps: task.steps,
-            antialiased: plan.antialiased(),
+            antialiased: plan.settings.antialiased,
             seed: self.seed(),
             size_bounds_metres: self.size_bounds_metres(),
             recipe: &recipe,
@@ -198,10 +198,20 @@ impl Block<'_> {
         if late {
             cap.iter().for_each(Cap::shorten);
         }
+        let splats = self.handed_on(splats, &views);
         if judge.is_some() {
             finished.insert(self.order.plan, plan, task.block, &splats);
         }
         Ok(splats)
+    }
+
+    /// The splats as other blocks, viewers and the merged model draw them: at full resolution. Compensated opacity does not
+    /// depend on the resolution.
+    fn handed_on(&self, mut splats: Splats, views: &[TrainView]) -> Splats {
+        if !self.plan.settings.antialiased {
+            train::blur::to_full_images(&mut splats, views);
+        }
+        splats
     }
 
     /// Splats to end with in the core. The plan shares the budget among the children of a block by what is known beforehand;
@@ -222,8 +232,7 @@ impl Block<'_> {
         (total * own / counts.iter().sum::<u64>().max(1)).max(1) as usize
     }
 
-    /// The recipe of the block's level: a child starts from splats that fit already, one mip coarser, so it needs no
-    /// coarse beginning, and moves less.
+    /// The recipe of the block's level: a child starts from splats that fit already, one mip coarser.
     fn recipe(&self) -> Recipe {
         if self.task.parent.is_some() { Recipe::refinement() } else { Recipe::default() }
     }
@@ -276,7 +285,10 @@ impl Block<'_> {
         let cut = task.context_cut();
         let mut initial = Splats::new(sh_degree);
         let mut context = Splats::new(sh_degree);
-        for (block, splats) in results {
+        for (block, mut splats) in results {
+            if !plan.settings.antialiased {
+                train::blur::from_full_images(&mut splats, views);
+            }
             let splats = cut.keep(&splats, &plan.ground, block);
             let inside = |i: usize| self.trains(&cut, splats.mean(i).as_dvec3());
             initial.append(&splats.filter(inside));

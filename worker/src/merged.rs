@@ -94,7 +94,7 @@ impl Judge {
         };
         let views: Vec<_> = held_out.map(|(i, view)| (i as u32, mip(&view.camera))).collect();
         let reader = WindowReader::new(capture.clone(), store.store().metered().blocking(), CACHE_BYTES);
-        let antialiased = plan.antialiased();
+        let antialiased = plan.settings.antialiased;
         (!views.is_empty()).then(|| Self { reader, antialiased, views, renderer: Renderer::default() })
     }
 

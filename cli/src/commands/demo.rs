@@ -116,6 +116,7 @@ fn settings(args: &DemoArgs) -> (CitySettings, TrainArgs) {
             steps,
             budget: Auto(Some(budget)),
             seed: 0,
+            antialiased: false,
             test_every: 8,
             downscale: 1,
         },
