@@ -68,12 +68,13 @@ where
     let request = proto::SubmitRequest { plan: plan.0.to_vec(), store_url };
     let job = client.submit(request).await.map_err(of_status)?.into_inner();
 
+    // Watched before anyone works: a report that came earlier would be told to nobody.
+    let mut news = client.watch(proto::WatchRequest { job: job.job }).await.map_err(of_status)?.into_inner();
     let leave = home.child_token();
     let mut crew = JoinSet::new();
     for number in 0..workers {
         crew.spawn(start_worker(url.clone(), number, leave.clone()));
     }
-    let mut news = client.watch(proto::WatchRequest { job: job.job }).await.map_err(of_status)?.into_inner();
     let mut results = Results::new(job.tasks);
     let mut trouble: Option<String> = None;
     let mut cancelled = false;
