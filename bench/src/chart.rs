@@ -3,7 +3,7 @@
 
 use std::fmt::Write;
 
-use crate::{CurvePoint, ResultLine, latest, scenes};
+use crate::{CurvePoint, ResultLine, averaged, scenes};
 
 const PANEL_WIDTH: f64 = 440.0;
 const PANEL_HEIGHT: f64 = 300.0;
@@ -22,10 +22,11 @@ const COLOURS: [(&str, &str); 6] = [
     ("#5b4bc4", "#a99cff"),
 ];
 
-/// Draws the latest run of each scene and label as a line, and the references as dashed lines. Scenes with neither
+/// Draws the latest run of each scene and label (of several seeds the mean) as a line, and the references as dashed lines. Scenes with neither
 /// have no panel.
 pub fn chart(lines: &[ResultLine], reference: &[ResultLine]) -> String {
-    let (runs, references) = (latest(lines), latest(reference));
+    let [runs, references] = [lines, reference].map(averaged);
+    let [runs, references] = [&runs, &references].map(|runs| runs.iter().map(|run| &run.line).collect::<Vec<_>>());
     let scenes = scenes(runs.iter().chain(&references).copied());
     let mut labels: Vec<&str> = Vec::new();
     for run in &runs {

@@ -6,6 +6,7 @@
 pub mod birdseye;
 pub mod chart;
 pub mod parts;
+pub mod seeds;
 pub mod sheet;
 pub mod table;
 
@@ -19,6 +20,7 @@ use serde::{Deserialize, Serialize};
 pub use birdseye::{birdseye_camera, oblique_camera};
 pub use chart::chart;
 pub use parts::{PartLine, append_part};
+pub use seeds::{Averaged, averaged};
 pub use sheet::{SheetRow, contact_sheet, write_png};
 pub use table::{replace_table, table};
 
@@ -183,18 +185,6 @@ pub fn read_folder(folder: &Path) -> Result<Vec<ResultLine>, BadInput> {
     Ok(lines)
 }
 
-/// The last line of each scene and label, in the order of their first appearance.
-pub fn latest(lines: &[ResultLine]) -> Vec<&ResultLine> {
-    let mut latest: Vec<&ResultLine> = Vec::new();
-    for line in lines {
-        match latest.iter_mut().find(|l| l.scene == line.scene && l.label == line.label) {
-            Some(older) => *older = line,
-            None => latest.push(line),
-        }
-    }
-    latest
-}
-
 /// CPU model and number of cores of this machine: `Intel(R) Xeon(R) CPU @ 2.50GHz, 2 cores`. No host name.
 pub fn machine() -> String {
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
@@ -283,13 +273,6 @@ pub(crate) mod tests {
         assert_eq!(run.cpu_seconds_to(19.0), Some(10.0));
         assert_eq!(run.cpu_seconds_to(24.1), None);
         assert_eq!(run.best_psnr(), 24.0);
-    }
-
-    #[test]
-    fn the_latest_of_each_scene_and_label_counts() {
-        let lines = [line("a", "fox", &[(1.0, 1.0)]), line("b", "fox", &[(1.0, 2.0)]), line("a", "fox", &[(1.0, 3.0)])];
-        let psnr: Vec<f64> = latest(&lines).iter().map(|l| l.psnr).collect();
-        assert_eq!(psnr, [3.0, 2.0]);
     }
 
     #[test]

@@ -2,33 +2,36 @@
 
 use std::fmt::Write;
 
-use crate::{ResultLine, latest, scenes};
+use crate::{Averaged, ResultLine, averaged, scenes};
 
 const BEGIN: &str = "<!-- bench:begin -->";
 const END: &str = "<!-- bench:end -->";
 
-/// The latest run of each scene and label, references (lines with a source) first. The column of times says how long
-/// a run took to the reference's best PSNR, and how much sooner that is than the reference's own.
+/// The latest run of each scene and label, references (lines with a source) first; of several seeds the mean, with the
+/// largest PSNR less the smallest. The column of times says how long a run took to the reference's best PSNR, and how
+/// much sooner that is than the reference's own.
 pub fn table(lines: &[ResultLine]) -> String {
-    let lines = latest(lines);
+    let runs = averaged(lines);
     let mut text = String::from(
         "| scene | run | backend | PSNR, dB | SSIM | SSIMULACRA2 | CPU s | to the reference's best, CPU s | splats | peak MB |\n\
          |---|---|---|---:|---:|---:|---:|---:|---:|---:|\n",
     );
-    for scene in scenes(lines.iter().copied()) {
-        let of_scene = || lines.iter().filter(|line| line.scene == scene);
-        let reference = of_scene().find(|line| line.source.is_some());
-        let ordered = of_scene().filter(|l| l.source.is_some()).chain(of_scene().filter(|l| l.source.is_none()));
-        for line in ordered {
+    for scene in scenes(runs.iter().map(|run| &run.line)) {
+        let of_scene = |referred: bool| {
+            runs.iter().filter(move |run| run.line.scene == scene && run.line.source.is_some() == referred)
+        };
+        let reference = of_scene(true).next().map(|run| &run.line);
+        for run in of_scene(true).chain(of_scene(false)) {
+            let line = &run.line;
             let size = if line.downscale > 1 { format!(" 1/{}", line.downscale) } else { String::new() };
             // writing to a String cannot fail
             let _ = writeln!(
                 text,
-                "| {}{size} | {} | {} | {:.2} | {} | {} | {} | {} | {} | {} |",
+                "| {}{size} | {} | {} | {} | {} | {} | {} | {} | {} | {} |",
                 cell(scene),
                 cell(&line.label),
                 cell(&line.backend),
-                line.psnr,
+                psnr(run),
                 number(line.ssim, 3),
                 number(line.perceptual, 1),
                 seconds(line.cpu_seconds),
@@ -47,6 +50,15 @@ pub fn replace_table(document: &str, table: &str) -> Option<String> {
     let from = document.find(BEGIN)? + BEGIN.len();
     let to = from + document[from..].find(END)?;
     Some(format!("{}\n{}\n{}", &document[..from], table.trim_end(), &document[to..]))
+}
+
+fn psnr(run: &Averaged) -> String {
+    let mean = run.line.psnr;
+    if run.seeds > 1 {
+        format!("{mean:.2} ({} seeds, {:.2} apart)", run.seeds, run.spread)
+    } else {
+        format!("{mean:.2}")
+    }
 }
 
 fn to_best(line: &ResultLine, reference: &ResultLine) -> String {
