@@ -14,6 +14,8 @@ pub enum PartLine {
     Kernels(Kernels),
     /// Photos to artefacts.
     Ingest(Ingest),
+    /// A model with fewer splats.
+    Prune(Prune),
 }
 
 /// How long the renderer's passes take: medians.
@@ -76,6 +78,37 @@ pub struct Ingest {
     pub command: String,
 }
 
+/// A model cut to a share of its splats, or pruned and healed within a tolerance.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Prune {
+    /// The program's git commit.
+    pub commit: String,
+    /// See [`crate::machine`].
+    pub machine: String,
+    /// The capture's name.
+    pub scene: String,
+    /// Photos were used at one over this of their size.
+    pub downscale: u32,
+    /// What went first.
+    pub order: String,
+    /// Share kept, without healing; null where it follows from a tolerance.
+    pub keep: Option<f64>,
+    /// Loss allowed on the views that it was pruned by, dB, after healing.
+    pub tolerance_db: Option<f64>,
+    /// Splats before.
+    pub splats_before: u64,
+    /// Splats now.
+    pub splats: u64,
+    /// PSNR on the views that it was pruned by: before and now, dB.
+    pub held_in_psnr: [f64; 2],
+    /// PSNR on the held-out views: before and now, dB.
+    pub held_out_psnr: [f64; 2],
+    /// User and system time of all threads.
+    pub cpu_seconds: f64,
+    /// The command that made the line.
+    pub command: String,
+}
+
 impl PartLine {
     fn is_finite(&self) -> bool {
         match self {
@@ -84,6 +117,10 @@ impl PartLine {
                     .iter()
                     .all(|millis| millis.is_finite())
             }
+            Self::Prune(line) => (line.held_in_psnr.iter().chain(&line.held_out_psnr))
+                .chain([&line.cpu_seconds])
+                .chain(line.keep.iter().chain(&line.tolerance_db))
+                .all(|value| value.is_finite()),
             Self::Ingest(line) => line.wall_seconds.is_finite() && line.cpu_seconds.is_finite(),
         }
     }

@@ -16,9 +16,11 @@ pub mod lint;
 pub mod lod;
 pub mod plan;
 pub mod planner;
+pub mod seams;
 pub mod select;
 #[cfg(test)]
 mod testing;
+pub mod view_cut;
 
 pub use cut::{cut, keep_core, merge};
 pub use draw::draw;
@@ -27,3 +29,5 @@ pub use lint::{Finding, Severity, lint};
 pub use lod::{Cut, context_of, sweep_of};
 pub use plan::{Mode, Plan, PlanError, PlanSettings, Task, ViewUse};
 pub use planner::plan;
+pub use seams::{Face, Seams};
+pub use view_cut::ViewTree;

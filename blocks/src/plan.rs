@@ -41,6 +41,8 @@ pub struct PlanSettings {
     pub steps: u32,
     /// Splats of the merged model.
     pub budget: u32,
+    /// What leaves may lose of their PSNR for fewer splats, dB; 0 prunes nothing.
+    pub tolerance_db: f64,
     /// Every which view is held out; 0 holds out none.
     pub test_every: u32,
     /// Degree of the spherical harmonics, 0 to 3.
@@ -60,6 +62,7 @@ impl Default for PlanSettings {
             seed: 0,
             steps: 3000,
             budget: 200_000,
+            tolerance_db: 0.0,
             test_every: 8,
             sh_degree: 3,
             antialiased: false,

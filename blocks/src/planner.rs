@@ -96,6 +96,9 @@ fn check(settings: &PlanSettings) -> Result<(), PlanError> {
     if settings.budget == 0 {
         return bad("--budget", "no splats".into(), "give at least 1");
     }
+    if !(settings.tolerance_db >= 0.0 && settings.tolerance_db.is_finite()) {
+        return bad("--tolerance-db", format!("{} is no loss", settings.tolerance_db), "give decibels from 0");
+    }
     if settings.sh_degree > 3 {
         return bad("sh_degree", format!("{} is not supported", settings.sh_degree), "give 0 to 3");
     }

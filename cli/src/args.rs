@@ -6,7 +6,9 @@ use std::str::FromStr;
 
 use blocks::{Mode, PlanSettings};
 use clap::{Args, Parser, Subcommand, ValueEnum};
+use scene::Capture;
 use serde::{Serialize, Serializer};
+use train::importance::Order;
 
 /// Trains Gaussian-splat models of whole cities from photos with poses.
 ///
@@ -42,6 +44,8 @@ pub(crate) enum Command {
     Eval(EvalArgs),
     /// Draw a model from the cameras of a capture or of a transforms.json
     Render(RenderArgs),
+    /// Leave out the splats that matter least
+    Prune(PruneArgs),
     /// Write a model in a format that other programs read
     Export(ExportArgs),
     /// Measure plat itself
@@ -59,6 +63,8 @@ pub(crate) enum BenchCommand {
     Kernels(KernelsArgs),
     /// Ingest a capture into a store of its own, and append what it took to the results
     Ingest(IngestArgs),
+    /// Compare the orders to prune a model by, and append the figures to the results
+    Prune(BenchPruneArgs),
     /// Build the demo, and append what it took and how good it is to the results
     Demo(BenchDemoArgs),
 }
@@ -151,12 +157,16 @@ pub(crate) struct PlanOptions {
     /// Levels below the root; auto chooses from extent, resolution, views and points
     #[arg(long, value_name = "N|auto", default_value_t)]
     pub(crate) levels: Auto<u8>,
-    /// Optimiser steps, counted in full images of the whole scene: every division costs about the same
-    #[arg(long, value_name = "N", default_value_t = 3000)]
-    pub(crate) steps: u32,
-    /// Splats of the merged model; auto takes two for each sparse point, from 20,000 to 2,000,000
+    /// Optimiser steps, counted in full images of the whole scene: every division costs about the same; auto takes 60 for
+    /// each view, from 500
+    #[arg(long, value_name = "N|auto", default_value_t)]
+    pub(crate) steps: Auto<u32>,
+    /// Splats of the merged model before pruning; auto takes three for each sparse point, from 5,000 to 2,000,000
     #[arg(long, value_name = "N|auto", default_value_t)]
     pub(crate) budget: Auto<u32>,
+    /// Prune the finest blocks within this loss of PSNR on the views that they are trained on; 0 prunes nothing
+    #[arg(long, value_name = "X", value_parser = decibels, default_value_t = 0.1)]
+    pub(crate) tolerance_db: f64,
     /// Seed of all random choices
     #[arg(long, value_name = "S", default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=i64::MAX as u64))]
     pub(crate) seed: u64,
@@ -173,9 +183,15 @@ pub(crate) struct PlanOptions {
 }
 
 impl PlanOptions {
-    /// The planner's settings for a capture with this many sparse points.
-    pub(crate) fn settings(&self, points: usize) -> PlanSettings {
-        let auto = || u32::try_from(2 * points).unwrap_or(u32::MAX).clamp(20_000, 2_000_000);
+    /// The planner's settings for a capture.
+    ///
+    /// More splats or steps than its points and views support fit the photos that are trained on and spoil the others:
+    /// at a quarter of its size `street_lund` (25 views, 1,540 points) has 16.1 dB held out with 6,000 splats and 1,500 steps,
+    /// 15.3 with 20,000 and 3,000.
+    pub(crate) fn settings(&self, capture: &Capture) -> PlanSettings {
+        let times = |count: usize, each: u32| u32::try_from(count).unwrap_or(u32::MAX).saturating_mul(each);
+        let budget = || times(capture.points.len(), 3).clamp(5000, 2_000_000);
+        let steps = || times(capture.views.len(), 60).max(500);
         PlanSettings {
             mode: match self.blocks {
                 Blocks::Tree => Mode::Tree,
@@ -184,8 +200,9 @@ impl PlanOptions {
             },
             levels: self.levels.0,
             seed: self.seed,
-            steps: self.steps,
-            budget: self.budget.0.unwrap_or_else(auto),
+            steps: self.steps.0.unwrap_or_else(steps),
+            budget: self.budget.0.unwrap_or_else(budget),
+            tolerance_db: self.tolerance_db,
             test_every: self.test_every,
             antialiased: self.antialiased,
             ..PlanSettings::default()
@@ -254,6 +271,14 @@ pub(crate) struct TrainArgs {
     /// Measure held-out PSNR of the merged model so far every N steps of a task; 0 measures only at its end
     #[arg(long, value_name = "N", default_value_t = 0)]
     pub(crate) eval_every: u32,
+    /// Train all anew, whatever an earlier run of the same plan left in the store
+    #[arg(long)]
+    #[serde(skip)]
+    pub(crate) fresh: bool,
+    /// Seconds between two checkpoints of a block, from which the same command goes on after it was stopped or killed
+    #[arg(long, value_name = "SECONDS", default_value_t = 60.0, value_parser = seconds)]
+    #[serde(skip)]
+    pub(crate) checkpoint_every: f64,
     /// Be done within M minutes of wall time: every task takes its share, in fewer steps if need be. What was shortened
     /// so depends on the machine's speed: its bytes are not the same twice
     #[arg(long, value_name = "M", value_parser = minutes)]
@@ -287,6 +312,45 @@ pub(crate) struct EvalArgs {
     /// Also measure LPIPS with this network (ONNX)
     #[arg(long, value_name = "FILE", long_help = LPIPS_HELP)]
     pub(crate) lpips: Option<PathBuf>,
+    /// Also measure the tree cut at level L, or at every level, against the finest model
+    #[arg(long, value_name = "L|all")]
+    pub(crate) level: Option<Level>,
+    /// Also measure what a viewer shows with at most N splats: for each view the sharpest cut of the tree
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    pub(crate) budget: Option<u32>,
+    /// Also measure near the faces between blocks against elsewhere in the same views, and the jump across each face
+    #[arg(long)]
+    pub(crate) seams: bool,
+    /// As --seams, at the faces of that model: say, of a tree, where MODEL is one block trained on the same capture
+    #[arg(long, value_name = "MODEL")]
+    pub(crate) seams_of: Option<PathBuf>,
+    /// What counts as near a face, and implies --seams; by default 2 metres where the capture says where on Earth it lies,
+    /// else 1/32 of the edge of the smallest block; never more than 1/8 of it
+    #[arg(long, value_name = "M", value_parser = metres)]
+    pub(crate) seam_metres: Option<f64>,
+}
+
+fn metres(text: &str) -> Result<f64, String> {
+    let value = text.parse().ok().filter(|metres: &f64| *metres > 0.0 && metres.is_finite());
+    value.ok_or_else(|| "give metres above 0, such as 2 or 0.5".into())
+}
+
+/// A level of the tree, or `all`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Level {
+    All,
+    Only(u8),
+}
+
+impl FromStr for Level {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        match text {
+            "all" => Ok(Self::All),
+            text => text.parse().map(Self::Only).map_err(|_| "give a level from 0, or all".into()),
+        }
+    }
 }
 
 const LPIPS_HELP: &str = "\
@@ -322,6 +386,60 @@ pub(crate) struct RenderArgs {
     /// Draw as the original 3DGS rasterizer does; by default as the model says
     #[arg(long, overrides_with = "antialiased")]
     pub(crate) classic: bool,
+}
+
+#[derive(Debug, Clone, Args)]
+pub(crate) struct PruneArgs {
+    /// Folder that `plat train` wrote, a .ply or a .spz
+    pub(crate) model: PathBuf,
+    /// Where the pruned model goes: a folder if the model is one, else a file of the same kind
+    #[arg(long, value_name = "MODEL2")]
+    pub(crate) out: PathBuf,
+    /// Keep this share of the splats, in 0..1
+    #[arg(long, value_name = "F", value_parser = share, conflicts_with = "tolerance_db")]
+    pub(crate) keep: Option<f64>,
+    /// Lose at most so much PSNR on the views that are not held out; 0.1 if --keep is not given either [needs --capture]
+    #[arg(long, value_name = "X", value_parser = decibels)]
+    pub(crate) tolerance_db: Option<f64>,
+    /// Photos to judge and heal by; without them only --keep, by opacity and size
+    #[arg(long)]
+    pub(crate) capture: Option<PathBuf>,
+    #[command(flatten)]
+    pub(crate) photos: PruneCapture,
+}
+
+/// How a capture is read to prune by.
+#[derive(Debug, Clone, Args)]
+pub(crate) struct PruneCapture {
+    /// Leave out every K-th view; by default as the model was trained, else 8
+    #[arg(long, value_name = "K")]
+    pub(crate) test_every: Option<u32>,
+    /// Use photos at one N-th of their size; by default as the model was trained, else 1
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    pub(crate) downscale: Option<u32>,
+    /// Store of the photos; by default the model's own where it is there, else a temporary one
+    #[arg(long, value_name = "URL")]
+    pub(crate) store: Option<String>,
+}
+
+fn share(text: &str) -> Result<f64, String> {
+    let value = text.parse().ok().filter(|share: &f64| *share > 0.0 && *share <= 1.0);
+    value.ok_or_else(|| "give a share above 0 and at most 1, such as 0.5".into())
+}
+
+fn seconds(text: &str) -> Result<f64, String> {
+    let value = text.parse().ok().filter(|seconds: &f64| *seconds >= 0.0 && seconds.is_finite());
+    value.ok_or_else(|| "give seconds from 0, such as 60".into())
+}
+
+fn decibels(text: &str) -> Result<f64, String> {
+    let value = text.parse().ok().filter(|db: &f64| *db >= 0.0 && db.is_finite());
+    value.ok_or_else(|| "give decibels from 0, such as 0.1".into())
+}
+
+fn order(text: &str) -> Result<Order, String> {
+    let names = || Order::ALL.map(Order::name).join(", ");
+    Order::ALL.into_iter().find(|order| order.name() == text).ok_or_else(|| format!("give one of {}", names()))
 }
 
 /// A format that other programs read.
@@ -380,6 +498,41 @@ pub(crate) struct IngestArgs {
     /// Folder of the result lines; this one goes to ingest.jsonl there
     #[arg(long, value_name = "DIR", default_value = "bench/results")]
     pub(crate) results: PathBuf,
+}
+
+#[derive(Debug, Clone, Args)]
+pub(crate) struct BenchPruneArgs {
+    /// Folder that `plat train` wrote, a .ply or a .spz
+    pub(crate) model: PathBuf,
+    /// Folder of the capture
+    pub(crate) capture: PathBuf,
+    /// What the lines call the capture; by default the name of its folder
+    #[arg(long)]
+    pub(crate) scene: Option<String>,
+    /// Orders to compare; all by default
+    #[arg(long, value_name = "ORDER", value_parser = order, value_delimiter = ',')]
+    pub(crate) order: Vec<Order>,
+    /// Loss of PSNR allowed
+    #[arg(long, value_name = "X", value_parser = decibels, default_value_t = 0.1)]
+    pub(crate) tolerance_db: f64,
+    /// Rounds of cut and healing at most; by default as plat prune
+    #[arg(long, value_name = "N")]
+    pub(crate) rounds: Option<u32>,
+    /// Steps of healing in a round, as a share of the model's; by default as plat prune
+    #[arg(long, value_name = "F", value_parser = healing)]
+    pub(crate) healing: Option<f32>,
+    /// How far below the floor the first cut goes, dB; by default as plat prune
+    #[arg(long, value_name = "X", value_parser = decibels)]
+    pub(crate) drop_db: Option<f64>,
+    /// Folder of the result lines; these go to prune.jsonl there
+    #[arg(long, value_name = "DIR", default_value = "bench/results")]
+    pub(crate) results: PathBuf,
+    #[command(flatten)]
+    pub(crate) photos: PruneCapture,
+}
+
+fn healing(text: &str) -> Result<f32, String> {
+    share(text).map(|share| share as f32)
 }
 
 #[derive(Debug, Clone, Args)]

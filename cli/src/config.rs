@@ -168,7 +168,7 @@ mod tests {
         ] {
             let cli = parse(&words).unwrap();
             let Command::Train(train) = cli.command else { panic!("not train") };
-            assert_eq!((train.plan.steps, train.plan.seed, train.plan.test_every), (7, 6, 8));
+            assert_eq!((train.plan.steps.0, train.plan.seed, train.plan.test_every), (Some(7), 6, 8));
             assert!(cli.quiet && train.out == Path::new("there") && train.capture == Path::new("here"));
         }
     }

@@ -8,12 +8,15 @@ mod cameras;
 mod clock;
 mod commands;
 mod config;
+mod cuts;
 mod failure;
 mod journal;
 mod lpips;
+mod maps;
 mod model;
 mod output;
 mod record;
+mod seams;
 
 use std::process::ExitCode;
 
@@ -42,11 +45,13 @@ fn main() -> ExitCode {
         Command::Train(args) => commands::train::run(args, &output),
         Command::Eval(args) => commands::eval::run(args, &output),
         Command::Render(args) => commands::render::run(args, &output),
+        Command::Prune(args) => commands::prune::run(args, &output),
         Command::Export(args) => commands::export::run(args, &output),
         Command::Bench(BenchCommand::Pareto(args)) => commands::bench::pareto(args, &output),
         Command::Bench(BenchCommand::Chart(args)) => commands::bench::chart(args, &output),
         Command::Bench(BenchCommand::Kernels(args)) => commands::kernels::run(args, &output),
         Command::Bench(BenchCommand::Ingest(args)) => commands::bench::ingest(args, &output),
+        Command::Bench(BenchCommand::Prune(args)) => commands::prune::bench(args, &output),
         Command::Bench(BenchCommand::Demo(args)) => commands::bench::demo(args, &output),
     };
     done.map_or_else(|failure| fail(&failure), |()| ExitCode::SUCCESS)

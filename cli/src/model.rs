@@ -7,10 +7,13 @@
 //! OUT/merged.ply                the finest cut, sewn together
 //! ```
 
+pub(crate) mod rewrite;
+
+use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use blocks::{Ground, Plan};
+use blocks::{Cut, Ground, Plan};
 use scene::{ArtefactId, BadInput, BlockId, CodecError, GeoOrigin, Splats, frame, ply, spz};
 use serde::{Deserialize, Serialize};
 use store::BlockingStore;
@@ -160,8 +163,7 @@ fn sew<E>(plan: &Plan, mut result_of: impl FnMut(BlockId) -> Result<Splats, E>) 
 pub(crate) fn read(path: &Path) -> Result<Model, BadInput> {
     let advice = "give a folder that plat train wrote, a .ply or a .spz";
     if path.is_dir() {
-        let folder = [path.join("model"), path.to_path_buf()].into_iter().find(|f| f.join("model.json").is_file());
-        let Some(folder) = folder else {
+        let Some(folder) = trained_folder(path) else {
             return Err(BadInput::new(path.display().to_string(), "holds no model/model.json", advice));
         };
         return read_trained(&folder);
@@ -182,6 +184,51 @@ pub(crate) fn read(path: &Path) -> Result<Model, BadInput> {
 }
 
 fn read_trained(folder: &Path) -> Result<Model, BadInput> {
+    let (manifest, plan) = read_plan(folder)?;
+    let splats = sew(&plan, |block| read_block(folder, block))?;
+    let out = folder.parent().filter(|_| folder.ends_with("model")).unwrap_or(folder);
+    Ok(Model { splats, antialiased: manifest.antialiased, trained: Some((manifest, out.to_path_buf())) })
+}
+
+/// A trained model block by block.
+#[derive(Debug)]
+pub(crate) struct Tree {
+    pub(crate) plan: Plan,
+    /// Of every task, halo included.
+    pub(crate) results: BTreeMap<BlockId, Splats>,
+    pub(crate) antialiased: bool,
+}
+
+impl Tree {
+    /// What a cut shows.
+    pub(crate) fn sewn(&self, cut: &Cut) -> Splats {
+        let kept = self.results.iter().map(|(&block, splats)| (block, cut.keep(splats, &self.plan.ground, block)));
+        blocks::merge(kept)
+    }
+}
+
+/// Reads the blocks of a folder that `plat train` wrote, or of its `model` folder.
+///
+/// # Errors
+/// What is not there, not readable, or not a model of blocks.
+pub(crate) fn read_tree(path: &Path) -> Result<Tree, BadInput> {
+    let Some(folder) = trained_folder(path) else {
+        let problem = "holds no model/model.json, and the blocks of a model are needed";
+        return Err(BadInput::new(path.display().to_string(), problem, "give a folder that plat train wrote"));
+    };
+    let (manifest, plan) = read_plan(&folder)?;
+    let results = (plan.tasks.iter().map(|task| task.block))
+        .map(|block| Ok((block, read_block(&folder, block)?)))
+        .collect::<Result<_, BadInput>>()?;
+    Ok(Tree { plan, results, antialiased: manifest.antialiased })
+}
+
+/// The folder with `model.json`.
+fn trained_folder(path: &Path) -> Option<PathBuf> {
+    [path.join("model"), path.to_path_buf()].into_iter().find(|folder| folder.join("model.json").is_file())
+}
+
+fn read_plan(folder: &Path) -> Result<(Manifest, Plan), BadInput> {
     let path = folder.join("model.json");
     let manifest: Manifest =
         serde_json::from_slice(&load(&path)?).map_err(|error| damaged(&path, &CodecError::new(error.to_string())))?;
@@ -191,12 +238,12 @@ fn read_trained(folder: &Path) -> Result<Model, BadInput> {
     }
     let path = folder.join(PLAN_FILE);
     let plan = Plan::from_frame(&load(&path)?).map_err(|error| damaged(&path, &error))?;
-    let splats = sew(&plan, |block| {
-        let path = folder.join("blocks").join(file_name(block));
-        frame::decode_splats(&load(&path)?).map_err(|error| damaged(&path, &error))
-    })?;
-    let out = folder.parent().filter(|_| folder.ends_with("model")).unwrap_or(folder);
-    Ok(Model { splats, antialiased: manifest.antialiased, trained: Some((manifest, out.to_path_buf())) })
+    Ok((manifest, plan))
+}
+
+fn read_block(folder: &Path, block: BlockId) -> Result<Splats, BadInput> {
+    let path = folder.join("blocks").join(file_name(block));
+    frame::decode_splats(&load(&path)?).map_err(|error| damaged(&path, &error))
 }
 
 fn file_name(block: BlockId) -> String {

@@ -88,3 +88,14 @@ pub struct Gradients {
     /// dL/dξ for `camera_from_world ← exp(ξ)·camera_from_world`, ξ = (ρ metres, ω radians).
     pub pose: [f32; 6],
 }
+
+/// What each trainable splat means to a view, in pixels that count as much as their weight says. Zero where not seen.
+#[derive(Debug, Clone, Default)]
+pub struct Contributions {
+    /// Σ αT.
+    pub weight: Vec<f32>,
+    /// Σ (dI/dg)² over channels too, with g the splat's projected value before opacity (Speedy-Splat, Hanson et al. 2025).
+    pub squared: Vec<f32>,
+    /// Σ δ² over channels too, with δ the exact change of the pixel if this splat alone were not there.
+    pub energy: Vec<f32>,
+}

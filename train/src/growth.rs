@@ -62,11 +62,11 @@ impl Growth {
 #[derive(Debug, Default, Clone)]
 pub struct Evidence {
     /// Σ over views of the absolute screen-space gradient.
-    error: Vec<f32>,
+    pub(crate) error: Vec<f32>,
     /// Largest share of a view, in pixels, that the splat explained.
-    weight: Vec<f32>,
+    pub(crate) weight: Vec<f32>,
     /// Views that saw it.
-    views: Vec<u32>,
+    pub(crate) views: Vec<u32>,
 }
 
 impl Evidence {

@@ -4,14 +4,18 @@
 //! ([`random`]), so the same job gives the same splats whatever the number of threads.
 
 pub mod blur;
+pub mod checkpoint;
 pub mod growth;
+pub mod importance;
 pub mod init;
 pub mod loss;
 pub mod metrics;
 pub mod optimiser;
+pub mod prune;
 pub mod random;
 pub mod source;
 pub mod trainer;
 
+pub use checkpoint::State;
 pub use source::WindowSource;
-pub use trainer::{Flow, Job, Progress, Recipe, TrainError, TrainView, train};
+pub use trainer::{Flow, Job, Progress, Recipe, TrainError, TrainView, train, train_on};

@@ -65,6 +65,16 @@ impl Adam {
         Self { isa, step: 0, first: zeros.clone(), second: zeros }
     }
 
+    /// Steps taken, first and second moments.
+    pub(crate) fn parts(&self) -> (i32, &[Vec<f32>], &[Vec<f32>]) {
+        (self.step, &self.first, &self.second)
+    }
+
+    /// From such parts.
+    pub(crate) fn from_parts(isa: Isa, step: i32, first: Vec<Vec<f32>>, second: Vec<Vec<f32>>) -> Self {
+        Self { isa, step, first, second }
+    }
+
     /// One step along the gradient of the columns that the SH degree uses.
     pub fn step(&mut self, splats: &mut Splats, gradients: &Gradients, sh_degree: u8, rates: &Rates) {
         self.step += 1;

@@ -13,7 +13,7 @@ use serde::{Deserialize, Serialize};
 use crate::growth::{self, Evidence, Growth};
 use crate::loss::Photometric;
 use crate::optimiser::{Adam, Rates};
-use crate::{WindowSource, random};
+use crate::{State, WindowSource, random};
 
 /// How a block is trained. Shares are of the number of steps; rates are per step of Adam.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -157,6 +157,8 @@ pub struct Progress<'a> {
     pub splats: &'a Splats,
     /// Steps whose gradient was not finite; such a step is left out.
     pub skipped: u32,
+    /// From which training can go on.
+    pub state: &'a State,
 }
 
 /// Should training go on?
@@ -187,23 +189,41 @@ pub enum TrainError {
 /// # Errors
 /// See [`TrainError`].
 pub fn train(job: Job, report: &mut dyn FnMut(Progress) -> Flow) -> Result<Splats, TrainError> {
-    let Job { initial: mut splats, context, views, counts, keeps, budget, steps, recipe, .. } = job;
+    train_on(job, None, report)
+}
+
+/// Trains a block on from where an earlier run of the same job stood: the result is what that would have come to.
+///
+/// # Errors
+/// See [`TrainError`].
+pub fn train_on(
+    mut job: Job,
+    from: Option<State>,
+    report: &mut dyn FnMut(Progress) -> Flow,
+) -> Result<Splats, TrainError> {
+    let Job { context, views, counts, keeps, budget, steps, recipe, .. } = job;
     if views.is_empty() {
         return Err(TrainError::NoViews);
     }
     let isa = Isa::detect();
     let mut renderer = Renderer::new(isa);
     let mut loss = Photometric::new(isa, recipe.lambda);
-    let mut adam = Adam::new(isa, &splats);
-    let mut evidence = Evidence::default();
     let mut upstream = Upstream::default();
     let mut weights = Vec::new();
-    let mut skipped = 0;
-    let start_count = (0..splats.len()).filter(|&i| counts(splats.mean(i))).count();
+    let initial = std::mem::replace(&mut job.initial, Splats::new(0));
+    let mut now = from.unwrap_or_else(|| State {
+        step: 0,
+        skipped: 0,
+        start_count: (0..initial.len()).filter(|&i| counts(initial.mean(i))).count(),
+        adam: Adam::new(isa, &initial),
+        evidence: Evidence::default(),
+        splats: initial,
+    });
     let log_scale_bounds = job.size_bounds_metres.map(f32::ln);
 
-    for step in 0..steps {
-        if splats.is_empty() {
+    while now.step < steps {
+        let step = now.step;
+        if now.splats.is_empty() {
             return Err(TrainError::Empty(step));
         }
         let progress = step as f32 / steps as f32;
@@ -215,35 +235,47 @@ pub fn train(job: Job, report: &mut dyn FnMut(Progress) -> Flow) -> Result<Splat
         let sh_degree = recipe.sh_from.iter().filter(|&&from| progress >= from).count() as u8;
         let options = Options {
             antialiased: job.antialiased,
-            sh_degree: sh_degree.min(splats.sh_degree()),
+            sh_degree: sh_degree.min(now.splats.sh_degree()),
             background: [0.0; 3],
             extras: context.is_some(),
         };
-        let frame = renderer.forward(&splats, context, &camera, &options);
+        let frame = renderer.forward(&now.splats, context, &camera, &options);
         pixel_weights(frame, &photo, &mut weights);
         let value = loss.evaluate(&frame.colour, &photo, &weights, &mut upstream.colour);
         if value.total.is_finite() {
-            let gradients = renderer.backward(&splats, &upstream);
-            evidence.add(gradients, photo.area() as f32);
-            adam.step(&mut splats, gradients, options.sh_degree, &rates(recipe, progress, log_scale_bounds));
+            let gradients = renderer.backward(&now.splats, &upstream);
+            now.evidence.add(gradients, photo.area() as f32);
+            now.adam.step(&mut now.splats, gradients, options.sh_degree, &rates(recipe, progress, log_scale_bounds));
         } else {
-            skipped += 1;
+            now.skipped += 1;
         }
 
         let growth = &recipe.growth;
-        let done = step + 1;
+        now.step = step + 1;
         let last_refinement = (growth.until * steps as f32) as u32 + growth.every;
-        if done.is_multiple_of(growth.every) && progress >= growth.from && done <= last_refinement && done < steps {
-            let target = growth.target(done, steps, start_count, budget);
-            let (grown, rows, _) = growth::refine(&splats, &mut evidence, growth, target, counts, keeps);
-            splats = grown;
-            adam.rearrange(&rows);
+        if now.step.is_multiple_of(growth.every)
+            && progress >= growth.from
+            && now.step <= last_refinement
+            && now.step < steps
+        {
+            let target = growth.target(now.step, steps, now.start_count, budget);
+            let (grown, rows, _) = growth::refine(&now.splats, &mut now.evidence, growth, target, counts, keeps);
+            now.splats = grown;
+            now.adam.rearrange(&rows);
         }
-        if report(Progress { step: done, steps, loss: value.total, splats: &splats, skipped }) == Flow::Stop {
+        let said = Progress {
+            step: now.step,
+            steps,
+            loss: value.total,
+            splats: &now.splats,
+            skipped: now.skipped,
+            state: &now,
+        };
+        if report(said) == Flow::Stop {
             break;
         }
     }
-    Ok(splats)
+    Ok(now.splats)
 }
 
 /// Every view once per epoch, each epoch in another order.

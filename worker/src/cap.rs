@@ -113,13 +113,14 @@ pub(crate) struct Limit<'a> {
 }
 
 impl<'a> Limit<'a> {
-    /// Gives this task of the plan its share, and its job no more steps than fit. There is an evaluation (`evaluate`) at
+    /// Gives this task of the plan its share, and its job no more steps than fit into that part of it. There is an evaluation (`evaluate`) at
     /// the end and one every `eval_every` steps (0 = none).
     pub(crate) fn of<T>(
         cap: &'a Cap,
         plan: &Plan,
         task: u32,
         job: &mut Job,
+        part: f64,
         eval_every: u32,
         mut evaluate: impl FnMut(&Splats) -> T,
     ) -> Self {
@@ -132,7 +133,7 @@ impl<'a> Limit<'a> {
             limit.evaluation = cap.now() - start;
             let Pace { step, window } = rehearse(job, cap, cap.now() + REHEARSAL * share);
             let on_the_way = if eval_every > 0 { limit.evaluation / f64::from(eval_every) } else { 0.0 };
-            let available = AIM * share - (cap.now() - start) - limit.evaluation;
+            let available = part * (AIM * share - (cap.now() - start) - limit.evaluation);
             steps = fitting_steps(available, step * growth(job) + on_the_way, window, job.views.len());
         }
         if steps < job.steps {

@@ -8,6 +8,7 @@
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU32, Ordering};
 
 use blocks::{Mode, Plan, Task, ViewUse};
 use dataset::windows::WindowReader;
@@ -16,10 +17,12 @@ use rayon::prelude::*;
 use render::cpu::Isa;
 use scene::{ArtefactId, BlockId, Capture, SparsePoints, Splats, frame};
 use store::BlockingStore;
+use train::prune::{self, Pruning};
 use train::{Recipe, TrainError, TrainView};
 
 use crate::cap::{Cap, Limit};
 use crate::clock::Stopwatch;
+use crate::memory::Memory;
 use crate::merged::{Finished, Judge};
 use crate::{Execute, ExecuteError, Flow, Report, TaskOrder};
 
@@ -27,7 +30,7 @@ use crate::{Execute, ExecuteError, Flow, Report, TaskOrder};
 const REPORT_EVERY: u32 = 10;
 
 /// What a worker may use, and what it is asked to measure.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TrainerOptions {
     /// Threads of the compute pool, at least 1.
     pub threads: usize,
@@ -35,6 +38,10 @@ pub struct TrainerOptions {
     pub eval_every: u32,
     /// Bound on the windows kept in memory.
     pub cache_bytes: usize,
+    /// Whether to take what an earlier run left in the store, and to leave such (never where there is a cap in time).
+    pub resume: bool,
+    /// Wall seconds between two checkpoints of a task.
+    pub checkpoint_seconds: f64,
 }
 
 /// What the workers of one process know of a job together.
@@ -44,6 +51,8 @@ pub struct Shared {
     pub finished: Finished,
     /// A cap in wall time.
     pub cap: Option<Cap>,
+    /// Tasks that an earlier run had finished, or begun and left a checkpoint of.
+    pub resumed: AtomicU32,
 }
 
 /// Trains blocks on the CPU backend.
@@ -86,10 +95,38 @@ impl Execute for BlockTrainer {
         let capture = Arc::new(dataset::ingest::load_capture(&self.store, plan.capture).map_err(failed)?);
         let reader = WindowReader::new(capture.clone(), self.store.clone(), self.options.cache_bytes);
         let results = self.results(&plan, task, order)?;
-        let block = Block { trainer: self, order, plan: &plan, task, capture: &capture, reader: &reader };
+        let memory = self.options.resume.then(|| Memory::of(order)).filter(|_| self.shared.cap.is_none());
+        if let Some((artefact, splats)) = memory.as_ref().and_then(|memory| memory.result(&self.store)) {
+            self.shared.resumed.fetch_add(1, Ordering::Relaxed);
+            let psnr = Judge::new(&plan, &capture, &self.store).and_then(|mut judge| {
+                let finished = &self.shared.finished;
+                finished.learn(order.plan, &plan, &results);
+                finished.insert(order.plan, &plan, task.block, &splats);
+                let merged = finished.with(order.plan, &plan, task.block, &splats);
+                judge.psnr(&merged).map(|psnr| (psnr, merged.len() as u64))
+            });
+            let steps = task.steps.into();
+            // Nothing is left to stop.
+            let _ = report(Report {
+                step: steps,
+                steps,
+                loss: f64::NAN,
+                splats: splats.len() as u64,
+                cpu_seconds: stopwatch.cpu_seconds(),
+                wall_seconds: stopwatch.wall_seconds(),
+                psnr: psnr.map(|(psnr, _)| psnr),
+                merged_splats: psnr.map(|(_, count)| count),
+            });
+            return Ok(artefact);
+        }
+        let memory = memory.as_ref();
+        let block = Block { trainer: self, order, plan: &plan, task, capture: &capture, reader: &reader, memory };
         let splats = self.pool.install(|| block.train(results, &mut stopwatch, report))?;
         let artefact = self.store.put(frame::encode_splats(&splats)).map_err(failed)?;
         self.shared.cap.iter().for_each(|cap| cap.finish(order.task));
+        if let Some(memory) = memory {
+            memory.keep_result(&self.store, artefact);
+        }
         Ok(artefact)
     }
 }
@@ -117,6 +154,7 @@ struct Block<'a> {
     task: &'a Task,
     capture: &'a Arc<Capture>,
     reader: &'a WindowReader,
+    memory: Option<&'a Memory>,
 }
 
 impl Block<'_> {
@@ -127,7 +165,7 @@ impl Block<'_> {
         report: &mut (dyn FnMut(Report) -> Flow + Send),
     ) -> Result<Splats, ExecuteError> {
         let Self { plan, task, .. } = *self;
-        let Shared { finished, cap } = &*self.trainer.shared;
+        let Shared { finished, cap, .. } = &*self.trainer.shared;
         let eval_every = self.trainer.options.eval_every;
         let recipe = self.recipe();
         let views = self.windows(&task.views)?;
@@ -145,53 +183,99 @@ impl Block<'_> {
         let counts = |p: Vec3| plan.ground.owns(task.block, p.as_dvec3());
         let cut = task.context_cut();
         let keeps = |p: Vec3| self.trains(&cut, p.as_dvec3());
-        let mut job = train::Job {
+        let job_of = |initial, steps| train::Job {
             initial,
             context: context.as_ref(),
             views: &views,
             counts: &counts,
             keeps: &keeps,
             budget,
-            steps: task.steps,
+            steps,
             antialiased: plan.settings.antialiased,
             seed: self.seed(),
             size_bounds_metres: self.size_bounds_metres(),
             recipe: &recipe,
             source: self.reader,
         };
+        let pruning = self.pruning();
+        let mut job = job_of(initial, task.steps);
+        if pruning.is_some() {
+            job.steps = prune::steps_before(task.steps);
+        }
+        let planned = job.steps;
         let limit = cap.as_ref().map(|cap| {
             let evaluate = |splats: &Splats| stopwatch.paused(|| measure(splats));
-            Limit::of(cap, plan, self.order.task, &mut job, eval_every, evaluate)
+            let part = f64::from(planned) / f64::from(task.steps.max(1));
+            Limit::of(cap, plan, self.order.task, &mut job, part, eval_every, evaluate)
         });
+        let over = || limit.as_ref().is_some_and(Limit::is_over);
+        let trained = job.steps;
+        // In proportion, where the cap left fewer.
+        let whole = (u64::from(task.steps) * u64::from(trained)).div_ceil(u64::from(planned.max(1))) as u32;
+        let steps = trained + pruning.map_or(0, |pruning| pruning.steps(whole));
         let (mut cancelled, mut late) = (false, false);
-        let splats = train::train(job, &mut |now| {
-            late = now.step < now.steps && limit.as_ref().is_some_and(Limit::is_over);
-            let last = now.step == now.steps || late;
-            let evaluate = last || (eval_every > 0 && now.step.is_multiple_of(eval_every));
-            if !evaluate && !now.step.is_multiple_of(REPORT_EVERY) {
-                return train::Flow::Continue;
+        // Reports a step if one is due; whether to go on.
+        let mut tell = |step: u32, loss: f64, splats: &Splats, last: bool| -> bool {
+            let evaluate = last || (eval_every > 0 && step.is_multiple_of(eval_every));
+            if !evaluate && !step.is_multiple_of(REPORT_EVERY) {
+                return true;
             }
             let (cpu_seconds, wall_seconds) = (stopwatch.cpu_seconds(), stopwatch.wall_seconds());
-            let measured = if evaluate { stopwatch.paused(|| measure(now.splats)) } else { None };
+            let measured = if evaluate { stopwatch.paused(|| measure(splats)) } else { None };
             let flow = report(Report {
-                step: now.step.into(),
-                steps: now.steps.into(),
-                loss: now.loss,
-                splats: now.splats.len() as u64,
+                step: step.into(),
+                steps: steps.into(),
+                loss,
+                splats: splats.len() as u64,
                 cpu_seconds,
                 wall_seconds,
                 psnr: measured.map(|(psnr, _)| psnr),
                 merged_splats: measured.map(|(_, splats)| splats),
             });
             cancelled |= flow == Flow::Stop && !last;
-            if cancelled || late { train::Flow::Stop } else { train::Flow::Continue }
-        })
-        .map_err(|error| match error {
+            !cancelled
+        };
+        let going = |on: bool| if on { train::Flow::Continue } else { train::Flow::Stop };
+        let wrong = |error| match error {
             TrainError::NoViews | TrainError::Empty(_) => {
                 ExecuteError { message: format!("block {}: {error}", task.block), is_input: true }
             }
             TrainError::Source(_) => failed(error),
-        })?;
+        };
+        let (mut loss, mut stopped) = (f64::NAN, false);
+        let from = self.memory.and_then(|memory| memory.checkpoint(&self.trainer.store));
+        if from.is_some() {
+            self.trainer.shared.resumed.fetch_add(1, Ordering::Relaxed);
+        }
+        let clock = Stopwatch::start();
+        let mut next_checkpoint = self.trainer.options.checkpoint_seconds;
+        let mut splats = train::train_on(job, from, &mut |now| {
+            let (seconds, last) = (clock.wall_seconds(), now.step == now.steps);
+            // The last one is what pruning begins with.
+            if let Some(memory) = self.memory
+                && (seconds >= next_checkpoint || (last && seconds > 0.5 * next_checkpoint))
+            {
+                memory.keep_checkpoint(&self.trainer.store, now.state);
+                next_checkpoint = seconds + self.trainer.options.checkpoint_seconds;
+            }
+            late = now.step < now.steps && over();
+            loss = now.loss;
+            stopped = !tell(now.step, loss, now.splats, late || now.step == steps);
+            going(!stopped && !late)
+        })
+        .map_err(wrong)?;
+        if let Some(pruning) = pruning.filter(|_| !stopped && !late) {
+            let (pruned, outcome) = prune::within_tolerance(job_of(splats, whole), &pruning, &mut |now| {
+                late = over();
+                loss = now.loss;
+                // Once more at the end, with what pruning chose.
+                going(tell(trained + now.step.min(now.steps - 1), loss, now.splats, false) && !late)
+            })
+            .map_err(wrong)?;
+            tracing::info!(block = %task.block, before = outcome.splats[0], after = outcome.splats[1], "pruned");
+            splats = pruned;
+            tell(steps, loss, &splats, true);
+        }
         if cancelled {
             return Err(failed("stopped before its end, as asked"));
         }
@@ -230,6 +314,13 @@ impl Block<'_> {
         }
         let own = siblings.iter().position(|t| t.block == task.block).map_or(0, |i| counts[i]);
         (total * own / counts.iter().sum::<u64>().max(1)).max(1) as usize
+    }
+
+    /// Blocks without children are pruned: what lies above them, they replace.
+    fn pruning(&self) -> Option<Pruning> {
+        let tolerance_db = self.plan.settings.tolerance_db;
+        let is_leaf = self.plan.tasks.iter().all(|task| task.parent != Some(self.task.block));
+        (is_leaf && tolerance_db > 0.0).then(|| Pruning::within(tolerance_db))
     }
 
     /// The recipe of the block's level: a child starts from splats that fit already, one mip coarser.

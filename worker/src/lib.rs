@@ -13,6 +13,7 @@ mod attempt;
 pub mod cap;
 pub mod clock;
 pub mod execute;
+mod memory;
 mod merged;
 
 use std::collections::BTreeMap;

@@ -8,7 +8,7 @@ use ::bench::{CurvePoint, PartLine, append, append_part, read_folder, replace_ta
 use serde::Serialize;
 use store::Store;
 
-use crate::args::{BenchDemoArgs, ChartArgs, IngestArgs, ParetoArgs};
+use crate::args::{BenchDemoArgs, ChartArgs, IngestArgs, ParetoArgs, TrainArgs};
 use crate::cameras;
 use crate::clock::{self, Stopwatch};
 use crate::commands::demo;
@@ -28,7 +28,8 @@ const INGESTS: &str = "ingest.jsonl";
 /// Trains, measures the merged model, and appends a line.
 pub(crate) fn pareto(args: &ParetoArgs, output: &Output) -> Result<(), Failure> {
     let lpips = args.lpips.as_deref().map(Lpips::load).transpose()?;
-    let trained = train(&args.train, output)?;
+    // A line says what all of the work took.
+    let trained = train(&TrainArgs { fresh: true, ..args.train.clone() }, output)?;
     let store_url = args.train.store.clone().unwrap_or_else(|| args.train.out.join("store").display().to_string());
     let store = Store::open(&store_url)?.blocking();
     let out = args.train.out.join("eval");

@@ -113,8 +113,9 @@ fn settings(args: &DemoArgs) -> (CitySettings, TrainArgs) {
         plan: PlanOptions {
             blocks: Blocks::Tree,
             levels: Auto(Some(1)),
-            steps,
+            steps: Auto(Some(steps)),
             budget: Auto(Some(budget)),
+            tolerance_db: 0.1,
             seed: 0,
             antialiased: false,
             test_every: 8,
@@ -124,6 +125,8 @@ fn settings(args: &DemoArgs) -> (CitySettings, TrainArgs) {
         workers: 1,
         threads: Auto(None),
         eval_every: 0,
+        fresh: true,
+        checkpoint_every: 60.0,
         minutes: None,
     };
     (city, train)

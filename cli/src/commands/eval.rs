@@ -20,11 +20,13 @@ use crate::cameras;
 use crate::clock::{self, Stopwatch};
 use crate::commands::render::to_image;
 use crate::commands::train::{ingest_photos, make_folder};
+use crate::cuts::{self, CutFigures};
 use crate::failure::Failure;
 use crate::lpips::Lpips;
-use crate::model::{self, Model, save_json};
+use crate::model::{self, Model, Tree, save_json};
 use crate::output::Output;
 use crate::record::Record;
+use crate::seams::{self, SeamReport};
 
 /// Rows of a contact sheet at most; of more views, evenly many are shown.
 const SHEET_ROWS: usize = 24;
@@ -38,6 +40,12 @@ pub(crate) struct Evaluated {
     pub(crate) record: Record,
     pub(crate) sheet: PathBuf,
     pub(crate) views: Vec<Figures>,
+    /// With `--level` or `--budget`.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub(crate) cuts: Vec<CutFigures>,
+    /// With `--seams` or `--seams-of`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(crate) seams: Option<SeamReport>,
 }
 
 /// One held-out view.
@@ -56,6 +64,7 @@ pub(crate) struct Figures {
 pub(crate) fn run(args: &EvalArgs, output: &Output) -> Result<(), Failure> {
     let lpips = args.lpips.as_deref().map(Lpips::load).transpose()?;
     let model = model::read(&args.model)?;
+    let parts = Parts::read(args)?;
     let source = cameras::open(&args.capture, output)?;
     let (trained, default_every, default_downscale) = match &model.trained {
         Some((manifest, out)) => (Some(out.join("store")), manifest.test_every, manifest.downscale),
@@ -72,11 +81,57 @@ pub(crate) fn run(args: &EvalArgs, output: &Output) -> Result<(), Failure> {
     let ingested = ingest_photos(&source, &store.blocking(), downscale, output)?;
     let out = args.out.clone().unwrap_or_else(|| model.folder(&args.model, "eval"));
     let test_every = args.test_every.unwrap_or(default_every);
-    let mut evaluated = evaluate(&model, ingested.capture, store.blocking(), test_every, lpips.as_ref(), &out, output)?;
+    let capture = ingested.capture;
+    let mut evaluated = evaluate(&model, capture.clone(), store.blocking(), test_every, lpips.as_ref(), &out, output)?;
+    let held_out = held_out(&capture, test_every);
+    let reader = WindowReader::new(Arc::new(capture), store.blocking(), CACHE_BYTES);
+    if let Some(tree) = &parts.own {
+        evaluated.cuts = cuts::measure(tree, &parts.cuts, &reader, &held_out, output)?;
+    }
+    if let Some(tree) = parts.faces_of() {
+        let control = parts.other.as_ref().map(|_| (&model.splats, model.antialiased));
+        let ask = seams::Ask { tree, control, seam_metres: args.seam_metres, out: &out };
+        evaluated.seams = Some(seams::measure(&ask, &reader, &held_out, output)?);
+    }
     evaluated.record.scene = cameras::name_of(&args.capture);
     evaluated.record.downscale = downscale;
     save_json(&out.join("report.json"), &evaluated)?;
     output.result(&evaluated, &text(&evaluated))
+}
+
+/// What of models is looked at block by block.
+struct Parts {
+    /// MODEL, where it is.
+    own: Option<Tree>,
+    cuts: Vec<cuts::Ask>,
+    /// Whether its faces are looked at.
+    seams: bool,
+    /// The model of `--seams-of`.
+    other: Option<Tree>,
+}
+
+impl Parts {
+    fn read(args: &EvalArgs) -> Result<Self, BadInput> {
+        let other = args.seams_of.as_deref().map(model::read_tree).transpose()?;
+        let seams = args.seams || (args.seam_metres.is_some() && other.is_none());
+        let own = (seams || args.level.is_some() || args.budget.is_some()).then(|| model::read_tree(&args.model));
+        let own = own.transpose()?;
+        let cuts = own.as_ref().map_or(Ok(Vec::new()), |tree| cuts::asked(args, &tree.plan))?;
+        let parts = Self { own, cuts, seams, other };
+        if parts.faces_of().is_some_and(|tree| tree.plan.leaves().blocks().len() < 2) {
+            let path = args.seams_of.as_ref().unwrap_or(&args.model).display().to_string();
+            return Err(BadInput::new(
+                path,
+                "is one block and has no seams",
+                "give it with --seams-of a model that has",
+            ));
+        }
+        Ok(parts)
+    }
+
+    fn faces_of(&self) -> Option<&Tree> {
+        self.other.as_ref().or(self.own.as_ref().filter(|_| self.seams))
+    }
 }
 
 /// The figures as text, a line a view.
@@ -93,7 +148,18 @@ pub(crate) fn text(evaluated: &Evaluated) -> String {
         text += &line(&view.view, [view.psnr, Some(view.ssim), view.perceptual, view.lpips]);
     }
     text += &line("mean", [record.psnr, record.ssim, record.perceptual, record.lpips]);
+    if !evaluated.cuts.is_empty() {
+        text += &format!("\n{}\n", cuts::text(&evaluated.cuts));
+    }
+    if let Some(report) = &evaluated.seams {
+        text += &format!("\n{}\n\n", seams::text(report));
+    }
     text + &evaluated.sheet.display().to_string()
+}
+
+/// Indices of the views that are held out.
+fn held_out(capture: &Capture, test_every: u32) -> Vec<u32> {
+    (0..capture.views.len()).filter(|&i| Capture::is_test(i, test_every)).map(|i| i as u32).collect()
 }
 
 /// Draws every held-out view of an ingested capture and measures it; leaves the contact sheet under `out`.
@@ -106,8 +172,7 @@ pub(crate) fn evaluate(
     out: &Path,
     output: &Output,
 ) -> Result<Evaluated, Failure> {
-    let held_out: Vec<u32> =
-        (0..capture.views.len()).filter(|&i| Capture::is_test(i, test_every)).map(|i| i as u32).collect();
+    let held_out = held_out(&capture, test_every);
     if held_out.is_empty() {
         return Err(BadInput::new("--test-every", "holds out no view", "give a number from 1 to that of views").into());
     }
@@ -156,7 +221,7 @@ pub(crate) fn evaluate(
         peak_memory_bytes: clock::peak_memory_bytes(),
         ..Record::new("eval")
     };
-    Ok(Evaluated { record, sheet, views })
+    Ok(Evaluated { record, sheet, views, cuts: Vec::new(), seams: None })
 }
 
 /// Time that drawing took.
@@ -173,7 +238,7 @@ impl Drawing {
     }
 }
 
-fn measure(name: &str, colour: &[f32], photo: &Pixels, lpips: Option<&Lpips>) -> Result<Figures, Failure> {
+pub(crate) fn measure(name: &str, colour: &[f32], photo: &Pixels, lpips: Option<&Lpips>) -> Result<Figures, Failure> {
     let truth: Vec<f32> = photo.rgb.iter().map(|&value| f32::from(value) / 255.0).collect();
     let mut render: Vec<f32> = colour.iter().map(|value| value.clamp(0.0, 1.0)).collect();
     let psnr = metrics::psnr(&render, &truth, photo.mask.as_deref());
@@ -195,12 +260,12 @@ fn measure(name: &str, colour: &[f32], photo: &Pixels, lpips: Option<&Lpips>) ->
 }
 
 /// Mean of what there is.
-fn mean(values: impl Iterator<Item = Option<f64>>) -> Option<f64> {
-    let (sum, count) = values.flatten().fold((0.0, 0), |(sum, count), value| (sum + value, count + 1));
+pub(crate) fn mean(values: impl Iterator<Item = Option<f64>>) -> Option<f64> {
+    let (sum, count) = values.flatten().fold((0.0, 0u32), |(sum, count), value| (sum + value, count + 1));
     (count > 0).then(|| sum / f64::from(count))
 }
 
-fn photo_image(photo: &Pixels) -> RgbImage {
+pub(crate) fn photo_image(photo: &Pixels) -> RgbImage {
     let area = photo.area();
     RgbImage::from_fn(photo.width, photo.height, |x, y| {
         let at = y as usize * photo.width as usize + x as usize;

@@ -7,5 +7,6 @@ pub(crate) mod export;
 pub(crate) mod inspect;
 pub(crate) mod kernels;
 pub(crate) mod plan;
+pub(crate) mod prune;
 pub(crate) mod render;
 pub(crate) mod train;

@@ -50,7 +50,7 @@ pub(crate) fn run(args: &PlanArgs, output: &Output) -> Result<(), Failure> {
 pub(crate) fn plan_of(capture: &Capture, options: &PlanOptions) -> Result<(Capture, Plan), Failure> {
     let capture = cameras::shrunk(capture, options.downscale)?;
     let id = ArtefactId::of(&frame::encode(dataset::ingest::CAPTURE, &capture, &[]));
-    let settings = options.settings(capture.points.len());
+    let settings = options.settings(&capture);
     let plan = blocks::plan(&capture, id, &settings, &worker::execute::backend())?;
     Ok((capture, plan))
 }

@@ -4,6 +4,7 @@
 use std::fs;
 use std::path::Path;
 use std::sync::Arc;
+use std::sync::atomic::Ordering;
 
 use bench::CurvePoint;
 use blocks::{Plan, Severity};
@@ -51,6 +52,8 @@ pub(crate) struct Report {
     pub(crate) ingest_cpu_seconds: f64,
     /// Whether `--minutes` left fewer steps than planned, so that another run may give other bytes.
     pub(crate) capped: bool,
+    /// Tasks that an earlier run had finished or begun; their time is not in this report.
+    pub(crate) resumed: u32,
 }
 
 pub(crate) fn run(args: &TrainArgs, output: &Output) -> Result<(), Failure> {
@@ -86,7 +89,9 @@ pub(crate) fn train(args: &TrainArgs, output: &Output) -> Result<Trained, Failur
     let Ingested { capture, id: capture_id, .. } = ingested;
     let plan = Plan { capture: capture_id, ..plan };
     let mut resolved = args.clone();
-    (resolved.plan.budget.0, resolved.threads.0) = (Some(plan.settings.budget), Some(threads));
+    resolved.plan.budget.0 = Some(plan.settings.budget);
+    resolved.plan.steps.0 = Some(plan.settings.steps);
+    resolved.threads.0 = Some(threads);
     let (config_text, config_hash) = config::resolved(&resolved);
     save(&args.out.join("config.toml"), config_text.as_bytes())?;
     save_json(&args.out.join("plan.json"), &plan)?;
@@ -98,13 +103,24 @@ pub(crate) fn train(args: &TrainArgs, output: &Output) -> Result<Trained, Failur
     let cap = args.minutes.map(|minutes| cap_of(minutes, clock.clone(), &plan, args.workers));
     let shared = Arc::new(Shared { cap, ..Shared::default() });
     let metered = store.metered();
-    let options = TrainerOptions { threads: threads as usize, eval_every: args.eval_every, cache_bytes: CACHE_BYTES };
+    let options = TrainerOptions {
+        threads: threads as usize,
+        eval_every: args.eval_every,
+        cache_bytes: CACHE_BYTES,
+        resume: !args.fresh,
+        checkpoint_seconds: args.checkpoint_every,
+    };
     let trainers = (0..args.workers).map(|_| BlockTrainer::new(metered.blocking(), options, shared.clone()));
     let trainers = trainers.map(|trainer| trainer.map(Arc::new)).collect::<Result<_, _>>().map_err(Failure::Work)?;
     let outcome = train_blocks(trainers, &store, plan_id, &mut journal, output);
     let spent = journal.close()?;
     drop(progress);
     let results = outcome?;
+    let resumed = shared.resumed.load(Ordering::Relaxed);
+    if resumed > 0 {
+        output
+            .note(format!("{resumed} of {} tasks went on from an earlier run (--fresh begins anew)", plan.tasks.len()));
+    }
     let capped = shared.cap.as_ref().is_some_and(Cap::shortened);
     if capped {
         output.note("fewer steps than planned were taken to be done in time: another run may give other bytes");
@@ -140,6 +156,7 @@ pub(crate) fn train(args: &TrainArgs, output: &Output) -> Result<Trained, Failur
         antialiased: model.antialiased,
         ingest_cpu_seconds,
         capped,
+        resumed,
     };
     save_json(&args.out.join("report.json"), &report)?;
     Ok(Trained { capture, model, report, curve: spent.curve })

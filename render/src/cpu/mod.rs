@@ -8,6 +8,7 @@
 //! Every reduction runs in the order of the data, not of the threads, so results do not depend on their number.
 
 mod bin;
+mod contribute;
 mod project;
 mod project_backward;
 mod rasterize;
@@ -17,7 +18,7 @@ pub mod simd;
 use rayon::prelude::*;
 use scene::{Camera, Splats};
 
-use crate::{Frame, Gradients, Options, Upstream};
+use crate::{Contributions, Frame, Gradients, Options, Upstream};
 use bin::{Bins, SortScratch, TILE};
 use project::{Projected, View};
 use project_backward::Sink;
@@ -44,6 +45,7 @@ pub struct Renderer {
     rank: Vec<u32>,
     sums: Vec<Moments>,
     gradients: Gradients,
+    contributions: Contributions,
     frame: Frame,
     /// What the last `forward` drew, for `backward`.
     drawn: Option<(View, Options, usize)>,
@@ -71,6 +73,7 @@ impl Renderer {
             rank: Vec::new(),
             sums: Vec::new(),
             gradients: Gradients::default(),
+            contributions: Contributions::default(),
             frame: Frame::default(),
             drawn: None,
         }
@@ -189,46 +192,22 @@ impl Renderer {
     }
 
     fn rasterize_backward(&mut self, upstream: &Upstream) {
-        self.moments.resize(self.bins.pairs.len(), Moments::default());
-        let (bins, ranked, isa, frame) = (&self.bins, &self.ranked, self.isa, &self.frame);
-        // The pairs of a band of tiles lie together, so bands write disjoint slices.
-        let mut rest = self.moments.as_mut_slice();
-        let mut bands = Vec::with_capacity(bins.tiles_y);
-        for row in 0..bins.tiles_y {
-            let len = bins.start[(row + 1) * bins.tiles_x] - bins.start[row * bins.tiles_x];
-            let (band, after) = rest.split_at_mut(len as usize);
-            bands.push(band);
-            rest = after;
-        }
-        let visited = &self.visited;
-        bands.into_par_iter().enumerate().for_each(|(row, mut moments)| {
-            let band = BackwardBand::new(frame, upstream, row);
-            for column in 0..bins.tiles_x {
-                let tile = row * bins.tiles_x + column;
-                let pairs = &bins.pairs[bins.start[tile] as usize..bins.start[tile + 1] as usize];
-                let (out, after) = std::mem::take(&mut moments).split_at_mut(pairs.len());
-                moments = after;
-                let (visited_out, unseen) = out.split_at_mut(visited[tile] as usize);
-                unseen.fill(Moments::default());
-                let input = TileInput {
-                    ranked,
-                    pairs: &pairs[..visited_out.len()],
-                    x: column * TILE,
-                    y: row * TILE,
-                    width: frame.width,
-                    height: frame.height,
-                };
-                rasterize::rasterize_backward(isa, &input, &band, visited_out);
-            }
-        });
+        let (frame, isa) = (&self.frame, self.isa);
+        self.bins.for_each_tile(
+            &self.ranked,
+            &self.visited,
+            &mut self.moments,
+            frame.width,
+            frame.height,
+            |row, tile, out| {
+                rasterize::rasterize_backward(isa, tile, &BackwardBand::new(frame, upstream, row), out);
+            },
+        );
     }
 
     /// Adds up the pairs of each splat, in the order of its tiles.
     fn reduce(&mut self, count: usize) {
-        self.rank.resize(self.records.len(), 0);
-        for (rank, &i) in self.order.iter().enumerate() {
-            self.rank[i as usize] = rank as u32;
-        }
+        self.rank_splats();
         self.sums.resize(count, Moments::default());
         let (bins, seen, rank, moments) = (&self.bins, &self.seen, &self.rank, &self.moments);
         self.sums.par_chunks_mut(CHUNK).enumerate().for_each(|(chunk, sums)| {
@@ -247,6 +226,13 @@ impl Renderer {
                 *sum = Moments(total);
             }
         });
+    }
+
+    fn rank_splats(&mut self) {
+        self.rank.resize(self.records.len(), 0);
+        for (rank, &i) in self.order.iter().enumerate() {
+            self.rank[i as usize] = rank as u32;
+        }
     }
 
     fn project_backward(&mut self, splats: &Splats, view: &View, options: &Options) {
@@ -288,5 +274,43 @@ impl Renderer {
                 *total += part;
             }
         }
+    }
+}
+
+impl Bins {
+    /// Calls `work(row of tiles, tile, entries)` for every tile, in parallel over rows; entries that lie after the last pair
+    /// a tile visited are cleared.
+    fn for_each_tile(
+        &self,
+        ranked: &[Projected],
+        visited: &[u32],
+        moments: &mut Vec<Moments>,
+        width: usize,
+        height: usize,
+        work: impl Fn(usize, &TileInput, &mut [Moments]) + Sync,
+    ) {
+        moments.resize(self.pairs.len(), Moments::default());
+        // The pairs of a band of tiles lie together, so bands write disjoint slices.
+        let mut rest = moments.as_mut_slice();
+        let mut bands = Vec::with_capacity(self.tiles_y);
+        for row in 0..self.tiles_y {
+            let len = self.start[(row + 1) * self.tiles_x] - self.start[row * self.tiles_x];
+            let (band, after) = rest.split_at_mut(len as usize);
+            bands.push(band);
+            rest = after;
+        }
+        bands.into_par_iter().enumerate().for_each(|(row, mut moments)| {
+            for column in 0..self.tiles_x {
+                let tile = row * self.tiles_x + column;
+                let pairs = &self.pairs[self.start[tile] as usize..self.start[tile + 1] as usize];
+                let (out, after) = std::mem::take(&mut moments).split_at_mut(pairs.len());
+                moments = after;
+                let (out, unseen) = out.split_at_mut(visited[tile] as usize);
+                unseen.fill(Moments::default());
+                let pairs = &pairs[..out.len()];
+                let input = TileInput { ranked, pairs, x: column * TILE, y: row * TILE, width, height };
+                work(row, &input, out);
+            }
+        });
     }
 }

@@ -11,10 +11,10 @@ use super::simd::Lanes;
 use crate::{ALPHA_MAX, ALPHA_MIN, Frame, TRANSMITTANCE_MIN, Upstream, each, kernel};
 
 /// Blocks in a tile, lanes in a block.
-const BLOCKS: usize = 16;
+pub(crate) const BLOCKS: usize = 16;
 
 /// Sixteen blocks of sixteen pixels.
-type Plane = [[f32; 16]; BLOCKS];
+pub(crate) type Plane = [[f32; 16]; BLOCKS];
 
 /// Places of the moments in a pair's gradient; `v = dL/dα · α`, `w = α T`.
 pub(crate) mod moment {
@@ -75,7 +75,7 @@ impl TileInput<'_> {
     }
 
     #[inline(always)]
-    fn gather(&self, plane: &[f32], scale: f32, out: &mut Plane) {
+    pub(crate) fn gather(&self, plane: &[f32], scale: f32, out: &mut Plane) {
         if plane.is_empty() {
             return;
         }
@@ -95,7 +95,7 @@ impl TileInput<'_> {
 
     /// Transmittance one inside the image, zero outside: pixels that do not exist are finished from the start.
     #[inline(always)]
-    fn start(&self) -> (Plane, u32) {
+    pub(crate) fn start(&self) -> (Plane, u32) {
         let mut live = [[0.0; 16]; BLOCKS];
         self.runs(|block, lane, count, _| live[block][lane..lane + count].fill(1.0));
         let alive = live.iter().enumerate().fold(0, |mask, (b, lanes)| mask | (u32::from(lanes[0] > 0.0) << b));
@@ -104,15 +104,15 @@ impl TileInput<'_> {
 }
 
 /// α of sixteen pixels under a splat, zero where it is skipped; dx, dy from its mean; and the lanes where α is clamped.
-struct Alpha<L> {
-    alpha: L,
-    dx: L,
-    dy: L,
-    clamped: u16,
+pub(crate) struct Alpha<L> {
+    pub(crate) alpha: L,
+    pub(crate) dx: L,
+    pub(crate) dy: L,
+    pub(crate) clamped: u16,
 }
 
 /// A splat's record spread over lanes.
-struct Spread<L> {
+pub(crate) struct Spread<L> {
     a: L,
     b: L,
     c: L,
@@ -124,7 +124,7 @@ struct Spread<L> {
 impl<L: Lanes> Spread<L> {
     /// Relative to the tile's first pixel centre.
     #[inline(always)]
-    fn new(r: &[f32; 16], tile: &TileInput) -> Self {
+    pub(crate) fn new(r: &[f32; 16], tile: &TileInput) -> Self {
         Self {
             a: L::splat(r[at::A]),
             b: L::splat(r[at::B]),
@@ -136,7 +136,7 @@ impl<L: Lanes> Spread<L> {
     }
 
     #[inline(always)]
-    fn alpha(&self, block: usize, lane_x: L, lane_y: L) -> Alpha<L> {
+    pub(crate) fn alpha(&self, block: usize, lane_x: L, lane_y: L) -> Alpha<L> {
         let dx = lane_x + L::splat(self.x + (block % 4 * 4) as f32);
         let dy = lane_y + L::splat(self.y + (block / 4 * 4) as f32);
         let (u, v) = (self.a.fma(dx, self.b * dy), self.c * dy);
@@ -151,7 +151,7 @@ impl<L: Lanes> Spread<L> {
 
 /// Column and row of each lane in its block.
 #[inline(always)]
-fn lane_offsets<L: Lanes>() -> (L, L) {
+pub(crate) fn lane_offsets<L: Lanes>() -> (L, L) {
     (L::load(&std::array::from_fn(|i| (i % 4) as f32)), L::load(&std::array::from_fn(|i| (i / 4) as f32)))
 }
 

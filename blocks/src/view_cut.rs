@@ -1,0 +1,192 @@
+//! The cut a viewer shows: for one camera, the sharpest that a number of splats affords.
+
+use std::collections::{BTreeMap, BinaryHeap};
+
+use glam::{DVec2, DVec3};
+use scene::{BlockId, Camera, Splats};
+
+use crate::ground::{Ground, quantile};
+use crate::lod::Cut;
+use crate::plan::Plan;
+
+/// What a viewer has to know of a block before it loads it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Node {
+    /// Its splats in each child's core.
+    in_children: [usize; 4],
+    /// Between these heights are nearly all of them, ground metres.
+    heights: [f64; 2],
+}
+
+/// A tree of blocks as a viewer sees it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ViewTree {
+    ground: Ground,
+    /// Metres per pixel, by level.
+    rho_metres: Vec<f64>,
+    nodes: BTreeMap<BlockId, Node>,
+}
+
+impl ViewTree {
+    /// The tree of a plan and its results. Empty without a root: other plans have no levels.
+    pub fn new<'a>(plan: &Plan, results: impl IntoIterator<Item = (BlockId, &'a Splats)>) -> Self {
+        let (ground, rho_metres) = (plan.ground, plan.rho_metres.clone());
+        let node = |block: BlockId, splats: &Splats| {
+            let children = block.children();
+            let (mut in_children, mut heights) = ([0; 4], Vec::new());
+            for i in 0..splats.len() {
+                let place = splats.mean(i).as_dvec3();
+                if let Some(child) = children.iter().position(|&child| ground.owns(child, place)) {
+                    in_children[child] += 1;
+                    heights.push(ground.from_world(place).z);
+                }
+            }
+            Node { in_children, heights: [0.02, 0.98].map(|share| quantile(&mut heights, share)) }
+        };
+        let nodes: BTreeMap<_, _> = results.into_iter().map(|(block, splats)| (block, node(block, splats))).collect();
+        Self { ground, rho_metres, nodes: if nodes.contains_key(&BlockId::ROOT) { nodes } else { BTreeMap::new() } }
+    }
+
+    /// Pixels of this camera that a pixel of the block's own resolution covers where it comes nearest; 0 out of sight.
+    pub fn screen_error(&self, block: BlockId, camera: &Camera) -> f64 {
+        let (Some(node), Some(rho)) = (self.nodes.get(&block), self.rho_metres.get(usize::from(block.level))) else {
+            return 0.0;
+        };
+        let core = self.ground.core(block);
+        let (low, high) = (core.min.extend(node.heights[0]), core.max.extend(node.heights[1]));
+        let eye = self.ground.from_world(camera.centre());
+        if !self.sees(camera, low, high) {
+            return 0.0;
+        }
+        let distance = eye.distance(eye.clamp(low, high.max(low)));
+        rho * camera.pinhole.fx / distance.max(f64::from(f32::MIN_POSITIVE))
+    }
+
+    /// Divides, from the root, the block that shows the coarsest pixels, as long as no more than `budget` splats come to be
+    /// shown and until no pixel shows more than one of the model's. Never fewer than the root's. `None` without a tree.
+    pub fn cut(&self, camera: &Camera, budget: usize) -> Option<Cut> {
+        let mut shown: usize = self.nodes.get(&BlockId::ROOT)?.in_children.iter().sum();
+        let mut members = vec![BlockId::ROOT];
+        let mut open = BinaryHeap::from([Open(self.screen_error(BlockId::ROOT, camera), BlockId::ROOT)]);
+        while let Some(Open(error, block)) = open.pop() {
+            if error <= 1.0 {
+                break;
+            }
+            let node = self.nodes[&block];
+            let children =
+                || block.children().into_iter().enumerate().filter_map(|(k, b)| Some((k, b, self.nodes.get(&b)?)));
+            let more: usize = children().map(|(_, _, child)| child.in_children.iter().sum::<usize>()).sum();
+            let less: usize = children().map(|(k, ..)| node.in_children[k]).sum();
+            if shown - less + more > budget {
+                continue;
+            }
+            shown = shown - less + more;
+            for (_, child, _) in children() {
+                members.push(child);
+                open.push(Open(self.screen_error(child, camera), child));
+            }
+        }
+        Some(members.into_iter().collect())
+    }
+
+    /// May a box of the ground be in the picture? True for some that are not.
+    fn sees(&self, camera: &Camera, low: DVec3, high: DVec3) -> bool {
+        let k = &camera.pinhole;
+        let corners: [DVec3; 8] = std::array::from_fn(|i| {
+            let pick = |axis: usize| if i >> axis & 1 == 0 { low[axis] } else { high[axis] };
+            camera.camera_from_world.apply(self.ground.to_world(DVec3::new(pick(0), pick(1), pick(2))))
+        });
+        let (near, far) = (DVec2::new(k.cx / k.fx, k.cy / k.fy), DVec2::new(f64::from(k.width), f64::from(k.height)));
+        let far = far / DVec2::new(k.fx, k.fy) - near;
+        let planes: [&dyn Fn(&DVec3) -> bool; 5] =
+            [&|p| p.z > 0.0, &|p| p.x > -near.x * p.z, &|p| p.y > -near.y * p.z, &|p| p.x < far.x * p.z, &|p| {
+                p.y < far.y * p.z
+            }];
+        planes.iter().all(|inside| corners.iter().any(inside))
+    }
+}
+
+/// A block to divide, the coarsest first, ties to the lowest id.
+#[derive(Debug, PartialEq)]
+struct Open(f64, BlockId);
+
+impl Eq for Open {}
+
+impl Ord for Open {
+    fn cmp(&self, other: &Self) -> std::cmp::Ordering {
+        self.0.total_cmp(&other.0).then(other.1.cmp(&self.1))
+    }
+}
+
+impl PartialOrd for Open {
+    fn partial_cmp(&self, other: &Self) -> Option<std::cmp::Ordering> {
+        Some(self.cmp(other))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::Vec3;
+    use scene::{ArtefactId, Splat};
+
+    use super::*;
+    use crate::plan::{Mode, PlanSettings};
+    use crate::testing::{aerial, look, noise};
+
+    /// A plan of two levels, and for each block as many splats as its level says, halo included.
+    fn tree() -> (Plan, BTreeMap<BlockId, Splats>) {
+        let settings = PlanSettings { mode: Mode::Tree, levels: Some(2), ..PlanSettings::default() };
+        let plan = crate::plan(&aerial(8, 300.0, 8000), ArtefactId::of(b""), &settings, "cpu").unwrap();
+        let mut results = BTreeMap::new();
+        for task in &plan.tasks {
+            let halo = plan.ground.nominal_halo(task.block);
+            let mut splats = Splats::new(0);
+            for i in 0..200 {
+                let share = DVec2::new(noise(2 * i), noise(2 * i + 1));
+                let at = plan.ground.to_world((halo.min + share * (halo.max - halo.min)).extend(0.0));
+                splats.push(&Splat::round(at.as_vec3(), 0.0, Vec3::ONE, 0.5));
+            }
+            results.insert(task.block, splats);
+        }
+        (plan, results)
+    }
+
+    fn shown(cut: &Cut, plan: &Plan, results: &BTreeMap<BlockId, Splats>) -> usize {
+        results.iter().map(|(&block, splats)| cut.keep(splats, &plan.ground, block).len()).sum()
+    }
+
+    #[test]
+    fn budgets_are_kept_and_used_where_the_camera_looks() {
+        let (plan, results) = tree();
+        let tree = ViewTree::new(&plan, results.iter().map(|(&b, s)| (b, s)));
+        let centre = plan.ground.to_world(plan.ground.core(BlockId { level: 2, x: 0, y: 0 }).centre().extend(0.0));
+        let camera = look(centre + DVec3::Z * 20.0, centre, DVec3::Y);
+        let mut last = 0;
+        for budget in [0, 200, 700, 1500, 5000] {
+            let cut = tree.cut(&camera, budget).unwrap();
+            let now = shown(&cut, &plan, &results);
+            assert!(now <= budget.max(shown(&tree.cut(&camera, 0).unwrap(), &plan, &results)), "{now} of {budget}");
+            assert!(now >= last);
+            last = now;
+        }
+        let cut = tree.cut(&camera, 5000).unwrap();
+        let level_at = |at: DVec3| cut.owner_of(&plan.ground, at).unwrap().level;
+        assert_eq!(level_at(centre), 2, "near and in sight");
+        let opposite = plan.ground.to_world(plan.ground.core(BlockId { level: 2, x: 3, y: 3 }).centre().extend(0.0));
+        assert!(level_at(opposite) < 2, "out of sight");
+    }
+
+    #[test]
+    fn from_far_away_the_root_is_enough() {
+        let (plan, results) = tree();
+        let tree = ViewTree::new(&plan, results.iter().map(|(&b, s)| (b, s)));
+        let centre = plan.ground.to_world(plan.ground.core(BlockId::ROOT).centre().extend(0.0));
+        let camera = look(centre + DVec3::Z * 1e5, centre, DVec3::Y);
+        assert_eq!(tree.cut(&camera, usize::MAX).unwrap().blocks(), [BlockId::ROOT].into());
+        assert_eq!(
+            tree.screen_error(BlockId::ROOT, &look(centre + DVec3::Z * 1e3, centre + DVec3::Z * 2e3, DVec3::Y)),
+            0.0
+        );
+        assert!(ViewTree::new(&plan, []).cut(&camera, 10).is_none());
+    }
+}

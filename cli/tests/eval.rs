@@ -1,0 +1,85 @@
+//! `plat eval` of cuts and seams, as scripts see it.
+
+use std::path::Path;
+use std::process::{Command, Output};
+
+use dataset::synth::{CitySettings, write_city};
+use serde_json::Value;
+
+fn plat(folder: &Path, words: &[&str]) -> Output {
+    let program = env!("CARGO_BIN_EXE_plat");
+    Command::new(program).args(words).arg("--json").current_dir(folder).output().expect("plat runs")
+}
+
+fn done(folder: &Path, words: &[&str]) -> Value {
+    let output = plat(folder, words);
+    assert!(output.status.success(), "{words:?}: {}", String::from_utf8_lossy(&output.stderr));
+    let text = String::from_utf8(output.stdout).unwrap();
+    serde_json::from_str(text.lines().last().expect("an object on the last line")).unwrap()
+}
+
+fn refused(folder: &Path, words: &[&str], wanted: &str) {
+    let output = plat(folder, words);
+    let line = String::from_utf8(output.stderr).unwrap();
+    assert_eq!(output.status.code(), Some(2), "{words:?}: {line}");
+    assert!(line.contains(wanted) && line.trim_end().lines().count() == 1, "{words:?}: {line}");
+}
+
+#[test]
+fn cuts_and_seams_of_a_tree_are_measured() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    let settings = CitySettings { seed: 3, extent_metres: 80.0, views: 24, width: 96, height: 72 };
+    write_city(&at.join("city"), &settings, |_, _| {}).unwrap();
+    let train = |out: &str, blocks: &str| {
+        let options = ["--steps", "300", "--budget", "3000", "--levels", "1", "--threads", "1", "--tolerance-db", "0"];
+        done(at, &[&["train", "city", "--out", out, "--blocks", blocks][..], &options].concat())
+    };
+    train("tree", "tree");
+    train("whole", "whole");
+
+    let plain = done(at, &["eval", "tree", "city"]);
+    assert!(plain.get("cuts").is_none() && plain.get("seams").is_none());
+    let said = done(at, &["eval", "tree", "city", "--level", "all", "--budget", "1000000", "--seams"]);
+    let cuts = said["cuts"].as_array().unwrap();
+    let figure = |cut: usize, key: &str| cuts[cut][key].as_f64().unwrap_or(f64::NAN);
+    assert_eq!(cuts.len(), 3);
+    assert_eq!((&cuts[0]["level"], &cuts[1]["level"], &cuts[2]["budget"]), (&0.into(), &1.into(), &1_000_000.into()));
+    // The finest level is the model itself: it loses nothing, and as many of its splats are all of them.
+    assert_eq!([figure(1, "loss_db"), figure(1, "away_loss_db"), figure(1, "away_gain_db")], [0.0; 3]);
+    assert_eq!((&cuts[1]["full"]["psnr"], &cuts[1]["splats"]), (&said["psnr"], &said["splats"].as_f64().into()));
+    assert!(figure(0, "loss_db") > 0.1, "{}", figure(0, "loss_db"));
+    let [coarse, fine] = [0, 1].map(|cut| figure(cut, "away_mip"));
+    assert!(coarse > fine, "coarser pixels fit smaller pictures: {coarse} {fine}");
+    // Three ways to draw from afar, three results; which is best is for real scenes to say.
+    let away = |way: &str| cuts[0]["away"][way]["psnr"].as_f64().unwrap();
+    assert!(away("thinned") != away("classic") && away("antialiased") != away("classic"));
+    assert!(figure(0, "away_loss_db").is_finite() && figure(0, "away_gain_db").is_finite());
+
+    let seams = &said["seams"];
+    assert_eq!(seams["faces"].as_array().unwrap().len(), 4);
+    assert!(seams["seam_psnr"].is_f64() && seams["interior_psnr"].is_f64() && seams["of"].is_null());
+    assert!(seams["faces"][0]["jump"].as_f64().unwrap() > 0.0 && seams["faces"][0]["step"].is_f64());
+    let share = |key: &str| seams[key].as_f64().unwrap();
+    assert!(share("seam_share") > 0.01 && share("seam_share") < share("interior_share"));
+    for picture in ["seams.png", "seams_birdseye.png"] {
+        assert!(image::open(at.join("tree/eval").join(picture)).is_ok(), "{picture}");
+    }
+    assert_eq!(done(at, &["eval", "tree", "city", "--seams"])["seams"]["faces"], seams["faces"]);
+
+    // The same places of a model without faces.
+    let control = done(at, &["eval", "whole", "city", "--seams-of", "tree"]);
+    assert_eq!(control["seams"]["of"]["seam_psnr"], seams["seam_psnr"]);
+    assert_ne!(control["seams"]["seam_psnr"], seams["seam_psnr"]);
+    assert!(control["seams"]["faces_cost_db"].is_f64() && control["seams"]["faces"][0]["control_step"].is_f64());
+    let wide = done(at, &["eval", "tree", "city", "--seam-metres", "12"]);
+    assert!(wide["seams"]["seam_share"].as_f64().unwrap() > share("seam_share"));
+
+    refused(at, &["eval", "whole", "city", "--seams"], "--seams-of");
+    refused(at, &["eval", "tree", "city", "--level", "2"], "--level");
+    refused(at, &["eval", "tree", "city", "--level", "fine"], "--level");
+    refused(at, &["eval", "tree/merged.ply", "city", "--budget", "100"], "model.json");
+    for metres in ["0", "-1", "nan"] {
+        refused(at, &["eval", "tree", "city", &format!("--seam-metres={metres}")], "--seam-metres");
+    }
+}

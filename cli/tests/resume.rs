@@ -1,0 +1,68 @@
+//! A job that is killed goes on where it was, and ends with the same bytes.
+
+use std::path::Path;
+use std::process::{Command, Stdio};
+use std::time::Duration;
+
+use dataset::synth::{CitySettings, write_city};
+use serde_json::Value;
+
+const JOB: [&str; 10] =
+    ["train", "city", "--steps", "240", "--budget", "900", "--levels", "1", "--checkpoint-every", "0"];
+
+fn plat(at: &Path, words: &[&str]) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_plat"));
+    command.args(JOB).args(words).arg("--json").current_dir(at).stdout(Stdio::piped()).stderr(Stdio::null());
+    command
+}
+
+fn done(at: &Path, words: &[&str]) -> Value {
+    let output = plat(at, words).output().unwrap();
+    assert!(output.status.success(), "{words:?}");
+    serde_json::from_str(String::from_utf8(output.stdout).unwrap().lines().last().unwrap()).unwrap()
+}
+
+#[test]
+fn killed_five_times_the_bytes_are_the_same() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    let city = CitySettings { extent_metres: 80.0, views: 20, width: 64, height: 48, ..CitySettings::default() };
+    write_city(&at.join("city"), &city, |_, _| {}).unwrap();
+    let undisturbed = done(at, &["--out", "calm", "--threads", "1"]);
+    assert_eq!(undisturbed["resumed"], 0);
+
+    // Lines of a run's journal after which it is killed: within the root, within leaves, in between.
+    let mut kills = 0;
+    for (n, lines) in [2, 9, 1, 14, 5].into_iter().enumerate() {
+        let threads = ["1", "2"][n % 2];
+        let mut run = plat(at, &["--out", "killed", "--threads", threads]).spawn().unwrap();
+        let journal = at.join("killed/metrics.jsonl");
+        let _ = std::fs::remove_file(&journal);
+        loop {
+            let written = std::fs::read_to_string(&journal).map_or(0, |text| text.lines().count());
+            if run.try_wait().unwrap().is_some() {
+                break;
+            }
+            if written >= lines {
+                run.kill().unwrap();
+                run.wait().unwrap();
+                kills += 1;
+                break;
+            }
+            std::thread::sleep(Duration::from_millis(2));
+        }
+    }
+    assert!(kills >= 3, "{kills} kills found it at work");
+    let resumed = done(at, &["--out", "killed", "--threads", "2"]);
+    assert!(resumed["resumed"].as_u64() >= Some(1), "{resumed}");
+    let bytes = |path: &str| std::fs::read(at.join(path)).unwrap();
+    assert!(bytes("calm/merged.ply") == bytes("killed/merged.ply"), "a kill shows in the result");
+    assert_eq!(undisturbed["psnr"], resumed["psnr"]);
+
+    // All is there already, unless it is asked for anew.
+    let again = done(at, &["--out", "killed"]);
+    assert_eq!((&again["resumed"], &again["psnr"]), (&again["tasks"], &resumed["psnr"]));
+    let anew = done(at, &["--out", "killed", "--fresh"]);
+    assert_eq!((&anew["resumed"], &anew["psnr"]), (&0.into(), &resumed["psnr"]));
+    assert!(bytes("calm/merged.ply") == bytes("killed/merged.ply"));
+}

@@ -1,0 +1,109 @@
+//! What each splat means to a view, against renders with and without it.
+
+mod reference;
+
+use reference::{Random, camera};
+use render::cpu::Renderer;
+use render::{Contributions, Options};
+use scene::{Camera, Splats, column};
+
+const AREA: usize = 37 * 26;
+const OPTIONS: Options = Options { antialiased: false, sh_degree: 3, background: [0.2, 0.4, 0.1], extras: false };
+
+fn splats(seed: u64, count: usize) -> (Splats, Camera) {
+    let camera = camera(37, 26, 40.0);
+    let mut random = Random(seed);
+    let mut splats = Splats::new(1);
+    for _ in 0..count {
+        let pixel = [random.range(-4.0, 41.0), random.range(-4.0, 30.0)];
+        let (z, sigma) = (random.range(1.5, 6.0), random.range(0.6, 5.0));
+        splats.push(&random.splat(&camera, pixel, z, sigma));
+    }
+    (splats, camera)
+}
+
+/// What each pixel counts, 0 to 1.
+fn weights(seed: u64) -> Vec<f32> {
+    Random(seed).plane(AREA).iter().map(|value| value.abs().min(1.0)).collect()
+}
+
+fn contributions(splats: &Splats, context: Option<&Splats>, camera: &Camera, weights: &[f32]) -> Contributions {
+    let mut renderer = Renderer::default();
+    renderer.forward(splats, context, camera, &OPTIONS);
+    renderer.contributions(weights).clone()
+}
+
+#[test]
+fn energy_is_how_far_the_picture_is_from_that_without_the_splat() {
+    for seed in 1..4 {
+        let ((splats, camera), (context, _)) = (self::splats(seed, 40), self::splats(seed + 50, 10));
+        let weights = weights(seed);
+        let mut renderer = Renderer::default();
+        let mut draw = |splats: &Splats| renderer.forward(splats, Some(&context), &camera, &OPTIONS).colour.clone();
+        let all = draw(&splats);
+        let said = contributions(&splats, Some(&context), &camera, &weights).energy;
+        assert_eq!(said.len(), splats.len());
+        let mut strong = 0;
+        for i in 0..splats.len() {
+            let pairs = all.iter().zip(draw(&splats.filter(|k| k != i))).enumerate();
+            let energy: f64 = pairs.map(|(k, (a, b))| f64::from(weights[k % AREA]) * f64::from(a - b).powi(2)).sum();
+            assert!((energy - f64::from(said[i])).abs() < 1e-4 + 1e-3 * energy, "{seed} {i}: {energy} {}", said[i]);
+            strong += usize::from(energy > 0.1);
+        }
+        assert!(strong > 10, "the scene must be able to tell");
+    }
+}
+
+#[test]
+fn weights_add_up_to_what_is_covered() {
+    let ((splats, camera), weights) = (splats(7, 40), weights(7));
+    let said = contributions(&splats, None, &camera, &weights).weight;
+    let mut renderer = Renderer::default();
+    let rest = &renderer.forward(&splats, None, &camera, &OPTIONS).transmittance;
+    let covered: f64 = rest.iter().zip(&weights).map(|(rest, weight)| f64::from((1.0 - rest) * weight)).sum();
+    let sum: f64 = said.iter().map(|weight| f64::from(*weight)).sum();
+    assert!((sum / covered - 1.0).abs() < 1e-4, "{sum} {covered}");
+}
+
+#[test]
+fn squared_is_the_energy_with_the_falloff_taken_out() {
+    let ((splats, camera), weights) = (splats(8, 30), weights(8));
+    let mut checked = 0;
+    for i in 0..splats.len() {
+        let one = splats.filter(|k| k == i);
+        let said = contributions(&one, None, &camera, &weights);
+        let mut renderer = Renderer::default();
+        let rest = &renderer.forward(&one, None, &camera, &OPTIONS).transmittance;
+        let drawn = || rest.iter().zip(&weights).filter(|(rest, _)| **rest < 1.0);
+        let alphas: f64 = drawn().map(|(rest, weight)| f64::from(*weight) * f64::from(1.0 - rest).powi(2)).sum();
+        let counted: f64 = drawn().map(|(_, weight)| f64::from(*weight)).sum();
+        if counted < 1.0 {
+            continue;
+        }
+        let opacity = 1.0 / (1.0 + (-f64::from(one.col(column::OPACITY)[0])).exp());
+        let expected = f64::from(said.energy[0]) / alphas * opacity * opacity * counted;
+        assert!((f64::from(said.squared[0]) / expected - 1.0).abs() < 1e-3, "{i}: {} {expected}", said.squared[0]);
+        checked += 1;
+    }
+    assert!(checked > 10);
+}
+
+#[test]
+fn threads_do_not_change_a_bit_and_an_earlier_view_leaves_nothing() {
+    let (splats, camera) = splats(9, 200);
+    let run = |threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        pool.install(|| contributions(&splats, None, &camera, &[]))
+    };
+    let (one, three) = (run(1), run(3));
+    assert_eq!((&one.energy, &one.squared, &one.weight), (&three.energy, &three.squared, &three.weight));
+    assert!(one.energy.iter().any(|value| *value > 0.0));
+    let mut renderer = Renderer::default();
+    renderer.forward(&splats, None, &camera, &OPTIONS);
+    renderer.contributions(&[]);
+    let mut away = camera;
+    away.camera_from_world.translation.z -= 100.0;
+    renderer.forward(&splats, None, &away, &OPTIONS);
+    let nothing = renderer.contributions(&[]);
+    assert!(nothing.weight.iter().chain(&nothing.squared).chain(&nothing.energy).all(|value| *value == 0.0));
+}

@@ -1,0 +1,290 @@
+//! Pruning within a tolerance: as few splats as the views allow.
+//!
+//! ```text
+//! heal → importance → cut to `drop` below the floor (bisection) → heal: train on, no growth ── at the floor or above? ── yes → next round
+//!                                                                                        └ no → back, with half the drop
+//! at the end: cut to the floor itself, heal once more
+//! ```
+//! The floor is the PSNR after some healing without a cut, minus the tolerance: a model that was not trained to its end gets
+//! better by healing alone, and a cut that spent this as well cost views held out two to three times the tolerance. What a
+//! cut costs at once, healing mostly gives back, so cuts go deeper than the tolerance; no result is below it.
+
+use std::mem;
+
+use glam::Vec3;
+use scene::Splats;
+
+use crate::growth::Growth;
+use crate::importance::{Order, Shares, Views};
+use crate::{Flow, Job, Recipe, TrainError, TrainView, random, train};
+
+/// Views that a result is measured on, at most: of more, evenly many.
+const MEASURED_VIEWS: usize = 256;
+/// Views that a cut which is yet to heal is measured on.
+const PROBED_VIEWS: usize = 16;
+/// A round that cuts less than this share is the last.
+const WORTH: f64 = 0.01;
+
+/// Share of a job's steps that pruning takes where it is part of training.
+const SHARE: f32 = 0.4;
+
+/// Steps of training before pruning, of so many in all.
+pub fn steps_before(steps: u32) -> u32 {
+    (steps - (steps as f32 * SHARE) as u32).max(1)
+}
+
+/// How to prune.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Pruning {
+    /// Loss of PSNR on the job's own views, dB.
+    pub tolerance_db: f64,
+    /// What goes first.
+    pub order: Order,
+    /// Rounds of healing before the first cut.
+    pub warm_up: u32,
+    /// Rounds of cut and healing at most, before the last one.
+    pub rounds: u32,
+    /// Steps of healing in a round, as a share of those of the job.
+    pub healing: f32,
+    /// How far below the floor the first cut may go before healing, dB.
+    pub drop_db: f64,
+}
+
+impl Pruning {
+    /// The order and the rounds that measurements chose, at this tolerance. Fewer and longer rounds beat many short ones.
+    pub fn within(tolerance_db: f64) -> Self {
+        let (warm_up, rounds) = (1, 5);
+        let healing = SHARE / (warm_up + rounds + 1) as f32;
+        Self { tolerance_db, order: Order::Energy, warm_up, rounds, healing, drop_db: 0.5 }
+    }
+}
+
+/// What pruning did.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Pruned {
+    /// Splats that count: before, and now.
+    pub splats: [usize; 2],
+    /// PSNR on the job's views: before, and now, dB.
+    pub psnr: [f64; 2],
+    /// Rounds of cut and healing that were kept, without the last.
+    pub rounds: u32,
+}
+
+impl Pruning {
+    /// Steps of healing in all, at most, for a job of so many steps.
+    pub fn steps(&self, steps: u32) -> u32 {
+        (self.warm_up + self.rounds + 1) * self.round_steps(steps)
+    }
+
+    fn round_steps(&self, steps: u32) -> u32 {
+        ((steps as f32 * self.healing).ceil() as u32).max(1)
+    }
+}
+
+/// Where pruning stands.
+#[derive(Debug, Clone, Copy)]
+pub struct PruneProgress<'a> {
+    /// Steps of healing done, rounds that were not needed included.
+    pub step: u32,
+    /// Steps of healing in all, at most.
+    pub steps: u32,
+    /// Of the last step.
+    pub loss: f64,
+    /// The splats now.
+    pub splats: &'a Splats,
+}
+
+/// Is called after every step of healing; may stop the work, and then what was reached is the result.
+pub type Report<'a> = &'a mut dyn FnMut(PruneProgress) -> Flow;
+
+/// Prunes the splats that a job has trained, given as its `initial`, among those that it `counts`; the others only heal. The
+/// job's steps are those that it was trained with, its recipe the one whose last rates healing takes.
+///
+/// # Errors
+/// See [`TrainError`].
+pub fn within_tolerance(trained: Job, pruning: &Pruning, report: Report) -> Result<(Splats, Pruned), TrainError> {
+    let (pruner, mut best) = Pruner::new(trained, pruning)?;
+    let before = pruner.psnr(&best)?;
+    let owned = pruner.owned(&best);
+    // What healing alone gives is not the cut's to spend.
+    for round in 0..pruning.warm_up {
+        let Some(healed) = pruner.heal(best.clone(), round, report)? else {
+            let outcome = Pruned { splats: [owned; 2], psnr: [before, pruner.psnr(&best)?], rounds: 0 };
+            return Ok((best, outcome));
+        };
+        best = healed;
+    }
+    let mut reached = pruner.psnr(&best)?;
+    let floor = reached.max(before) - pruning.tolerance_db;
+    let (mut drop_db, mut kept_rounds, mut stopped) = (pruning.drop_db, 0, false);
+    for round in 0..pruning.rounds {
+        let cut = pruner.cut(&best, reached - floor + drop_db, &pruner.probed)?;
+        if ((best.len() - cut.len()) as f64) < WORTH * pruner.owned(&best) as f64 {
+            break;
+        }
+        let Some(healed) = pruner.heal(cut, pruning.warm_up + round, report)? else {
+            stopped = true;
+            break;
+        };
+        let psnr = pruner.psnr(&healed)?;
+        if psnr >= floor {
+            (best, reached, kept_rounds) = (healed, psnr, kept_rounds + 1);
+        } else {
+            drop_db *= 0.5;
+        }
+    }
+    if !stopped {
+        best = pruner.cut(&best, reached - floor, &pruner.measured)?;
+        // What healing gives back here the held-out views need: a cut that uses the tolerance up costs them more.
+        if let Some(healed) = pruner.heal(best.clone(), pruning.warm_up + pruning.rounds, report)?
+            && pruner.psnr(&healed)? >= floor
+        {
+            best = healed;
+        }
+    }
+    let outcome =
+        Pruned { splats: [owned, pruner.owned(&best)], psnr: [before, pruner.psnr(&best)?], rounds: kept_rounds };
+    Ok((best, outcome))
+}
+
+/// Keeps this share of the splats that a job has trained and counts, and heals once; else as [`within_tolerance`].
+///
+/// # Errors
+/// See [`TrainError`].
+pub fn to_share(trained: Job, pruning: &Pruning, share: f64, report: Report) -> Result<(Splats, Pruned), TrainError> {
+    let (pruner, splats) = Pruner::new(trained, &Pruning { warm_up: 0, rounds: 0, ..*pruning })?;
+    let before = [pruner.owned(&splats) as f64, pruner.psnr(&splats)?];
+    let importance = pruner.all.importance(pruning.order, &splats)?;
+    let cut = keep(&splats, &importance, share, pruner.job.counts);
+    let healed = if cut.is_empty() { None } else { pruner.heal(cut.clone(), 0, report)? }.unwrap_or(cut);
+    let psnr = [before[1], pruner.psnr(&healed)?];
+    let outcome = Pruned { splats: [before[0] as usize, pruner.owned(&healed)], psnr, rounds: 1 };
+    Ok((healed, outcome))
+}
+
+/// The most important splats among those that `counts`, this share of them, and all the others; rows keep their order.
+pub fn keep(splats: &Splats, importance: &[f64], share: f64, counts: &(dyn Fn(Vec3) -> bool + Sync)) -> Splats {
+    let order = ranking(splats, importance, counts);
+    let count = (order.len() as f64 * share.clamp(0.0, 1.0)).round() as usize;
+    without(splats, &order[..order.len() - count])
+}
+
+/// Rows of the splats that count, the least important first; of equals the later.
+fn ranking(splats: &Splats, importance: &[f64], counts: &(dyn Fn(Vec3) -> bool + Sync)) -> Vec<u32> {
+    let mut rows: Vec<u32> = (0..splats.len() as u32).filter(|&i| counts(splats.mean(i as usize))).collect();
+    rows.sort_by(|&a, &b| importance[a as usize].total_cmp(&importance[b as usize]).then(b.cmp(&a)));
+    rows
+}
+
+fn without(splats: &Splats, rows: &[u32]) -> Splats {
+    let mut gone = vec![false; splats.len()];
+    rows.iter().for_each(|&i| gone[i as usize] = true);
+    splats.filter(|i| !gone[i])
+}
+
+/// A job whose splats are pruned.
+struct Pruner<'a> {
+    /// Without its splats, with the healing's steps.
+    job: Job<'a>,
+    recipe: Recipe,
+    pruning: Pruning,
+    all: Views<'a>,
+    measured: Gauge,
+    probed: Gauge,
+}
+
+/// Views to measure on, and what their pixels count: as the splats before explain them.
+struct Gauge {
+    views: Vec<TrainView>,
+    shares: Shares,
+}
+
+impl Gauge {
+    fn new(all: &Views, count: usize, splats: &Splats) -> Result<Self, TrainError> {
+        let views = all.some(count);
+        let shares = Views { views: &views, ..*all }.shares(splats)?;
+        Ok(Self { views, shares })
+    }
+
+    fn psnr(&self, all: &Views, splats: &Splats) -> Result<f64, TrainError> {
+        Views { views: &self.views, ..*all }.psnr(splats, &self.shares)
+    }
+}
+
+impl<'a> Pruner<'a> {
+    fn new(mut job: Job<'a>, pruning: &Pruning) -> Result<(Self, Splats), TrainError> {
+        if job.views.is_empty() {
+            return Err(TrainError::NoViews);
+        }
+        let splats = mem::replace(&mut job.initial, Splats::new(0));
+        job.steps = pruning.round_steps(job.steps);
+        let all = Views { views: job.views, context: job.context, antialiased: job.antialiased, source: job.source };
+        let measured = Gauge::new(&all, MEASURED_VIEWS, &splats)?;
+        let probed = Gauge::new(&all, PROBED_VIEWS, &splats)?;
+        Ok((Self { recipe: healing(job.recipe), pruning: *pruning, all, measured, probed, job }, splats))
+    }
+
+    fn owned(&self, splats: &Splats) -> usize {
+        (0..splats.len()).filter(|&i| (self.job.counts)(splats.mean(i))).count()
+    }
+
+    fn psnr(&self, splats: &Splats) -> Result<f64, TrainError> {
+        self.measured.psnr(&self.all, splats)
+    }
+
+    /// As few splats as lose at most so much PSNR on the gauge's views, to half a percent of their number.
+    fn cut(&self, splats: &Splats, loss_db: f64, gauge: &Gauge) -> Result<Splats, TrainError> {
+        let floor = gauge.psnr(&self.all, splats)? - loss_db;
+        let importance = self.all.importance(self.pruning.order, splats)?;
+        let order = ranking(splats, &importance, self.job.counts);
+        // With `low` removed it is good, with `high` it is not.
+        let (mut low, mut high) = (0, order.len());
+        let mut best = splats.clone();
+        while high - low > 1 + order.len() / 200 {
+            let middle = (low + high) / 2;
+            let cut = without(splats, &order[..middle]);
+            if gauge.psnr(&self.all, &cut)? >= floor {
+                (low, best) = (middle, cut);
+            } else {
+                high = middle;
+            }
+        }
+        Ok(best)
+    }
+
+    /// Trains on without growth; `None` if the work was stopped.
+    fn heal(&self, cut: Splats, round: u32, report: Report) -> Result<Option<Splats>, TrainError> {
+        let steps = self.job.steps;
+        let job = Job {
+            budget: cut.len(),
+            initial: cut,
+            seed: random::bits(self.job.seed, u64::from(round) + 1),
+            recipe: &self.recipe,
+            ..self.job
+        };
+        let mut stopped = false;
+        let healed = train(job, &mut |now| {
+            let (step, steps) = (round * steps + now.step, (self.pruning.warm_up + self.pruning.rounds + 1) * steps);
+            let flow = report(PruneProgress { step, steps, loss: now.loss, splats: now.splats });
+            stopped |= flow == Flow::Stop;
+            flow
+        })?;
+        Ok((!stopped).then_some(healed))
+    }
+}
+
+/// Training's last steps once more, a little warmer at first, without growth.
+fn healing(recipe: &Recipe) -> Recipe {
+    let again = |[_, last]: [f32; 2]| [last * 2.5, last * 0.3];
+    Recipe {
+        mean: again(recipe.mean),
+        log_scale: again(recipe.log_scale),
+        quat: again(recipe.quat),
+        opacity: again(recipe.opacity),
+        sh_dc: again(recipe.sh_dc),
+        sh_from: [0.0; 3],
+        coarse: Vec::new(),
+        growth: Growth { every: u32::MAX / 2, ..recipe.growth },
+        ..recipe.clone()
+    }
+}

@@ -1,0 +1,53 @@
+//! What earlier runs left of a task: its result, or a checkpoint on the way.
+//!
+//! A task's result is a function of its plan and its inputs, so their hash is its name, and whoever finds the name need not
+//! train. Both are records that appear whole or not at all; one that is damaged, or cannot be written, is as none.
+
+use scene::{ArtefactId, Splats, frame};
+use store::BlockingStore;
+use train::State;
+
+use crate::TaskOrder;
+
+/// Names of what is remembered of a task.
+#[derive(Debug)]
+pub(crate) struct Memory {
+    result: String,
+    checkpoint: String,
+}
+
+impl Memory {
+    pub(crate) fn of(order: &TaskOrder) -> Self {
+        let inputs: Vec<String> = order.inputs.iter().map(|(task, id)| format!("{task}={id}")).collect();
+        let key = ArtefactId::of(format!("{}/{}/{}", order.plan, order.task, inputs.join(",")).as_bytes());
+        Self { result: format!("results/{key}"), checkpoint: format!("checkpoints/{key}") }
+    }
+
+    pub(crate) fn result(&self, store: &BlockingStore) -> Option<(ArtefactId, Splats)> {
+        let id = ArtefactId(store.get_name(&self.result).ok()??.as_ref().try_into().ok()?);
+        let splats = frame::decode_splats(&store.get(id).ok()?).ok()?;
+        Some((id, splats))
+    }
+
+    pub(crate) fn keep_result(&self, store: &BlockingStore, id: ArtefactId) {
+        kept(store.put_name(&self.result, id.0.to_vec()));
+        // Its room is worth more than it is.
+        if store.get_name(&self.checkpoint).is_ok_and(|found| found.is_some_and(|bytes| !bytes.is_empty())) {
+            kept(store.put_name(&self.checkpoint, Vec::new()));
+        }
+    }
+
+    pub(crate) fn checkpoint(&self, store: &BlockingStore) -> Option<State> {
+        State::from_frame(&store.get_name(&self.checkpoint).ok()??).ok()
+    }
+
+    pub(crate) fn keep_checkpoint(&self, store: &BlockingStore, state: &State) {
+        kept(store.put_name(&self.checkpoint, state.to_frame()));
+    }
+}
+
+fn kept(outcome: Result<(), store::StoreError>) {
+    if let Err(error) = outcome {
+        tracing::warn!("what was reached is not kept: {error}");
+    }
+}
