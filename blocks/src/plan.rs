@@ -14,6 +14,9 @@ pub const PLAN: Kind = Kind(*b"plan", VERSION);
 /// The deepest level a plan may have: 65,536 blocks a side.
 pub const MAX_LEVELS: u8 = 16;
 
+/// No image is wider or higher, in pixels.
+const MAX_SIDE: u32 = 1 << 24;
+
 /// How the scene is divided. All three share everything below the plan.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
@@ -184,8 +187,13 @@ impl Plan {
             if !task.context.iter().chain(&task.parent).chain([&task.block]).all(in_tree) || !sane(&task.rho_metres) {
                 return bad(format!("whose task {} is not in its tree", task.block));
             }
-            if task.views.iter().chain(&task.test_views).any(|v| v.mip > 31 || v.window.area() == 0) {
-                return bad(format!("whose task {} has an empty window", task.block));
+            let window = |v: &ViewUse| {
+                let Rect { x, y, width, height } = v.window;
+                let inside = |at: u32, length: u32| length > 0 && at.max(length) <= MAX_SIDE;
+                v.mip > 31 || !inside(x, width) || !inside(y, height)
+            };
+            if task.views.iter().chain(&task.test_views).any(window) {
+                return bad(format!("whose task {} has a window that is empty or in no image", task.block));
             }
         }
         if self.tasks.is_empty() || !self.tasks.is_sorted_by(|a, b| training_order(a.block) < training_order(b.block)) {

@@ -114,7 +114,9 @@ pub fn ingest(
 /// Not in the store, damaged, or not a capture.
 pub fn load_capture(store: &BlockingStore, id: ArtefactId) -> Result<Capture, IngestError> {
     let bytes = store.get(id)?;
-    let (capture, _) = frame::decode(CAPTURE, &bytes)
+    let capture =
+        frame::decode(CAPTURE, &bytes).and_then(|(capture, _): (Capture, _)| capture.check().map(|()| capture));
+    let capture = capture
         .map_err(|error| BadInput::new(format!("artefact {id}"), error.to_string(), "ingest the capture again"))?;
     Ok(capture)
 }

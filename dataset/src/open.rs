@@ -203,6 +203,7 @@ fn photo(root: &Root, posed: &Posed, masks: &[&str], options: &OpenOptions) -> R
         Found::File(path) => path,
         Found::Missing => {
             let Some((width, height)) = posed.intrinsics.size.filter(|_| options.cameras_only) else { return Ok(None) };
+            files::check_size(&root.path(&posed.file), width, height)?;
             let model = posed.intrinsics.model(width, height);
             return Ok(Some(Photo { path: root.path(&posed.file), mask: None, model, width, height }));
         }
@@ -267,10 +268,18 @@ fn views(posed: &[Posed], photos: &[Photo]) -> Result<Vec<View>, BadInput> {
     posed.iter().zip(photos).map(view).collect()
 }
 
+/// The largest file that says where a capture lies.
+const INFO_BYTES: u64 = 1 << 20;
+
 /// From OpenSfM's `reference_lla.json`, or the `gps_origin_lat_lon_alt` of an `info.json`.
 fn geo_origin(root: &Root) -> Result<Option<GeoOrigin>, BadInput> {
     let json = |name: &str| -> Result<Option<(String, serde_json::Value)>, BadInput> {
         let Some(path) = root.file(name) else { return Ok(None) };
+        // As values, JSON takes many times its length.
+        if path.metadata().is_ok_and(|data| data.len() > INFO_BYTES) {
+            let problem = format!("is larger than {} MB, which no such file is", INFO_BYTES >> 20);
+            return Err(BadInput::new(files::show(&path), problem, "correct or remove the file"));
+        }
         Ok(serde_json::from_slice(&files::read(&path)?).ok().map(|value| (files::show(&path), value)))
     };
     let reference = match json("reference_lla.json")? {

@@ -10,6 +10,11 @@ use scene::CodecError;
 /// What a decoder may allocate beyond the pixels.
 const DECODER_BYTES: u64 = 64 << 20;
 
+/// Pixels that any file may claim, and how many more for each of its bytes: photos have over a quarter of a bit for each
+/// pixel. More is a decompression bomb, or a header that lies: pixels are allocated before the first is decoded.
+const FREE_PIXELS: u64 = 8 << 20;
+const PIXELS_PER_BYTE: u64 = 32;
+
 /// The largest file that can be a photo of this size: 16 bytes a pixel, and room for what cameras append.
 pub(crate) fn file_limit(width: u32, height: u32) -> u64 {
     DECODER_BYTES + 16 * u64::from(width) * u64::from(height)
@@ -30,6 +35,10 @@ pub(crate) struct Photograph {
 /// # Errors
 /// Not such an image, of another size than its camera's, damaged or cut short.
 pub(crate) fn decode(bytes: &[u8], width: u32, height: u32) -> Result<Photograph, CodecError> {
+    if u64::from(width) * u64::from(height) > FREE_PIXELS + PIXELS_PER_BYTE * bytes.len() as u64 {
+        let length = bytes.len();
+        return Err(CodecError::new(format!("claims {width}×{height} pixels, which {length} bytes cannot hold")));
+    }
     let image = open(bytes, width, height)?;
     if !image.color().has_alpha() {
         return Ok(Photograph { rgb: image.into_rgb8().into_raw(), mask: None });
@@ -173,5 +182,9 @@ pub(crate) mod tests {
         let mut bytes = encoded(texture(10, 10), ImageFormat::Png);
         bytes[16..24].copy_from_slice(&[0, 0, 0xff, 0xff, 0, 0, 0xff, 0xff]);
         assert!(decode(&bytes, 10, 10).is_err());
+        // As large as its camera, who believes the header where the capture says no size: still not allocated.
+        bytes[16..24].copy_from_slice(&[0, 0, 0x3f, 0xff, 0, 0, 0x3f, 0xff]);
+        let refused = decode(&bytes, 0x3fff, 0x3fff).unwrap_err().to_string();
+        assert!(refused.contains("claims 16383×16383 pixels"), "{refused}");
     }
 }

@@ -4,6 +4,7 @@ use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
 use crate::camera::Camera;
+use crate::error::CodecError;
 use crate::ids::ArtefactId;
 
 /// WGS84 origin of the capture's local east-north-up frame.
@@ -74,6 +75,42 @@ pub struct Capture {
 }
 
 impl Capture {
+    /// Refuses captures whose numbers would make other functions meaningless, whoever wrote them.
+    ///
+    /// # Errors
+    /// What is out of range.
+    pub fn check(&self) -> Result<(), CodecError> {
+        for view in &self.views {
+            let (k, bad) = (&view.camera.pinhole, |what| Err(CodecError::new(format!("view {:?} {what}", view.name))));
+            let finite = [k.fx, k.fy, k.cx, k.cy].iter().all(|v| v.is_finite());
+            if !finite || k.fx <= 0.0 || k.fy <= 0.0 || k.width == 0 || k.height == 0 {
+                return bad("has a camera of no pixels, or without positive focal lengths");
+            }
+            if !view.camera.camera_from_world.is_sane() {
+                return bad("has a pose that is not finite or no rotation");
+            }
+            if view.mips.len() > 32 {
+                return bad("has more mips than an image can have");
+            }
+        }
+        let SparsePoints { positions, colours, track_start, seen_by } = &self.points;
+        if colours.len() != positions.len() || !positions.iter().all(|p| p.is_finite()) {
+            return Err(CodecError::new("sparse points are not finite, or have not a colour each"));
+        }
+        let tracks = match track_start.as_slice() {
+            [] => seen_by.is_empty(),
+            [first, .., last] => *first == 0 && *last as usize == seen_by.len() && track_start.is_sorted(),
+            [only] => *only == 0 && seen_by.is_empty(),
+        };
+        if !tracks || !(track_start.is_empty() || track_start.len() == positions.len() + 1) {
+            return Err(CodecError::new("tracks do not fit the sparse points"));
+        }
+        if seen_by.iter().any(|&view| view as usize >= self.views.len()) {
+            return Err(CodecError::new("a track names a view that is not there"));
+        }
+        Ok(())
+    }
+
     /// True for the views that are held out: every `test_every`-th by name order, starting with the first.
     pub fn is_test(index: usize, test_every: u32) -> bool {
         test_every > 0 && index.is_multiple_of(test_every as usize)

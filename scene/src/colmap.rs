@@ -189,7 +189,8 @@ fn image(id: u32, pose: [f64; 7], camera_id: u32, name: &str) -> Result<ColmapIm
     let rotation = DQuat::from_xyzw(x, y, z, w);
     let translation = DVec3::new(tx, ty, tz);
     let length = rotation.length();
-    let wrong = |what| CodecError::new(format!("image {id} ('{}') {what}", name.escape_debug()));
+    let wrong =
+        |what| CodecError::new(format!("image {id} ('{}') {what}", name.escape_debug().take(120).collect::<String>()));
     if name.is_empty() {
         return Err(CodecError::new(format!("image {id} has no name")));
     }

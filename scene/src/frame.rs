@@ -52,7 +52,8 @@ pub fn decode<T: DeserializeOwned>(kind: Kind, bytes: &[u8]) -> Result<(T, &[u8]
     }
     let header_len = word(12) as usize;
     let bulk_len = u64::from_le_bytes(bytes[16..24].try_into().expect("eight bytes"));
-    if header_len > HEADER_LIMIT || (PREFIX + header_len) as u64 + bulk_len != bytes.len() as u64 {
+    let length = bulk_len.checked_add((PREFIX + header_len) as u64);
+    if header_len > HEADER_LIMIT || length != Some(bytes.len() as u64) {
         return Err(CodecError::new(format!("'{name}' frame is cut short or padded")));
     }
     let (header, bulk) = bytes[PREFIX..].split_at(header_len);
@@ -131,5 +132,8 @@ mod tests {
             assert!(decode_splats(&damaged).is_err(), "flip at {at} went unseen");
         }
         assert!(decode_splats(&bytes[..bytes.len() - 1]).is_err());
+        let mut endless = bytes;
+        endless[16..24].fill(0xff);
+        assert!(decode_splats(&endless).unwrap_err().0.contains("cut short"));
     }
 }

@@ -136,7 +136,11 @@ pub fn read(bytes: &[u8]) -> Result<(Splats, bool), CodecError> {
 /// A splat that is not finite or lies further than 8,388 km from the origin, or four billion splats.
 pub fn write(splats: &Splats, antialiased: bool, version: Version) -> Result<Vec<u8>, CodecError> {
     if let Some(row) = (0..splats.len()).find(|&i| !splats.is_finite(i)) {
-        return Err(CodecError::new(format!("splat {row} is not finite")));
+        let all = (row..splats.len()).filter(|&i| !splats.is_finite(i)).count();
+        return Err(CodecError::new(format!(
+            "splat {row} has numbers that are not finite ({all} of {} splats have), which SPZ cannot hold",
+            splats.len()
+        )));
     }
     let count = u32::try_from(splats.len()).map_err(|_| CodecError::new("more splats than SPZ can count"))?;
     let farthest = splats.columns()[..3].iter().flatten().fold(0.0f64, |far, &v| far.max(f64::from(v).abs()));

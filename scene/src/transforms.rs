@@ -115,13 +115,14 @@ pub fn read(bytes: &[u8]) -> Result<Transforms, CodecError> {
     if file.frames.is_empty() {
         return Err(CodecError::new("transforms.json has no frames"));
     }
+    let shared = file.lens();
     let mut frames = Vec::with_capacity(file.frames.len());
     for frame in file.frames {
         let named = |problem: String| {
             let name: String = frame.file_path.chars().take(120).collect();
             CodecError::new(format!("frame {name:?}: {problem}"))
         };
-        let intrinsics = frame.lens.over(&file.lens).resolve().map_err(named)?;
+        let intrinsics = frame.lens().over(&shared).resolve().map_err(named)?;
         let camera_from_world = pose(&frame.transform_matrix).map_err(named)?;
         frames.push(Frame { file_path: frame.file_path, mask_path: frame.mask_path, intrinsics, camera_from_world });
     }
@@ -131,14 +132,11 @@ pub fn read(bytes: &[u8]) -> Result<Transforms, CodecError> {
 /// The file, with all intrinsics in the frames; numbers that are not finite become `null`, which [`read`] refuses or
 /// takes for absent.
 pub fn write(transforms: &Transforms) -> Vec<u8> {
-    let frames = transforms.frames.iter().map(|frame| FileFrame {
-        file_path: frame.file_path.clone(),
-        mask_path: frame.mask_path.clone(),
-        lens: Lens::of(&frame.intrinsics),
-        transform_matrix: matrix(&frame.camera_from_world),
+    let frames = transforms.frames.iter().map(|frame| {
+        let (file_path, mask_path) = (frame.file_path.clone(), frame.mask_path.clone());
+        FileFrame::new(file_path, mask_path, Lens::of(&frame.intrinsics), matrix(&frame.camera_from_world))
     });
-    let file =
-        File { lens: Lens::default(), ply_file_path: transforms.ply_file_path.clone(), frames: frames.collect() };
+    let file = File::new(Lens::default(), transforms.ply_file_path.clone(), frames.collect());
     serde_json::to_vec_pretty(&file).expect("text and numbers always serialise")
 }
 
@@ -178,32 +176,52 @@ fn matrix(camera_from_world: &Rigid) -> Vec<[f64; 4]> {
     rows
 }
 
-/// The file as JSON.
-#[derive(Serialize, Deserialize)]
-struct File {
-    #[serde(flatten)]
-    lens: Lens,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    ply_file_path: Option<String>,
-    frames: Vec<FileFrame>,
-}
-
-#[derive(Serialize, Deserialize)]
-struct FileFrame {
-    file_path: String,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    mask_path: Option<String>,
-    #[serde(flatten)]
-    lens: Lens,
-    transform_matrix: Vec<[f64; 4]>,
-}
-
+/// The keys of the file and of its frames, each with those of [`Lens`] among its own. Not by `serde(flatten)`: that keeps
+/// every value that nobody asked for, at many times its length in the file.
 macro_rules! lens {
     ($($field:ident: $type:ty),* $(,)?) => {
-        /// The keys that a frame shares with the top of the file.
-        #[derive(Default, Clone, Serialize, Deserialize)]
-        struct Lens {
+        /// The file as JSON.
+        #[derive(Serialize, Deserialize)]
+        struct File {
             $(#[serde(skip_serializing_if = "Option::is_none")] $field: Option<$type>,)*
+            #[serde(skip_serializing_if = "Option::is_none")]
+            ply_file_path: Option<String>,
+            frames: Vec<FileFrame>,
+        }
+
+        #[derive(Serialize, Deserialize)]
+        struct FileFrame {
+            file_path: String,
+            #[serde(skip_serializing_if = "Option::is_none")]
+            mask_path: Option<String>,
+            $(#[serde(skip_serializing_if = "Option::is_none")] $field: Option<$type>,)*
+            transform_matrix: Vec<[f64; 4]>,
+        }
+
+        /// The keys that a frame shares with the top of the file.
+        #[derive(Default, Clone)]
+        struct Lens {
+            $($field: Option<$type>,)*
+        }
+
+        impl File {
+            fn new(lens: Lens, ply_file_path: Option<String>, frames: Vec<FileFrame>) -> Self {
+                Self { $($field: lens.$field,)* ply_file_path, frames }
+            }
+
+            fn lens(&self) -> Lens {
+                Lens { $($field: self.$field.clone(),)* }
+            }
+        }
+
+        impl FileFrame {
+            fn new(file_path: String, mask_path: Option<String>, lens: Lens, transform_matrix: Vec<[f64; 4]>) -> Self {
+                Self { file_path, mask_path, $($field: lens.$field,)* transform_matrix }
+            }
+
+            fn lens(&self) -> Lens {
+                Lens { $($field: self.$field.clone(),)* }
+            }
         }
 
         impl Lens {

@@ -6,6 +6,10 @@ use std::path::{Component, Path, PathBuf};
 use image::ImageReader;
 use scene::BadInput;
 
+use crate::mips;
+
+/// Pixels of the longest side of a photo: as many as a JPEG can have.
+const LONGEST_SIDE: u32 = 65_535;
 /// Extensions that are tried where a capture names images without one.
 const EXTENSIONS: [&str; 6] = ["png", "jpg", "jpeg", "PNG", "JPG", "JPEG"];
 
@@ -84,7 +88,20 @@ pub(super) fn image_size(path: &Path) -> Result<(u32, u32), BadInput> {
         BadInput::new(show(path), problem, "replace the file or take its image out of the capture")
     };
     let reader = ImageReader::open(path).and_then(ImageReader::with_guessed_format).map_err(|e| cannot(&e))?;
-    reader.into_dimensions().map_err(|e| cannot(&e))
+    let (width, height) = reader.into_dimensions().map_err(|e| cannot(&e))?;
+    check_size(path, width, height)?;
+    Ok((width, height))
+}
+
+/// Refuses sizes that no photo has: whoever walks along the border of one, or allocates for it, relies on this.
+pub(super) fn check_size(path: &Path, width: u32, height: u32) -> Result<(), BadInput> {
+    let area = u64::from(width) * u64::from(height);
+    if area == 0 || area > mips::PIXEL_LIMIT || width.max(height) > LONGEST_SIDE {
+        let most = mips::PIXEL_LIMIT;
+        let problem = format!("claims {width}×{height} pixels: none, over {LONGEST_SIDE} a side or over {most} in all");
+        return Err(BadInput::new(show(path), problem, "replace the file or take its image out of the capture"));
+    }
+    Ok(())
 }
 
 /// All bytes of a file.

@@ -1,0 +1,459 @@
+//! Files of every codec: the real ones of `../shared/data`, where that is there, and what plat's own writers make.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use dataset::ingest::{self, IngestOptions};
+use dataset::open::{self, OpenOptions};
+use dataset::{mips, synth};
+use glam::{DQuat, DVec3, Vec3};
+use image::{DynamicImage, ImageFormat, Rgb, RgbImage, Rgba, RgbaImage};
+use scene::frame::{self, Kind};
+use scene::transforms::{Frame, Intrinsics, Transforms};
+use scene::{CameraModel, Capture, CodecError, Pixels, Rect, Rigid, Splat, Splats};
+use scene::{colmap, kitti360, npy, opensfm, ply, spz, transforms};
+use store::Store;
+
+/// A reader of files.
+pub(crate) struct Reader {
+    /// The fuzz target (`fuzz/fuzz_targets`) that the file is a seed of; empty if none.
+    pub(crate) target: &'static str,
+    call: Box<Call>,
+}
+
+type Call = dyn Fn(&[u8]) -> Result<(), String>;
+type Read = Arc<Reader>;
+
+impl Reader {
+    fn new(target: &'static str, call: impl Fn(&[u8]) -> Result<(), String> + 'static) -> Read {
+        Arc::new(Self { target, call: Box::new(call) })
+    }
+
+    /// Reads the bytes and checks that what comes out is what the reader promises; one line if it refuses them.
+    pub(crate) fn read(&self, bytes: &[u8]) -> Result<(), String> {
+        (self.call)(bytes)
+    }
+}
+
+/// What keeps damage from getting further than a checksum, and is made to fit again most of the time.
+#[derive(Clone, Copy, PartialEq)]
+pub(crate) enum Seal {
+    None,
+    /// A frame of plat: its checksum.
+    Frame,
+    /// gzip: what is inside is damaged.
+    Gzip,
+    /// PNG: the checksum of each chunk.
+    Png,
+}
+
+/// What reading may take, bytes: `base` and `factor` times the file.
+#[derive(Clone, Copy)]
+pub(crate) struct Budget {
+    pub(crate) factor: usize,
+    pub(crate) base: usize,
+}
+
+const PLAIN: Budget = Budget { factor: 16, base: 16 << 20 };
+/// SPZ is compressed; its reader's own bound on what a file can hold.
+const COMPRESSED: Budget = Budget { factor: 20, base: 34 << 20 };
+/// A photo's pixels several times over; what it may claim is bounded by `photo::FREE_PIXELS`.
+const PHOTO: Budget = Budget { factor: 0, base: 256 << 20 };
+
+pub(crate) struct Seed {
+    pub(crate) name: String,
+    pub(crate) bytes: Vec<u8>,
+    pub(crate) reader: Read,
+    pub(crate) seal: Seal,
+    pub(crate) budget: Budget,
+}
+
+/// All seeds, in the same order in every run.
+pub(crate) fn seeds() -> Vec<Seed> {
+    let mut corpus = Corpus(Vec::new());
+    corpus.written();
+    match shared() {
+        Some(data) => corpus.real(&data),
+        None => println!("skipped the real files: ../shared/data not present"),
+    }
+    corpus.0
+}
+
+struct Corpus(Vec<Seed>);
+
+impl Corpus {
+    fn put(&mut self, name: &str, bytes: Vec<u8>, read: &Read, seal: Seal, budget: Budget) {
+        self.0.push(Seed { name: name.into(), bytes, reader: Arc::clone(read), seal, budget });
+    }
+
+    fn plain(&mut self, name: &str, bytes: impl Into<Vec<u8>>, read: &Read) {
+        self.put(name, bytes.into(), read, Seal::None, PLAIN);
+    }
+
+    fn photo(&mut self, name: &str, bytes: Vec<u8>, read: &Read) {
+        let seal = if bytes.starts_with(b"\x89PNG") { Seal::Png } else { Seal::None };
+        self.put(name, bytes, read, seal, PHOTO);
+    }
+
+    /// From `../shared/data`; a file that is not there any more is a failure.
+    fn real(&mut self, data: &Path) {
+        let read = |name: &str| fs::read(data.join(name)).unwrap_or_else(|error| panic!("{name}: {error}"));
+        let [cameras, images, points] = colmap_binary();
+        for capture in ["building_sceaux", "street_lund", "fox/opencv_270", "drive_kitti_odom_1"] {
+            for (name, codec) in [("cameras", &cameras), ("images", &images), ("points3D", &points)] {
+                let name = format!("{capture}/sparse/0/{name}.bin");
+                self.plain(&name, read(&name), codec);
+            }
+        }
+        for (name, codec) in ["cameras", "images", "points3D"].into_iter().zip(&colmap_text()) {
+            let name = format!("drive_kitti_sfnd_lidar/sparse/0/{name}.txt");
+            let bytes = read(&name);
+            // The first lines alone too, without the comments that count them: small files go through more cases.
+            let lines = bytes.split_inclusive(|&b| b == b'\n').filter(|line| !line.starts_with(b"#"));
+            self.plain(&format!("{name} (head)"), lines.take(100).collect::<Vec<_>>().concat(), codec);
+            self.plain(&name, bytes, codec);
+        }
+        let model = read("splats/inria_style_ply/point_cloud/iteration_7000/point_cloud.ply");
+        let splats = ply::read(&model).expect("the real model is read");
+        let some = splats.select(&(0..splats.len().min(400) as u32).collect::<Vec<_>>());
+        self.plain("inria point_cloud.ply", model, &ply_codec());
+        self.plain("inria point_cloud.ply (400 splats)", ply::write(&some, &["antialiased"]), &ply_codec());
+        for version in [spz::Version::V2, spz::Version::V3] {
+            let bytes = spz::write(&some, true, version).expect("the real model is finite");
+            self.put(&format!("inria as {version:?} spz"), bytes, &spz_codec(), Seal::Gzip, COMPRESSED);
+        }
+        self.plain("guitar.compressed.ply", read("splats/playcanvas/guitar.compressed.ply"), &ply_codec());
+        self.put("biker.spz", read("splats/playcanvas/biker.spz"), &spz_codec(), Seal::Gzip, COMPRESSED);
+        let scan = read("drive_kitti_sfnd_lidar/lidar_frontal/0000000010.bin");
+        self.plain("0000000010.bin (Velodyne)", scan, &kitti_codecs()[4]);
+
+        let source = open::open(&data.join("fox/opencv_270"), &OpenOptions::default()).expect("the fox opens");
+        let frames = source.capture.views.iter().zip(&source.photos).map(|(view, photo)| Frame {
+            file_path: format!("images/{}", view.name),
+            mask_path: None,
+            intrinsics: Intrinsics::from_model(&photo.model, Some((photo.width, photo.height))),
+            camera_from_world: view.camera.camera_from_world,
+        });
+        let file = Transforms { frames: frames.collect(), ply_file_path: Some("points.ply".into()) };
+        self.plain("the fox's transforms.json", transforms::write(&file), &transforms_codec());
+        let capture = frame::encode(ingest::CAPTURE, &source.capture, &[]);
+        self.put("the fox as a capture", capture, &capture_codec(), Seal::Frame, PLAIN);
+
+        let photo = photo_codec(false);
+        for name in [
+            "fox/opencv_270/images/0001.jpg",
+            "fox/pinhole_270/images/0001.png",
+            "street_lund/images/01.jpg",
+            "splats/playcanvas/playbot/6_0/quats.webp",
+            "drive_radiate_fog/Navtech_Polar/000001.png",
+        ] {
+            self.photo(name, read(name), &photo);
+        }
+    }
+
+    fn written(&mut self) {
+        let folder = tempfile::tempdir().expect("a folder");
+        let city = synth::CitySettings { seed: 3, extent_metres: 90.0, views: 24, width: 48, height: 32 };
+        synth::write_city(folder.path(), &city, |_, _| ()).expect("a city");
+        for (name, codec) in ["cameras", "images", "points3D"].into_iter().zip(&colmap_binary()) {
+            let bytes = fs::read(folder.path().join(format!("sparse/0/{name}.bin"))).expect("the city has it");
+            self.plain(&format!("city {name}.bin"), bytes, codec);
+        }
+        let [cameras, images, points] = colmap_text();
+        self.plain("cameras.txt", "# Number of cameras: 1\n1 OPENCV 48 32 40 41 24 16 0.1 -0.01 0 0\n", &cameras);
+        self.plain(
+            "images.txt",
+            "# c\n1 1 0 0 0 0.5 0 2 1 a b.png\n1 2 -1 3 4 7\n2 0.5 0.5 0.5 0.5 0 0 2 1 c.png\n\n",
+            &images,
+        );
+        self.plain("points3D.txt", "# c\n1 0.5 1e-3 -7 255 0 9 0.1 1 0 2 1\n7 1 2 3 4 5 6 7\n", &points);
+
+        let source = open::open(folder.path(), &OpenOptions::default()).expect("the city opens");
+        let frames = (source.capture.views.iter().zip(&source.photos).enumerate()).map(|(i, (view, photo))| Frame {
+            file_path: format!("images/{}", view.name),
+            mask_path: (i == 1).then(|| "masks/a.png".to_string()),
+            intrinsics: Intrinsics::from_model(&lens(i, &photo.model), (i % 2 == 0).then_some((48, 32))),
+            camera_from_world: view.camera.camera_from_world,
+        });
+        let file = Transforms { frames: frames.take(6).collect(), ply_file_path: None };
+        self.plain("transforms.json", transforms::write(&file), &transforms_codec());
+        self.plain("reconstruction.json", RECONSTRUCTION, &opensfm_codec());
+        let [perspective, cam_to_pose, cam_to_velo, poses, scan] = kitti_codecs();
+        self.plain("perspective.txt", PERSPECTIVE, &perspective);
+        self.plain("calib_cam_to_pose.txt", CAM_TO_POSE, &cam_to_pose);
+        self.plain("calib_cam_to_velo.txt", "0 0 1 0 -1 0 0 0 0 -1 0 -0.5\n", &cam_to_velo);
+        self.plain("poses.txt", POSES, &poses);
+        let floats = |n: usize| (0..n).flat_map(|i| (i as f32 * 0.7 - 9.0).to_le_bytes()).collect::<Vec<u8>>();
+        self.plain("scan.bin", floats(400), &scan);
+
+        for degree in [0, 3] {
+            let mut splats = Splats::new(degree);
+            (0..200).for_each(|i| splats.push(&splat(i)));
+            self.plain("splats.ply", ply::write(&splats, &["a comment"]), &ply_codec());
+            for version in [spz::Version::V2, spz::Version::V3] {
+                let bytes = spz::write(&splats, degree == 0, version).expect("they are finite");
+                self.put("splats.spz", bytes, &spz_codec(), Seal::Gzip, COMPRESSED);
+            }
+            self.put("splat columns", frame::encode_splats(&splats), &splats_codec(), Seal::Frame, PLAIN);
+        }
+        self.plain("packed.compressed.ply", packed(), &ply_codec());
+        self.plain("cloud.ply", CLOUD, &cloud_codec());
+        let [shape, data] = [vec![7, 3], vec![]];
+        let numbers: Vec<f32> = (0..21).map(|i| i as f32).collect();
+        self.plain("array.npy", npy::write_f32(&shape, &numbers), &npy_codec());
+        self.plain("scalar.npy", npy::write_f32(&data, &[1.0]), &npy_codec());
+
+        self.put("capture", frame::encode(ingest::CAPTURE, &source.capture, &[]), &capture_codec(), Seal::Frame, PLAIN);
+        let settings = blocks::PlanSettings { levels: Some(2), budget: 1000, ..Default::default() };
+        let id = scene::ArtefactId::of(b"city");
+        let plan = blocks::plan(&source.capture, id, &settings, "cpu").expect("a city can be planned");
+        self.put("plan", plan.to_frame(), &plan_codec(), Seal::Frame, PLAIN);
+        let bytes = (0..3 * 150 * 140).map(|i| (i * 7 / 11) as u8).collect();
+        let pixels = Pixels { width: 150, height: 140, rgb: bytes, mask: None };
+        self.plain("mip", mips::encode(&pixels).expect("an image"), &mip_codec());
+
+        let [photo, mask] = [photo_codec(false), photo_codec(true)];
+        let image = RgbImage::from_fn(200, 100, |x, y| Rgb([(x * 5) as u8, (y * 3) as u8, (x ^ y) as u8]));
+        for format in [ImageFormat::Jpeg, ImageFormat::Png, ImageFormat::Tiff, ImageFormat::WebP] {
+            self.photo(&format!("photo, {format:?}"), encoded(image.clone(), format), &photo);
+        }
+        let alpha = RgbaImage::from_fn(200, 100, |x, y| Rgba([x as u8, y as u8, 9, (x + y) as u8]));
+        self.photo("photo with alpha", encoded(alpha, ImageFormat::Png), &photo);
+        self.photo("mask", encoded(DynamicImage::from(image).to_luma8(), ImageFormat::Png), &mask);
+    }
+}
+
+fn encoded(image: impl Into<DynamicImage>, format: ImageFormat) -> Vec<u8> {
+    let mut bytes = std::io::Cursor::new(Vec::new());
+    image.into().write_to(&mut bytes, format).expect("an image is encoded");
+    bytes.into_inner()
+}
+
+fn shared() -> Option<PathBuf> {
+    let root = std::env::var_os("PLAT_SHARED")
+        .map_or_else(|| PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/../../shared")), PathBuf::from);
+    Some(root.join("data")).filter(|data| data.is_dir())
+}
+
+fn lens(i: usize, model: &CameraModel) -> CameraModel {
+    let [fx, fy, cx, cy] = model.focal_and_centre();
+    match i % 3 {
+        0 => *model,
+        1 => CameraModel::FullOpenCv([fx, fy, cx, cy, 0.1, 0.01, 0.001, 0.002, 0.3, 0.1, 0.1, 0.1]),
+        _ => CameraModel::OpenCvFisheye([fx, fy, cx, cy, 0.1, 0.01, 0.001, 0.002]),
+    }
+}
+
+fn splat(i: u32) -> Splat {
+    let at = Vec3::new(i as f32 * 0.3, (i * i % 17) as f32, -3.0);
+    let mut splat = Splat::round(at, -2.0, Vec3::new(0.2, 0.5, 0.9), 0.7);
+    splat.quat = [0.1, 0.9, i as f32 * 0.01, -0.3];
+    splat.sh[(i % 16) as usize] = [0.1, -0.2, 0.3];
+    splat
+}
+
+/// 300 splats as PlayCanvas packs them, with SH of degree 1.
+fn packed() -> Vec<u8> {
+    let mut text = "ply\nformat binary_little_endian 1.0\nelement chunk 2\n".to_string();
+    for end in ["min", "max"] {
+        for axis in ["x", "y", "z", "scale_x", "scale_y", "scale_z", "r", "g", "b"] {
+            text += &format!("property float {end}_{axis}\n");
+        }
+    }
+    text += "element vertex 300\nproperty uint packed_position\nproperty uint packed_rotation\n\
+             property uint packed_scale\nproperty uint packed_color\nelement sh 300\n";
+    (0..9).for_each(|k| text += &format!("property uchar f_rest_{k}\n"));
+    let mut bytes = (text + "end_header\n").into_bytes();
+    bytes.extend((0..2 * 18).flat_map(|i| (i as f32).to_le_bytes()));
+    bytes.extend((0..300u32 * 4).flat_map(|i| i.wrapping_mul(2_654_435_761).to_le_bytes()));
+    bytes.extend((0..300 * 9).map(|i| i as u8));
+    bytes
+}
+
+/// A refusal in one line, or a promise that was kept.
+fn codec<T: 'static>(target: &'static str, read: fn(&[u8]) -> Result<T, CodecError>, kept: fn(T) -> bool) -> Read {
+    Reader::new(target, move |bytes| {
+        let value = read(bytes).map_err(|error| error.to_string())?;
+        assert!(kept(value), "accepted what it promises to refuse");
+        Ok(())
+    })
+}
+
+fn camera_is_sane(model: &CameraModel, width: u32, height: u32) -> bool {
+    let finite = model.focal_and_centre().iter().chain(&model.distortion()).all(|v| v.is_finite());
+    finite && model.focal_and_centre()[..2].iter().all(|f| *f > 0.0) && width > 0 && height > 0
+}
+
+fn colmap_binary() -> [Read; 3] {
+    let images: fn(&[u8]) -> _ = |bytes| {
+        let keypoints = colmap::read_keypoints_bin(bytes);
+        colmap::read_images_bin(bytes).inspect(|_| assert!(keypoints.is_ok()))
+    };
+    [
+        codec("colmap_binary", colmap::read_cameras_bin, |c| {
+            c.values().all(|c| camera_is_sane(&c.model, c.width, c.height))
+        }),
+        codec("colmap_binary", images, |i| i.iter().all(|i| i.camera_from_world.is_sane() && !i.name.is_empty())),
+        codec("colmap_binary", colmap::read_points_bin, points_are_sane),
+    ]
+}
+
+fn colmap_text() -> [Read; 3] {
+    [
+        codec("colmap_text", colmap::read_cameras_txt, |c| {
+            c.values().all(|c| camera_is_sane(&c.model, c.width, c.height))
+        }),
+        codec("colmap_text", colmap::read_images_txt, |i| {
+            i.iter().all(|i| i.camera_from_world.is_sane() && !i.name.is_empty())
+        }),
+        codec("colmap_text", colmap::read_points_txt, points_are_sane),
+    ]
+}
+
+fn points_are_sane(points: colmap::ColmapPoints) -> bool {
+    points.positions.iter().all(|p| p.is_finite())
+        && (0..points.len()).map(|i| points.track(i).len()).sum::<usize>() == points.track_images.len()
+}
+
+fn transforms_codec() -> Read {
+    codec("transforms", transforms::read, |file| {
+        let sane = |frame: &Frame| {
+            let (width, height) = frame.intrinsics.size.unwrap_or((40, 30));
+            frame.intrinsics.model(width, height);
+            frame.camera_from_world.is_sane() && width > 0 && height > 0
+        };
+        file.frames.iter().all(sane) && transforms::read(&transforms::write(&file)).is_ok()
+    })
+}
+
+fn opensfm_codec() -> Read {
+    codec("opensfm", opensfm::read, |sfm| {
+        sfm.shots
+            .iter()
+            .all(|s| s.camera_from_world.is_sane() && camera_is_sane(&s.camera.model, s.camera.width, s.camera.height))
+            && sfm.positions.iter().all(|p| p.is_finite())
+            && sfm.colours.len() == sfm.positions.len()
+    })
+}
+
+fn kitti_codecs() -> [Read; 5] {
+    [
+        codec("kitti360", kitti360::read_perspective, |c| {
+            c.values().all(|c| camera_is_sane(&c.model, c.width, c.height))
+        }),
+        codec("kitti360", kitti360::read_cam_to_pose, |poses| poses.values().all(Rigid::is_sane)),
+        codec("kitti360", kitti360::read_cam_to_velo, |pose| pose.is_sane()),
+        codec("kitti360", kitti360::read_poses, |poses| poses.values().all(Rigid::is_sane)),
+        codec("kitti360", |bytes| kitti360::read_scan(bytes, 1), |points| points.iter().all(|p| p.is_finite())),
+    ]
+}
+
+fn ply_codec() -> Read {
+    let both: fn(&[u8]) -> _ = |bytes| {
+        ply::comments(bytes);
+        ply::read(bytes)
+    };
+    codec("ply", both, |splats| splats.columns().iter().all(|c| c.len() == splats.len()))
+}
+
+fn cloud_codec() -> Read {
+    codec("ply", ply::read_points, |(points, colours)| {
+        points.len() == colours.len() && points.iter().all(|p| p.is_finite())
+    })
+}
+
+fn spz_codec() -> Read {
+    codec("spz", spz::read, |(splats, _)| (0..splats.len()).all(|i| splats.is_finite(i)))
+}
+
+fn splats_codec() -> Read {
+    codec("frames", frame::decode_splats, |splats| splats.columns().iter().all(|c| c.len() == splats.len()))
+}
+
+fn npy_codec() -> Read {
+    codec("npy", npy::read_f32, |(shape, data)| shape.iter().product::<usize>() == data.len())
+}
+
+fn plan_codec() -> Read {
+    codec("frames", blocks::Plan::from_frame, |plan| {
+        plan.leaves();
+        plan.tasks.iter().all(|task| {
+            task.window_pixels();
+            task.context_cut();
+            plan.ground.halo(task.block);
+            plan.task(task.block).is_some()
+        })
+    })
+}
+
+/// Through the store, as programs do; then what they ask of a capture.
+fn capture_codec() -> Read {
+    let store = Store::open("memory://").expect("memory").blocking();
+    Reader::new("frames", move |bytes| {
+        let kind: Kind = ingest::CAPTURE;
+        frame::decode::<Capture>(kind, bytes).map_err(|error| error.to_string())?;
+        let id = store.put(bytes.to_vec()).expect("memory takes it");
+        let capture = ingest::load_capture(&store, id).map_err(|error| error.to_string())?;
+        let settings = blocks::PlanSettings { budget: 1000, ..Default::default() };
+        // Whether there is a plan is not asked, as the numbers may be wild.
+        let _ = blocks::plan(&capture, id, &settings, "cpu").map_err(|error| error.to_string())?;
+        Ok(())
+    })
+}
+
+fn mip_codec() -> Read {
+    Reader::new("", |bytes| {
+        let layout = mips::Layout { width: 150, height: 140, masked: false };
+        let index = layout.index(bytes.get(..layout.index_len()).unwrap_or(bytes)).map_err(|e| e.to_string())?;
+        let rect = Rect { x: 100, y: 100, width: 50, height: 40 };
+        let ranges = index.ranges(rect).expect("the window is inside");
+        let part = |r: &std::ops::Range<u64>| bytes.get(r.start as usize..r.end as usize).unwrap_or(&[]);
+        index.window(rect, &ranges.iter().map(part).collect::<Vec<_>>()).map_err(|e| e.to_string())?;
+        Ok(())
+    })
+}
+
+/// A capture whose photo, or whose mask, is the file: opened and ingested.
+fn photo_codec(as_mask: bool) -> Read {
+    let folder = tempfile::tempdir().expect("a folder");
+    let frame = |x: f64, mask: bool| Frame {
+        file_path: if mask { "good.png" } else { "photo" }.into(),
+        mask_path: mask.then(|| "photo".to_string()),
+        intrinsics: Intrinsics::from_model(&CameraModel::Pinhole([90.0, 90.0, 50.0, 50.0]), None),
+        camera_from_world: Rigid { rotation: DQuat::IDENTITY, translation: DVec3::new(x, 0.0, 0.0) },
+    };
+    let file = Transforms { frames: vec![frame(0.0, as_mask)], ply_file_path: Some("cloud.ply".into()) };
+    fs::write(folder.path().join("transforms.json"), transforms::write(&file)).expect("written");
+    fs::write(folder.path().join("cloud.ply"), CLOUD).expect("written");
+    fs::write(folder.path().join("good.png"), encoded(RgbImage::new(200, 100), ImageFormat::Png)).expect("written");
+    Reader::new("", move |bytes| {
+        fs::write(folder.path().join("photo"), bytes).expect("written");
+        let source = open::open(folder.path(), &OpenOptions::default()).map_err(|error| error.to_string())?;
+        let store = Store::open("memory://").expect("memory").blocking();
+        let options = IngestOptions { downscale: 1, threads: 1 };
+        let ingested = ingest::ingest(&source, &store, &options, &|_, _| ()).map_err(|error| error.to_string())?;
+        let loaded = ingest::load_capture(&store, ingested.id).map_err(|error| error.to_string())?;
+        assert_eq!(loaded, ingested.capture);
+        Ok(())
+    })
+}
+
+const CLOUD: &str = "ply\nformat ascii 1.0\ncomment a cloud\nelement vertex 3\nproperty float x\nproperty double y\n\
+    property float z\nproperty uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n\
+    0 0 -3 1 2 3\n1 0.5 -3 4 5 6\n-1 1e-3 -4 7 8 9\n";
+const RECONSTRUCTION: &str = r#"[{"cameras": {
+    "v2 a": {"projection_type": "perspective", "width": 4000, "height": 3000, "focal": 0.85, "k1": -0.1, "k2": 0.01},
+    "v2 b": {"projection_type": "brown", "width": 3000, "height": 4000, "focal_x": 0.8, "focal_y": 0.81, "c_x": 0.01,
+             "c_y": -0.02, "k1": 0.1, "k2": 0.2, "k3": 0.3, "p1": 0.001, "p2": 0.002},
+    "v2 c": {"projection_type": "fisheye", "width": 4000, "height": 4000, "focal": 0.3, "k1": 0.1, "k2": 0.2}},
+  "shots": {
+    "b.jpg": {"camera": "v2 b", "rotation": [0, 0, 1.57], "translation": [1, 2, 3], "gps_dop": 5},
+    "a.jpg": {"camera": "v2 a", "rotation": [0.1, 0, 0], "translation": [0, 0, 10], "orientation": 1}},
+  "points": {"7": {"color": [255, 0, 12.4], "coordinates": [1, 2, 3]}, "10": {"coordinates": [4, 5, 6]}},
+  "reference_lla": {"latitude": 47.5, "longitude": 8.5, "altitude": 400}},
+  {"cameras": {}, "shots": {"z.jpg": {"camera": "", "rotation": [0, 0, 0], "translation": [0, 0, 0]}}}]"#;
+const PERSPECTIVE: &str = "calib_time: x\nS_rect_00: 80 40\nR_rect_00: 1 0 0 0 1 0 0 0 1\n\
+    P_rect_00: 50 0 40 0 0 50 20 0 0 0 1 0\nS_rect_01: 80 40\nP_rect_01: 50 0 40 -30 0 50 20 0 0 0 1 0\n";
+const CAM_TO_POSE: &str = "image_00: 0 0 1 1 1 0 0 0 0 1 0 0\nimage_01: 0 0 1 1 1 0 0 0.6 0 1 0 0\n";
+const POSES: &str = "1 1 0 0 10 0 -1 0 7 0 0 -1 2\n2 1 0 0 20 0 -1 0 7 0 0 -1 2 0 0 0 1\n";

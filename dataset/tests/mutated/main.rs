@@ -1,0 +1,159 @@
+//! Every reader against damaged files: each case ends in a value or in one line of refusal, never in a panic, and never
+//! takes more memory than the size of the file justifies.
+//!
+//! `PLAT_FUZZ_CASES` says how many cases (2,000), `PLAT_FUZZ_SEED` which (0). A failure prints file, seed and case; with
+//! `PLAT_FUZZ_SEED=seed PLAT_FUZZ_FROM=case PLAT_FUZZ_CASES=1` that case runs alone.
+
+mod corpus;
+mod memory;
+mod mutate;
+
+use std::io::{Read, Write};
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use corpus::{Seal, Seed};
+use mutate::Random;
+
+/// Files under this may not take more than [`MOST_BYTES`].
+const SMALL_FILE: usize = 10 << 20;
+const MOST_BYTES: usize = 256 << 20;
+/// A file of this length has all of its cases, one of twice the length half of them.
+const QUICK_FILE: usize = 8 << 10;
+/// Fuzzers get no further into long files.
+const LARGEST_SEED: usize = 16 << 10;
+/// Bytes of a frame before its header.
+const FRAME_PREFIX: usize = 40;
+
+#[test]
+fn damaged_files_are_refused_or_read() {
+    let number = |name: &str| std::env::var(name).ok().map(|text| text.parse::<u64>().expect("a whole number"));
+    let (seed, from) = (number("PLAT_FUZZ_SEED").unwrap_or(0), number("PLAT_FUZZ_FROM").unwrap_or(0));
+    let cases = number("PLAT_FUZZ_CASES").unwrap_or(2000);
+
+    let seeds = corpus::seeds();
+    if let Some(folder) = std::env::var_os("PLAT_FUZZ_SEEDS") {
+        write_seeds(Path::new(&folder), &seeds);
+    }
+    for file in &seeds {
+        file.reader.read(&file.bytes).unwrap_or_else(|error| panic!("{} undamaged: {error}", file.name));
+    }
+    let (mut slowest, mut largest) = ((Duration::ZERO, String::new()), (0, String::new()));
+    let mut refused = 0;
+    for case in from..from + cases {
+        let mut random = Random(seed ^ case.wrapping_mul(0xd134_2543_de82_ef95));
+        random.next();
+        let file = choose(&seeds, &mut random);
+        let other = &seeds[random.below(seeds.len())];
+        let (bytes, damage) = damaged(file, &other.bytes, &mut random);
+        let what = || format!("{}: {damage} (seed {seed}, case {case})", file.name);
+
+        let start = Instant::now();
+        let (outcome, peak) = memory::peak_of(|| catch_unwind(AssertUnwindSafe(|| file.reader.read(&bytes))));
+        let took = start.elapsed();
+        match outcome {
+            Ok(Ok(())) => {}
+            Ok(Err(line)) => {
+                refused += 1;
+                assert!(!line.is_empty() && !line.contains(char::is_control), "{}: not a line: {line:?}", what());
+                assert!(line.len() < 16 << 10, "{}: a line of {} bytes", what(), line.len());
+            }
+            Err(_) => panic!("{}: panicked", what()),
+        }
+        let budget = file.budget.base + file.budget.factor * bytes.len();
+        assert!(peak <= budget, "{}: {peak} bytes for a file of {}", what(), bytes.len());
+        assert!(peak <= MOST_BYTES || bytes.len() >= SMALL_FILE, "{}: {peak} bytes", what());
+        if took > slowest.0 {
+            slowest = (took, what());
+        }
+        if peak > largest.0 {
+            largest = (peak, what());
+        }
+    }
+    println!("{cases} cases of {} files, {refused} refused", seeds.len());
+    println!("slowest {:.3} s: {}", slowest.0.as_secs_f64(), slowest.1);
+    println!("largest {:.1} MB: {}", largest.0 as f64 / 1e6, largest.1);
+}
+
+/// The files as seeds of the fuzz targets, without what guards them: the targets put that back.
+fn write_seeds(folder: &Path, seeds: &[Seed]) {
+    for (i, file) in seeds.iter().enumerate().filter(|(_, file)| !file.reader.target.is_empty()) {
+        let mut bytes = opened(file);
+        bytes.truncate(LARGEST_SEED);
+        let folder = folder.join(file.reader.target);
+        std::fs::create_dir_all(&folder).expect("a folder for seeds");
+        std::fs::write(folder.join(format!("{i:03}")), bytes).expect("a seed is written");
+    }
+}
+
+/// What is inside of a seal.
+fn opened(file: &Seed) -> Vec<u8> {
+    match file.seal {
+        Seal::None | Seal::Png => file.bytes.clone(),
+        Seal::Frame => file.bytes[FRAME_PREFIX..].to_vec(),
+        Seal::Gzip => {
+            let mut bytes = Vec::new();
+            flate2::read::GzDecoder::new(&file.bytes[..]).read_to_end(&mut bytes).expect("the file itself is whole");
+            bytes
+        }
+    }
+}
+
+/// Any of the files, long ones less often.
+fn choose<'a>(seeds: &'a [Seed], random: &mut Random) -> &'a Seed {
+    loop {
+        let file = &seeds[random.below(seeds.len())];
+        if random.below(file.bytes.len().div_ceil(QUICK_FILE).max(1)) == 0 {
+            return file;
+        }
+    }
+}
+
+/// The damaged file, and what was done to it. What guards it is made good again, most of the time.
+fn damaged(file: &Seed, other: &[u8], random: &mut Random) -> (Vec<u8>, String) {
+    let sealed = file.seal != Seal::None && random.below(4) > 0;
+    let mut bytes = if sealed && file.seal == Seal::Gzip { opened(file) } else { file.bytes.clone() };
+    let damage = mutate::mutate(&mut bytes, other, random);
+    if sealed {
+        seal(file.seal, &mut bytes);
+    }
+    (bytes, if sealed { format!("{damage}, sealed") } else { damage })
+}
+
+fn seal(seal: Seal, bytes: &mut Vec<u8>) {
+    match seal {
+        Seal::None => {}
+        Seal::Frame if bytes.len() < FRAME_PREFIX => {}
+        Seal::Frame => {
+            // The lengths of header and bulk stay as they are where they fit, else the header takes what is there.
+            let length = |bytes: &[u8]| bytes.iter().rev().fold(0u64, |n, b| n << 8 | u64::from(*b));
+            let (header, bulk) = (length(&bytes[12..16]), length(&bytes[16..24]));
+            if header.checked_add(bulk) != Some((bytes.len() - FRAME_PREFIX) as u64) && header < 1 << 20 {
+                let rest = (bytes.len() - FRAME_PREFIX).saturating_sub(bulk.min(1 << 40) as usize) as u32;
+                bytes[12..16].copy_from_slice(&rest.to_le_bytes());
+            }
+            let hash = blake3::hash(&bytes[FRAME_PREFIX..]);
+            bytes[24..40].copy_from_slice(&hash.as_bytes()[..16]);
+        }
+        Seal::Gzip => {
+            let mut to = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast());
+            to.write_all(bytes).expect("memory takes it");
+            *bytes = to.finish().expect("memory takes it");
+        }
+        Seal::Png => {
+            let mut at = 8;
+            while let Some(length) = bytes.get(at..at + 4) {
+                let length = u32::from_be_bytes(length.try_into().expect("four bytes")) as usize;
+                let end = at + 8 + length;
+                if end + 4 > bytes.len() {
+                    break;
+                }
+                let mut sum = flate2::Crc::new();
+                sum.update(&bytes[at + 4..end]);
+                bytes[end..end + 4].copy_from_slice(&sum.sum().to_be_bytes());
+                at = end + 4;
+            }
+        }
+    }
+}

@@ -1,0 +1,44 @@
+//! Frames of plat: splat columns, plans, captures. As they are, and with lengths and checksum that fit the bytes.
+#![no_main]
+
+use blocks::{Plan, plan::PLAN};
+use libfuzzer_sys::fuzz_target;
+use scene::Capture;
+use scene::frame::{self, Kind, SPLATS};
+
+/// As `dataset::ingest::CAPTURE`.
+const CAPTURE: Kind = Kind(*b"capt", 1);
+
+fuzz_target!(|bytes: &[u8]| {
+    let _ = frame::decode::<frame::SplatsHeader>(SPLATS, bytes);
+    // The header of splats takes two bytes or a few more.
+    for header in 0..bytes.len().min(11) {
+        let _ = frame::decode_splats(&sealed(SPLATS, bytes, header));
+    }
+    if let Ok(plan) = Plan::from_frame(&sealed(PLAN, bytes, bytes.len())) {
+        plan.leaves();
+        for task in &plan.tasks {
+            task.window_pixels();
+            task.context_cut();
+            plan.ground.halo(task.block);
+            assert!(plan.task(task.block).is_some());
+        }
+    }
+    if let Ok((capture, _)) = frame::decode::<Capture>(CAPTURE, &sealed(CAPTURE, bytes, bytes.len()))
+        && capture.check().is_ok()
+    {
+        let _ = blocks::plan(&capture, scene::ArtefactId::of(bytes), &blocks::PlanSettings::default(), "cpu");
+    }
+});
+
+/// A frame whose header is the first bytes of these, its bulk the others.
+fn sealed(kind: Kind, body: &[u8], header: usize) -> Vec<u8> {
+    let mut bytes = b"plat".to_vec();
+    bytes.extend(kind.0);
+    bytes.extend(kind.1.to_le_bytes());
+    bytes.extend((header as u32).to_le_bytes());
+    bytes.extend(((body.len() - header) as u64).to_le_bytes());
+    bytes.extend(&blake3::hash(body).as_bytes()[..16]);
+    bytes.extend(body);
+    bytes
+}
