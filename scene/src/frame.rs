@@ -60,13 +60,32 @@ pub fn decode<T: DeserializeOwned>(kind: Kind, bytes: &[u8]) -> Result<(T, &[u8]
     if bytes[24..40] != checksum(header, bulk) {
         return Err(CodecError::new(format!("'{name}' frame fails its checksum")));
     }
-    let config = bincode::config::standard().with_limit::<HEADER_LIMIT>();
-    let (value, used) = bincode::serde::decode_from_slice(header, config)
-        .map_err(|e| CodecError::new(format!("'{name}' frame header: {e}")))?;
+    let (value, used) = decode_header(header).map_err(|e| CodecError::new(format!("'{name}' frame header: {e}")))?;
     if used != header.len() {
         return Err(CodecError::new(format!("'{name}' frame header has {} bytes too many", header.len() - used)));
     }
     Ok((value, bulk))
+}
+
+/// The value, and the bytes that it took.
+///
+/// bincode makes room for as long a text as is announced, up to a limit that is a constant: hence the least of some that
+/// suffices, as no value claims more than eight bytes for each of those that it takes.
+fn decode_header<T: DeserializeOwned>(header: &[u8]) -> Result<(T, usize), bincode::error::DecodeError> {
+    fn within<const LIMIT: usize, T: DeserializeOwned>(
+        header: &[u8],
+    ) -> Result<(T, usize), bincode::error::DecodeError> {
+        bincode::serde::decode_from_slice(header, bincode::config::standard().with_limit::<LIMIT>())
+    }
+    const LIMITS: [usize; 5] = [1 << 16, 1 << 19, 1 << 22, 1 << 25, 1 << 28];
+    match LIMITS.iter().position(|&limit| 8 * header.len() <= limit) {
+        Some(0) => within::<{ LIMITS[0] }, T>(header),
+        Some(1) => within::<{ LIMITS[1] }, T>(header),
+        Some(2) => within::<{ LIMITS[2] }, T>(header),
+        Some(3) => within::<{ LIMITS[3] }, T>(header),
+        Some(4) => within::<{ LIMITS[4] }, T>(header),
+        _ => within::<HEADER_LIMIT, T>(header),
+    }
 }
 
 fn checksum(header: &[u8], bulk: &[u8]) -> [u8; 16] {
@@ -117,6 +136,20 @@ mod tests {
     use super::*;
     use crate::splats::Splat;
     use glam::Vec3;
+
+    #[test]
+    fn no_header_makes_room_for_a_text_that_is_not_there() {
+        // A text of 900 MB, says its length.
+        let mut bytes = vec![252];
+        bytes.extend(900_000_000u32.to_le_bytes());
+        assert!(matches!(decode_header::<String>(&bytes), Err(bincode::error::DecodeError::LimitExceeded)));
+        // And headers just under and over a limit pass, of numbers that claim eight bytes and take one, and of text.
+        for length in [1 << 13, (1 << 13) + 1, 1 << 16, (1 << 16) + 1] {
+            let (numbers, text) = (vec![7u64; length], "x".repeat(length));
+            let frame = encode(SPLATS, &(&numbers, &text), &[]);
+            assert_eq!(decode(SPLATS, &frame).map(|(header, _)| header), Ok((numbers, text)));
+        }
+    }
 
     #[test]
     fn splats_round_trip_and_damage_is_seen() {

@@ -3,7 +3,7 @@
 use std::fmt;
 use std::path::{Component, Path, PathBuf};
 
-use image::ImageReader;
+use image::{ImageError, ImageReader};
 use scene::BadInput;
 
 use crate::mips;
@@ -88,7 +88,10 @@ pub(super) fn image_size(path: &Path) -> Result<(u32, u32), BadInput> {
         BadInput::new(show(path), problem, "replace the file or take its image out of the capture")
     };
     let reader = ImageReader::open(path).and_then(ImageReader::with_guessed_format).map_err(|e| cannot(&e))?;
-    let (width, height) = reader.into_dimensions().map_err(|e| cannot(&e))?;
+    let (width, height) = reader.into_dimensions().map_err(|e| match e {
+        ImageError::Limits(_) => cannot(&"it claims more pixels than any photo has"),
+        other => cannot(&other),
+    })?;
     check_size(path, width, height)?;
     Ok((width, height))
 }

@@ -20,7 +20,7 @@ use mutate::Random;
 const SMALL_FILE: usize = 10 << 20;
 const MOST_BYTES: usize = 256 << 20;
 /// A file of this length has all of its cases, one of twice the length half of them.
-const QUICK_FILE: usize = 8 << 10;
+const QUICK_FILE: usize = 64 << 10;
 /// Fuzzers get no further into long files.
 const LARGEST_SEED: usize = 16 << 10;
 /// Bytes of a frame before its header.
