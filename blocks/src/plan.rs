@@ -188,12 +188,11 @@ impl Plan {
                 return bad(format!("whose task {} is not in its tree", task.block));
             }
             let window = |v: &ViewUse| {
-                let Rect { x, y, width, height } = v.window;
-                let inside = |at: u32, length: u32| length > 0 && at.max(length) <= MAX_SIDE;
-                v.mip > 31 || !inside(x, width) || !inside(y, height)
+                let Rect { width, height, .. } = v.window;
+                v.mip > 31 || ![width, height].iter().all(|side| (1..=MAX_SIDE).contains(side))
             };
             if task.views.iter().chain(&task.test_views).any(window) {
-                return bad(format!("whose task {} has a window that is empty or in no image", task.block));
+                return bad(format!("whose task {} has a window that is empty or larger than any image", task.block));
             }
         }
         if self.tasks.is_empty() || !self.tasks.is_sorted_by(|a, b| training_order(a.block) < training_order(b.block)) {

@@ -331,6 +331,11 @@ mod tests {
         let mut broken = plan.clone();
         broken.tasks.swap(0, 1);
         assert!(Plan::from_frame(&broken.to_frame()).is_err());
+        for side in [0, u32::MAX] {
+            broken = plan.clone();
+            broken.tasks[0].views[0].window.width = side;
+            assert!(Plan::from_frame(&broken.to_frame()).is_err());
+        }
         broken = plan;
         broken.ground.edge_metres = f64::NAN;
         assert!(Plan::from_frame(&broken.to_frame()).is_err());

@@ -116,3 +116,43 @@ impl Capture {
         test_every > 0 && index.is_multiple_of(test_every as usize)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::camera::{Pinhole, Rigid};
+
+    #[test]
+    fn impossible_captures_are_refused() {
+        let pinhole = Pinhole { width: 4, height: 3, fx: 5.0, fy: 5.0, cx: 2.0, cy: 1.5 };
+        let camera = Camera { pinhole, camera_from_world: Rigid::IDENTITY };
+        let view = View { name: "a.png".into(), camera, mips: Vec::new(), masked: false };
+        let points = SparsePoints {
+            positions: vec![DVec3::ZERO, DVec3::ONE],
+            colours: vec![[1, 2, 3]; 2],
+            track_start: vec![0, 1, 1],
+            seen_by: vec![0],
+        };
+        let good = Capture { views: vec![view], points, geo_origin: None };
+        assert_eq!([good.check(), Capture::default().check()], [Ok(()), Ok(())]);
+        let changes: [fn(&mut Capture); 12] = [
+            |c| c.views[0].camera.pinhole.width = 0,
+            |c| c.views[0].camera.pinhole.fx = 0.0,
+            |c| c.views[0].camera.pinhole.cy = f64::NAN,
+            |c| c.views[0].camera.camera_from_world.translation.x = f64::INFINITY,
+            |c| c.views[0].camera.camera_from_world.rotation.w = 3.0,
+            |c| c.views[0].mips = vec![ArtefactId([0; 32]); 33],
+            |c| c.points.positions[1].z = f64::NAN,
+            |c| c.points.colours.truncate(1),
+            |c| c.points.track_start = vec![0, 2, 1],
+            |c| c.points.track_start = vec![0, 1],
+            |c| c.points.track_start.clear(),
+            |c| c.points.seen_by[0] = 1,
+        ];
+        for (i, change) in changes.into_iter().enumerate() {
+            let mut bad = good.clone();
+            change(&mut bad);
+            assert!(bad.check().is_err(), "change {i}");
+        }
+    }
+}

@@ -80,6 +80,51 @@ pub(crate) fn seeds() -> Vec<Seed> {
     corpus.0
 }
 
+/// Files that try to take many times their length, each in its own way. None of them is read.
+pub(crate) fn swelling() -> Vec<Seed> {
+    let mut corpus = Corpus(Vec::new());
+    let ones = |n: usize| "1,".repeat(n) + "1";
+    let json = format!(r#"{{"fl_x": 5, "x": [{}], "frames": []}}"#, ones(2_000_000));
+    corpus.plain("unknown numbers in transforms.json", json, &transforms_codec());
+    let frame = r#"{"file_path":"","transform_matrix":[]},"#.repeat(60_000);
+    let json = format!(r#"{{"fl_x": 5, "frames": [{}]}}"#, frame.trim_end_matches(','));
+    corpus.plain("empty frames in transforms.json", json, &transforms_codec());
+    let json = format!(r#"[{{"x": [{}], "shots": {{}}, "cameras": {{}}}}]"#, ones(2_000_000));
+    corpus.plain("unknown numbers in reconstruction.json", json, &opensfm_codec());
+    let text = format!("P_rect_00: {}", "1 ".repeat(1_000_000));
+    corpus.plain("a long line in perspective.txt", text, &kitti_codecs()[0]);
+    for line in ["comment\n", "property char a\n", "obj_info\n"] {
+        let text = format!("ply\nformat ascii 1.0\nelement vertex 1\n{}end_header\n1\n", line.repeat(200_000));
+        corpus.plain("a long PLY header", text, &ply_codec());
+    }
+    let count = "element vertex 4000000000\nproperty float x\nproperty float y\nproperty float z\nend_header\n";
+    for format in ["ascii", "binary_little_endian"] {
+        corpus.plain("vertices that are not there", format!("ply\nformat {format} 1.0\n{count}1 1"), &cloud_codec());
+    }
+    let mut header = 0x5053_474e_u32.to_le_bytes().to_vec();
+    header.extend([3u32, u32::MAX].iter().flat_map(|word| word.to_le_bytes()));
+    header.extend([3, 12, 0, 0]);
+    for (name, count, body) in [("splats that are not there", u32::MAX, 100), ("a bomb", 1_000_000, 100 << 20)] {
+        header[8..12].copy_from_slice(&count.to_le_bytes());
+        let mut to = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast());
+        std::io::Write::write_all(&mut to, &[header.clone(), vec![0; body]].concat()).expect("memory takes it");
+        let bytes = to.finish().expect("memory takes it");
+        corpus.put(&format!("{name} in SPZ"), bytes, &spz_codec(), Seal::None, COMPRESSED);
+    }
+    let mut views = vec![1, 252]; // one view, whose name is of 900 MB
+    views.extend(900_000_000u32.to_le_bytes());
+    let hash = blake3::hash(&views);
+    let lengths = [(views.len() as u32).to_le_bytes().as_slice(), &[0; 8]].concat();
+    let kind = [ingest::CAPTURE.0.as_slice(), &ingest::CAPTURE.1.to_le_bytes()].concat();
+    let frame = [b"plat".as_slice(), &kind, &lengths, &hash.as_bytes()[..16], &views].concat();
+    corpus.put("a name that is not there", frame, &capture_codec(), Seal::None, PLAIN);
+    for counts in [[u64::MAX; 2], [1 << 40; 2]] {
+        let bytes = counts.iter().flat_map(|count| count.to_le_bytes()).collect::<Vec<_>>();
+        colmap_binary().iter().for_each(|codec| corpus.plain("a count of COLMAP", bytes.clone(), codec));
+    }
+    corpus.0
+}
+
 struct Corpus(Vec<Seed>);
 
 impl Corpus {
@@ -209,7 +254,7 @@ impl Corpus {
         let settings = blocks::PlanSettings { levels: Some(2), budget: 1000, ..Default::default() };
         let id = scene::ArtefactId::of(b"city");
         let plan = blocks::plan(&source.capture, id, &settings, "cpu").expect("a city can be planned");
-        self.put("plan", plan.to_frame(), &plan_codec(), Seal::Frame, PLAIN);
+        self.put("plan", plan.to_frame(), &plan_codec(source.capture.clone()), Seal::Frame, PLAIN);
         let bytes = (0..3 * 150 * 140).map(|i| (i * 7 / 11) as u8).collect();
         let pixels = Pixels { width: 150, height: 140, rgb: bytes, mask: None };
         self.plain("mip", mips::encode(&pixels).expect("an image"), &mip_codec());
@@ -376,15 +421,19 @@ fn npy_codec() -> Read {
     codec("npy", npy::read_f32, |(shape, data)| shape.iter().product::<usize>() == data.len())
 }
 
-fn plan_codec() -> Read {
-    codec("frames", blocks::Plan::from_frame, |plan| {
+/// With the capture that it may or may not be a plan of.
+fn plan_codec(capture: Capture) -> Read {
+    Reader::new("frames", move |bytes| {
+        let plan = blocks::Plan::from_frame(bytes).map_err(|error| error.to_string())?;
         plan.leaves();
-        plan.tasks.iter().all(|task| {
+        for task in &plan.tasks {
             task.window_pixels();
             task.context_cut();
             plan.ground.halo(task.block);
-            plan.task(task.block).is_some()
-        })
+            assert!(plan.task(task.block).is_some());
+        }
+        blocks::lint(&plan, &capture);
+        Ok(())
     })
 }
 

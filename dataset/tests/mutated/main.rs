@@ -11,6 +11,7 @@ mod mutate;
 use std::io::{Read, Write};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::Path;
+use std::sync::Mutex;
 use std::time::{Duration, Instant};
 
 use corpus::{Seal, Seed};
@@ -26,8 +27,25 @@ const LARGEST_SEED: usize = 16 << 10;
 /// Bytes of a frame before its header.
 const FRAME_PREFIX: usize = 40;
 
+/// Memory is counted for the whole process.
+static ONE_AT_A_TIME: Mutex<()> = Mutex::new(());
+
+#[test]
+fn nothing_swells() {
+    let _alone = ONE_AT_A_TIME.lock();
+    for file in corpus::swelling() {
+        let (outcome, peak) = memory::peak_of(|| file.reader.read(&file.bytes));
+        let line = outcome.expect_err(&file.name);
+        assert!(line.len() < 16 << 10 && !line.contains(char::is_control), "{}: {line:?}", file.name);
+        let budget = file.budget.base + file.budget.factor * file.bytes.len();
+        println!("{}: {} bytes, {peak} in memory of {budget}: {line:.80}", file.name, file.bytes.len());
+        assert!(peak <= budget.min(MOST_BYTES), "{}: {peak} bytes for a file of {}", file.name, file.bytes.len());
+    }
+}
+
 #[test]
 fn damaged_files_are_refused_or_read() {
+    let _alone = ONE_AT_A_TIME.lock();
     let number = |name: &str| std::env::var(name).ok().map(|text| text.parse::<u64>().expect("a whole number"));
     let (seed, from) = (number("PLAT_FUZZ_SEED").unwrap_or(0), number("PLAT_FUZZ_FROM").unwrap_or(0));
     let cases = number("PLAT_FUZZ_CASES").unwrap_or(2000);
