@@ -116,7 +116,7 @@ fn models_with_impossible_numbers_are_refused() {
         m.images.iter_mut().for_each(|image| image.camera_from_world = pose);
     });
     // A rotation of another length is the same rotation.
-    with(&[], &|m| m.images.iter_mut().for_each(|i| i.camera_from_world.rotation = i.camera_from_world.rotation * 3.0));
+    with(&[], &|m| m.images.iter_mut().for_each(|i| i.camera_from_world.rotation *= 3.0));
     let scaled = run(folder.path()).unwrap();
     rewrite(folder.path(), &whole);
     for (a, b) in scaled.capture.views.iter().zip(run(folder.path()).unwrap().capture.views) {

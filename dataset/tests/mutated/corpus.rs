@@ -2,7 +2,7 @@
 
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
+use std::rc::Rc;
 
 use dataset::ingest::{self, IngestOptions};
 use dataset::open::{self, OpenOptions};
@@ -23,11 +23,11 @@ pub(crate) struct Reader {
 }
 
 type Call = dyn Fn(&[u8]) -> Result<(), String>;
-type Read = Arc<Reader>;
+type Read = Rc<Reader>;
 
 impl Reader {
     fn new(target: &'static str, call: impl Fn(&[u8]) -> Result<(), String> + 'static) -> Read {
-        Arc::new(Self { target, call: Box::new(call) })
+        Rc::new(Self { target, call: Box::new(call) })
     }
 
     /// Reads the bytes and checks that what comes out is what the reader promises; one line if it refuses them.
@@ -129,7 +129,7 @@ struct Corpus(Vec<Seed>);
 
 impl Corpus {
     fn put(&mut self, name: &str, bytes: Vec<u8>, read: &Read, seal: Seal, budget: Budget) {
-        self.0.push(Seed { name: name.into(), bytes, reader: Arc::clone(read), seal, budget });
+        self.0.push(Seed { name: name.into(), bytes, reader: Rc::clone(read), seal, budget });
     }
 
     fn plain(&mut self, name: &str, bytes: impl Into<Vec<u8>>, read: &Read) {
