@@ -83,9 +83,10 @@ impl Model {
     ///
     /// # Errors
     /// Splats that the format cannot hold.
-    pub(crate) fn to_spz(&self) -> Result<Vec<u8>, Failure> {
-        spz::write(&self.splats, self.antialiased, spz::Version::V3)
-            .map_err(|error| Failure::Work(format!("cannot be written as SPZ: {error}")))
+    pub(crate) fn to_spz(&self) -> Result<Vec<u8>, BadInput> {
+        spz::write(&self.splats, self.antialiased, spz::Version::V3).map_err(|error| {
+            BadInput::new("the model", format!("cannot be written as SPZ: {error}"), "use PLY or repair the model")
+        })
     }
 
     /// The folder for what is said about it.
