@@ -3,7 +3,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use scene::{BlockId, Capture};
+use scene::{BlockId, Camera, Capture};
 
 use crate::ground::{Ground, HALO_SCALE};
 use crate::plan::{PlanSettings, Task};
@@ -141,6 +141,47 @@ pub(crate) fn set_steps(tasks: &mut [Task], settings: &PlanSettings, levels: u8,
     }
 }
 
+/// Points and windows of a task that [`set_drawn`] looks at, at most.
+const DRAWN_POINTS: usize = 20_000;
+const DRAWN_WINDOWS: usize = 8;
+
+/// Estimates how many splats of core and halo each task's windows show: as large a share as of the sparse points there.
+pub(crate) fn set_drawn(tasks: &mut [Task], capture: &Capture, ground: &Ground) {
+    let points = &capture.points.positions;
+    let sample: Vec<_> =
+        points.iter().step_by(points.len().div_ceil(DRAWN_POINTS).max(1)).filter(|p| p.is_finite()).collect();
+    let levels: BTreeSet<u8> = tasks.iter().map(|task| task.block.level).collect();
+    let places: BTreeMap<BlockId, usize> = tasks.iter().enumerate().map(|(i, task)| (task.block, i)).collect();
+    let windows: Vec<Vec<Camera>> = (tasks.iter())
+        .map(|task| {
+            let some = task.views.iter().step_by(task.views.len().div_ceil(DRAWN_WINDOWS).max(1));
+            some.map(|used| capture.views[used.view as usize].camera.mip(used.mip).window(used.window)).collect()
+        })
+        .collect();
+    // Of each task, points that a window shows, and points times windows.
+    let mut shown = vec![[0u64; 2]; tasks.len()];
+    for point in sample {
+        for task in levels.iter().flat_map(|&level| ground.halos_at(level, *point)).filter_map(|b| places.get(&b)) {
+            let inside = |camera: &&Camera| {
+                let (pixel, depth) = camera.project(*point);
+                let size = [f64::from(camera.pinhole.width), f64::from(camera.pinhole.height)];
+                depth > 0.0 && (0.0..size[0]).contains(&pixel.x) && (0.0..size[1]).contains(&pixel.y)
+            };
+            shown[*task][0] += windows[*task].iter().filter(inside).count() as u64;
+            shown[*task][1] += windows[*task].len() as u64;
+        }
+    }
+    for (task, [inside, all]) in tasks.iter_mut().zip(shown) {
+        let share = inside as f64 / all.max(1) as f64;
+        task.drawn = (trained_splats(task) * share).round() as u32;
+    }
+}
+
+/// Splats under training in core and halo at the end.
+fn trained_splats(task: &Task) -> f64 {
+    f64::from(task.budget) * if task.block.level == 0 { 1.0 } else { HALO_AREA }
+}
+
 /// Columns of a splat of SH degree 3.
 const COLUMNS: [u64; 4] = [14, 23, 38, 59];
 /// Halo splats come on top of the core's: the area of halo over core.
@@ -149,16 +190,17 @@ const HALO_AREA: f64 = HALO_SCALE * HALO_SCALE;
 const BYTES_PER_TRAINED_COLUMN: u64 = 16;
 /// A frozen parameter.
 const BYTES_PER_FROZEN_COLUMN: u64 = 4;
-/// Projected splat, its gradient, its growth statistics, and its entries in about eight tiles.
-const BYTES_PER_PROJECTED: u64 = 320;
-/// The same for a frozen splat: no gradient, no statistics.
+/// Projected splat, its gradient, its growth statistics, its entries in tiles, and the copies that growth makes: what twelve
+/// runs on the bench's captures took beyond the rest, within 15 % (a tree's process 27 % less than it takes).
+const BYTES_PER_PROJECTED: u64 = 1860;
+/// The same for a frozen splat: no gradient, no statistics, no copies.
 const BYTES_PER_FROZEN_PROJECTED: u64 = 112;
-/// Per window pixel: colour, depth, alpha, their gradients, the photo, weights and the eleven SSIM planes, f32 each.
-const BYTES_PER_PIXEL: u64 = 160;
+/// Per window pixel: colour, depth, alpha, their gradients, the photo, weights and the SSIM planes.
+const BYTES_PER_PIXEL: u64 = 120;
 /// Windows of photos kept decoded at most; a pixel is four bytes.
 const IMAGE_CACHE_BYTES: u64 = 128 << 20;
 /// The program itself and its threads.
-const BASE_BYTES: u64 = 48 << 20;
+const BASE_BYTES: u64 = 17 << 20;
 
 /// Estimates each task's peak memory: splats in core and halo under training, context frozen, one window's buffers,
 /// and the image cache.
@@ -166,8 +208,7 @@ pub(crate) fn set_memory(tasks: &mut [Task], settings: &PlanSettings) {
     let columns = COLUMNS[usize::from(settings.sh_degree.min(3))];
     let budgets: BTreeMap<BlockId, u64> = tasks.iter().map(|t| (t.block, u64::from(t.budget))).collect();
     for task in tasks {
-        let halo = if task.block.level == 0 { 1.0 } else { HALO_AREA };
-        let trained = (f64::from(task.budget) * halo) as u64;
+        let trained = trained_splats(task) as u64;
         let frozen: u64 = task.context.iter().chain(&task.parent).filter_map(|b| budgets.get(b)).sum();
         let window = task.views.iter().map(|v| v.window.area()).max().unwrap_or(0);
         task.memory_bytes = BASE_BYTES

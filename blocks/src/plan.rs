@@ -104,6 +104,8 @@ pub struct Task {
     pub points: u32,
     /// Splats to end with inside the core.
     pub budget: u32,
+    /// Splats that a window shows at the end, halo included, mean over the windows; an estimate.
+    pub drawn: u32,
     /// Optimiser steps, one window each.
     pub steps: u32,
     /// Metres per pixel that the block is to resolve.

@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use scene::{ArtefactId, BlockId, Capture};
 
-use crate::allot::{Needs, set_budgets, set_memory, set_steps};
+use crate::allot::{Needs, set_budgets, set_drawn, set_memory, set_steps};
 use crate::ground::{Ground, quantile};
 use crate::lod::{context_of, finished_neighbours, training_order};
 use crate::plan::{MAX_LEVELS, Mode, Plan, PlanError, PlanSettings, Task, VERSION};
@@ -70,6 +70,7 @@ pub fn plan(
     let pixels: Vec<f64> = train_views.map(|&v| capture.views[v].camera.full().area() as f64).collect();
     let mean_pixels = pixels.iter().sum::<f64>() / pixels.len() as f64;
     set_steps(&mut tasks, settings, levels, mean_pixels);
+    set_drawn(&mut tasks, capture, &ground);
     set_memory(&mut tasks, settings);
     Ok(Plan {
         version: VERSION,
@@ -181,6 +182,7 @@ impl Survey<'_> {
                     budget: 0,
                     steps: 0,
                     rho_metres,
+                    drawn: 0,
                     memory_bytes: 0,
                 })
                 .collect();

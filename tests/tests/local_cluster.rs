@@ -34,6 +34,7 @@ fn plan() -> Plan {
             budget: 1,
             steps: 1,
             rho_metres: 1.0,
+            drawn: 0,
             memory_bytes: 0,
         }
     };

@@ -19,9 +19,11 @@ use crate::importance::{Order, Shares, Views};
 use crate::{Flow, Job, Recipe, TrainError, TrainView, random, train};
 
 /// Views that a result is measured on, at most: of more, evenly many.
-const MEASURED_VIEWS: usize = 256;
+const MEASURED_VIEWS: usize = 32;
 /// Views that a cut which is yet to heal is measured on.
-const PROBED_VIEWS: usize = 16;
+const PROBED_VIEWS: usize = 8;
+/// Views that say what splats are worth, at most.
+const JUDGED_VIEWS: usize = 128;
 /// A round that cuts less than this share is the last.
 const WORTH: f64 = 0.01;
 
@@ -232,15 +234,16 @@ impl<'a> Pruner<'a> {
         self.measured.psnr(&self.all, splats)
     }
 
-    /// As few splats as lose at most so much PSNR on the gauge's views, to half a percent of their number.
+    /// As few splats as lose at most so much PSNR on the gauge's views, to a percent of their number.
     fn cut(&self, splats: &Splats, loss_db: f64, gauge: &Gauge) -> Result<Splats, TrainError> {
         let floor = gauge.psnr(&self.all, splats)? - loss_db;
-        let importance = self.all.importance(self.pruning.order, splats)?;
+        let views = self.all.some(JUDGED_VIEWS);
+        let importance = Views { views: &views, ..self.all }.importance(self.pruning.order, splats)?;
         let order = ranking(splats, &importance, self.job.counts);
         // With `low` removed it is good, with `high` it is not.
         let (mut low, mut high) = (0, order.len());
         let mut best = splats.clone();
-        while high - low > 1 + order.len() / 200 {
+        while high - low > 1 + order.len() / 100 {
             let middle = (low + high) / 2;
             let cut = without(splats, &order[..middle]);
             if gauge.psnr(&self.all, &cut)? >= floor {

@@ -11,16 +11,16 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Mutex, PoisonError};
 
-use blocks::{Plan, Task};
+use blocks::Plan;
 use scene::{BlockId, Splats};
 use train::{Flow, Job, Recipe, TrainView};
 
 use crate::clock::Stopwatch;
+use crate::estimate::{cpu_seconds, parents};
 
-/// CPU seconds of one pixel in one training step, and of one splat in one step, as measured on the bench's captures on an
-/// AVX-512 core. An estimate: no result of a job without a cap depends on it.
-const CPU_SECONDS_PER_PIXEL: f64 = 0.2e-6;
-const CPU_SECONDS_PER_SPLAT: f64 = 0.35e-6;
+/// Cost of a pixel in a training step, and of a splat of the block, whatever the windows show of it: only the ratio counts.
+const PIXEL_COST: f64 = 0.2;
+const SPLAT_COST: f64 = 0.35;
 /// Part of its share that a task plans to use.
 const AIM: f64 = 0.95;
 /// Part of its share, over one, at which a task that turns out slow is stopped.
@@ -29,12 +29,6 @@ const PATIENCE: f64 = 1.2;
 const REHEARSAL: f64 = 0.1;
 /// Windows that are rehearsed with, twice each: the first time they are read.
 const REHEARSED: usize = 3;
-
-/// What a task will take on the CPU backend, CPU seconds.
-pub fn estimated_cpu_seconds(task: &Task) -> f64 {
-    let pixels = task.window_pixels() as f64 / task.views.len().max(1) as f64;
-    f64::from(task.steps) * (CPU_SECONDS_PER_PIXEL * pixels + CPU_SECONDS_PER_SPLAT * f64::from(task.budget))
-}
 
 /// A cap that the workers of one process share for one job.
 #[derive(Debug)]
@@ -85,11 +79,12 @@ fn share(plan: &Plan, task: u32, done: &BTreeSet<u32>, workers: u32) -> f64 {
     let mut depths: BTreeMap<BlockId, usize> = BTreeMap::new();
     let mut work: BTreeMap<usize, (f64, u32)> = BTreeMap::new();
     let mut own = 1.0;
+    let parents = parents(plan);
     for (i, of) in (0..).zip(&plan.tasks) {
         let needed = of.parent.iter().chain(&of.context).filter_map(|block| depths.get(block));
         let depth = needed.max().map_or(0, |depth| depth + 1);
         depths.insert(of.block, depth);
-        let seconds = estimated_cpu_seconds(of).max(f64::MIN_POSITIVE);
+        let seconds = cpu_seconds(&plan.settings, of, !parents.contains(&of.block)).max(f64::MIN_POSITIVE);
         if i == task {
             own = seconds;
         }
@@ -217,13 +212,13 @@ fn growth(job: &Job) -> f64 {
     let until = f64::from(job.recipe.growth.until.clamp(0.0, 1.0));
     let mean = until * 0.5 * (first + last) + (1.0 - until) * last;
     let pixels = job.views.iter().map(|view| view.rect.area() as f64).sum::<f64>() / job.views.len().max(1) as f64;
-    let cost = |splats: f64| CPU_SECONDS_PER_PIXEL * pixels + CPU_SECONDS_PER_SPLAT * splats;
+    let cost = |splats: f64| PIXEL_COST * pixels + SPLAT_COST * splats;
     cost(mean) / cost(first)
 }
 
 #[cfg(test)]
 mod tests {
-    use blocks::{Ground, PlanSettings};
+    use blocks::{Ground, PlanSettings, Task};
     use glam::{DQuat, DVec2};
     use scene::ArtefactId;
 
@@ -243,6 +238,7 @@ mod tests {
             budget: 1000,
             steps: steps[i],
             rho_metres: 1.0,
+            drawn: 1000,
             memory_bytes: 0,
         };
         Plan {

@@ -12,6 +12,7 @@
 mod attempt;
 pub mod cap;
 pub mod clock;
+pub mod estimate;
 pub mod execute;
 mod memory;
 mod merged;

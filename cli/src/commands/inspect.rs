@@ -5,28 +5,13 @@ use std::collections::BTreeMap;
 use blocks::Plan;
 use scene::{Capture, GeoOrigin};
 use serde::Serialize;
+use worker::estimate::Estimate;
 
 use crate::args::InspectArgs;
 use crate::commands::plan::{describe, plan_of};
 use crate::failure::Failure;
 use crate::output::Output;
 use crate::{cameras, commands::train::check_plan};
-
-/// What a plan would take.
-#[derive(Debug, Clone, Copy, Serialize)]
-pub(crate) struct Estimate {
-    /// All tasks, on the CPU backend.
-    pub(crate) cpu_seconds: f64,
-    /// The largest task.
-    pub(crate) memory_bytes: u64,
-}
-
-impl Estimate {
-    pub(crate) fn of(plan: &Plan) -> Self {
-        let memory_bytes = plan.tasks.iter().map(|task| task.memory_bytes).max().unwrap_or(0);
-        Self { cpu_seconds: plan.tasks.iter().map(worker::cap::estimated_cpu_seconds).sum(), memory_bytes }
-    }
-}
 
 #[derive(Serialize)]
 struct Inspected {

@@ -16,6 +16,7 @@ use serde::Serialize;
 use store::{BlockingStore, Store};
 use tokio_util::sync::CancellationToken;
 use worker::cap::Cap;
+use worker::estimate::Estimate;
 use worker::execute::{BlockTrainer, Shared, TrainerOptions};
 
 use crate::args::{Backend, TrainArgs};
@@ -54,6 +55,8 @@ pub(crate) struct Report {
     pub(crate) capped: bool,
     /// Tasks that an earlier run had finished or begun; their time is not in this report.
     pub(crate) resumed: u32,
+    /// What the plan said before anything ran.
+    pub(crate) predicted: Estimate,
 }
 
 pub(crate) fn run(args: &TrainArgs, output: &Output) -> Result<(), Failure> {
@@ -157,6 +160,7 @@ pub(crate) fn train(args: &TrainArgs, output: &Output) -> Result<Trained, Failur
         ingest_cpu_seconds,
         capped,
         resumed,
+        predicted: Estimate::of(&plan),
     };
     save_json(&args.out.join("report.json"), &report)?;
     Ok(Trained { capture, model, report, curve: spent.curve })

@@ -1,0 +1,94 @@
+//! What a plan will take, before anything runs. An estimate: no result depends on it.
+//!
+//! A training step costs its pixels and the splats that its window shows. Both change over a task's schedule (coarse mips
+//! first, growth towards the budget), which the means here follow. The constants were fitted to runs on the bench's captures
+//! on an AVX-512 core: other machines are as much slower as they are.
+
+use std::collections::BTreeSet;
+
+use blocks::{Plan, PlanSettings, Task};
+use scene::BlockId;
+use serde::Serialize;
+use train::{Recipe, prune};
+
+/// CPU seconds of a pixel in a step.
+const PER_PIXEL: f64 = 0.092e-6;
+/// CPU seconds of a splat that is shown in a step.
+const PER_SHOWN: f64 = 0.95e-6;
+/// CPU seconds of a splat in a step, shown or not.
+const PER_SPLAT: f64 = 0.21e-6;
+/// CPU seconds of reading a pixel of a window the first time.
+const PER_READ_PIXEL: f64 = 0.31e-6;
+/// Steps' worth of measuring, for each view of a block that is pruned.
+const MEASURING: f64 = 8.0;
+/// Splats on the way through pruning, against those before.
+const PRUNED: f64 = 0.75;
+/// Splats that a parent leaves where a child starts, against the child's budget.
+const INHERITED: f64 = 0.4;
+/// Core and halo, against the core.
+const HALO_AREA: f64 = blocks::ground::HALO_SCALE * blocks::ground::HALO_SCALE;
+/// Splats of the backdrop.
+const BACKDROP: f64 = 1024.0;
+/// Bytes of a splat of SH degree 0 to 3 in a merged PLY: floats of position, normal, colour, opacity, scale and rotation.
+const PLY_FLOATS: [u64; 4] = [17, 26, 41, 62];
+
+/// What a plan will take.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Estimate {
+    /// All tasks, on the CPU backend.
+    pub cpu_seconds: f64,
+    /// Of the process, with the largest task under way: bytes.
+    pub memory_bytes: u64,
+    /// Of the merged model, at most (pruning leaves fewer splats).
+    pub bytes: u64,
+}
+
+impl Estimate {
+    /// Of all tasks, one at a time.
+    pub fn of(plan: &Plan) -> Self {
+        let parents = parents(plan);
+        let leaf = |task: &&Task| !parents.contains(&task.block);
+        let splats: u64 = plan.tasks.iter().filter(leaf).map(|task| u64::from(task.budget)).sum();
+        Self {
+            cpu_seconds: plan.tasks.iter().map(|task| cpu_seconds(&plan.settings, task, leaf(&task))).sum(),
+            memory_bytes: plan.tasks.iter().map(|task| task.memory_bytes).max().unwrap_or(0),
+            bytes: splats * 4 * PLY_FLOATS[usize::from(plan.settings.sh_degree.min(3))],
+        }
+    }
+}
+
+/// Blocks below which others are trained.
+pub(crate) fn parents(plan: &Plan) -> BTreeSet<BlockId> {
+    plan.tasks.iter().filter_map(|task| task.parent).collect()
+}
+
+/// What a task will take on the CPU backend, CPU seconds.
+pub(crate) fn cpu_seconds(settings: &PlanSettings, task: &Task, leaf: bool) -> f64 {
+    let pixels = task.window_pixels() as f64 / task.views.len().max(1) as f64;
+    let recipe = if task.parent.is_some() { Recipe::refinement() } else { Recipe::default() };
+    let first = match task.parent {
+        Some(_) => INHERITED,
+        None => (f64::from(task.points) / f64::from(task.budget.max(1))).clamp(0.01, 1.0),
+    };
+    // Geometric growth from `first` to 1 until its end.
+    let until = f64::from(recipe.growth.until);
+    let growing = if first < 0.999 { (1.0 - first) / -first.ln() } else { 1.0 };
+    let mean_splats = until * growing + (1.0 - until);
+    let (mut mean_pixels, mut left) = (0.0, 1.0);
+    for (n, share) in recipe.coarse.iter().enumerate() {
+        mean_pixels += f64::from(*share) * 0.25f64.powi((recipe.coarse.len() - n) as i32);
+        left -= f64::from(*share);
+    }
+    mean_pixels += left;
+    // The halo's splats, and a backdrop.
+    let trained_splats = f64::from(task.budget) * if task.parent.is_some() { HALO_AREA } else { 1.0 } + BACKDROP;
+    let splats = PER_SHOWN * f64::from(task.drawn) + PER_SPLAT * trained_splats;
+    let step = PER_PIXEL * pixels * mean_pixels + splats * mean_splats;
+    let read = PER_READ_PIXEL * task.window_pixels() as f64;
+    if settings.tolerance_db == 0.0 || !leaf {
+        return read + f64::from(task.steps) * step;
+    }
+    let trained = f64::from(prune::steps_before(task.steps));
+    let healing = f64::from(task.steps) - trained + MEASURING * task.views.len() as f64;
+    read + trained * step + healing * (PER_PIXEL * pixels + splats * PRUNED)
+}
