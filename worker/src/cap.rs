@@ -258,13 +258,16 @@ mod tests {
         let plan = plan([10, 20, 20, 50]);
         let near = |a: f64, b: f64| assert!((a - b).abs() < 1e-9, "{a} {b}");
         let done = |tasks: &[u32]| tasks.iter().copied().collect::<BTreeSet<u32>>();
-        near(share(&plan, 0, &done(&[]), 1), 0.1);
+        let leaves = [false, true, true, true];
+        let work = [0, 1, 2, 3].map(|i| cpu_seconds(&plan.settings, &plan.tasks[i], leaves[i]));
+        assert!((work[3] / work[1] - 2.5).abs() < 1e-9, "children cost as much as their steps");
+        near(share(&plan, 0, &done(&[]), 1), work[0] / work.iter().sum::<f64>());
         near(share(&plan, 1, &done(&[0]), 1), 20.0 / 90.0);
         near(share(&plan, 3, &done(&[0, 1, 2]), 1), 1.0);
         // An attempt after one that was done all the same.
         near(share(&plan, 3, &done(&[0, 1, 2, 3]), 1), 1.0);
         // Two workers do the two in the middle at once, and nothing else.
-        near(share(&plan, 0, &done(&[]), 2), 10.0 / 80.0);
+        near(share(&plan, 0, &done(&[]), 2), work[0] / (work[0] + work[1] + work[3]));
         near(share(&plan, 1, &done(&[0]), 2), 20.0 / 70.0);
         near(share(&plan, 2, &done(&[0, 1]), 2), 20.0 / 70.0);
         near(share(&plan, 3, &done(&[0, 1, 2]), 8), 1.0);
