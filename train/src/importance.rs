@@ -15,7 +15,7 @@ use crate::{TrainError, TrainView, WindowSource};
 ///
 /// Opacity, opacity times volume, Σ αT, largest αT (RadSplat), Σ αT times a power of the volume (LightGaussian), the determinant of
 /// the Fisher information (PUP 3D-GS) and the exact growth of the error by each removal alone were measured and lost:
-/// `bench/results/prune.jsonl` has the figures.
+/// ARCHITECTURE has the figures.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Order {
