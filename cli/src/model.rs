@@ -16,7 +16,8 @@ use std::path::{Path, PathBuf};
 use blocks::{Cut, Ground, Plan};
 use scene::{ArtefactId, BadInput, BlockId, CodecError, GeoOrigin, Splats, frame, ply, spz};
 use serde::{Deserialize, Serialize};
-use store::BlockingStore;
+use store::{BlockingStore, Store};
+use tempfile::TempDir;
 
 use crate::failure::{Failure, cannot};
 
@@ -89,6 +90,23 @@ impl Model {
         })
     }
 
+    /// Every which view was held out of its training, and by how much photos were reduced; what is usual where it is unknown.
+    pub(crate) fn photos_used(&self) -> (u32, u32) {
+        self.trained.as_ref().map_or((8, 1), |(manifest, _)| (manifest.test_every, manifest.downscale))
+    }
+
+    /// The store for its photos: the one asked for, else its own where that is still there, else one in the temporary folder,
+    /// with which it is gone.
+    pub(crate) fn photo_store(&self, asked: Option<&str>) -> Result<(Store, TempDir), Failure> {
+        let temporary = tempfile::tempdir().map_err(|e| Failure::Work(format!("no temporary folder: {e}")))?;
+        let own = self.trained.as_ref().map(|(_, out)| out.join("store")).filter(|store| store.is_dir());
+        let store = match asked {
+            Some(url) => Store::open(url)?,
+            None => Store::open(&own.unwrap_or_else(|| temporary.path().to_path_buf()).display().to_string())?,
+        };
+        Ok((store, temporary))
+    }
+
     /// The folder for what is said about it.
     pub(crate) fn folder(&self, path: &Path, what: &str) -> PathBuf {
         match &self.trained {
@@ -96,6 +114,19 @@ impl Model {
             None => path.with_file_name(format!("{}-{what}", path.file_stem().unwrap_or_default().to_string_lossy())),
         }
     }
+}
+
+/// Begins a model's folder under `out`: an older model is none from here on, and the new one is none before its
+/// `model.json` is there.
+fn begin(out: &Path, plan: &Plan) -> Result<PathBuf, Failure> {
+    let folder = out.join("model");
+    if folder.join("model.json").exists() {
+        fs::remove_dir_all(&folder).map_err(cannot("replaced", &folder))?;
+    }
+    let blocks = folder.join("blocks");
+    fs::create_dir_all(&blocks).map_err(cannot("made", &blocks))?;
+    save(&folder.join(PLAN_FILE), &plan.to_frame())?;
+    Ok(folder)
 }
 
 /// Writes the results of all tasks of a plan, in its order, under `out`, and returns the sewn model.
@@ -107,15 +138,7 @@ pub(crate) fn write(
     geo_origin: Option<GeoOrigin>,
     downscale: u32,
 ) -> Result<Model, Failure> {
-    let folder = out.join("model");
-    let manifest_path = folder.join("model.json");
-    // An older model is no longer one from here on.
-    if manifest_path.exists() {
-        fs::remove_dir_all(&folder).map_err(cannot("replaced", &folder))?;
-    }
-    let blocks_folder = folder.join("blocks");
-    fs::create_dir_all(&blocks_folder).map_err(cannot("made", &blocks_folder))?;
-    save(&folder.join(PLAN_FILE), &plan.to_frame())?;
+    let folder = begin(out, plan)?;
 
     let mut blocks = Vec::new();
     let splats = sew(plan, |block| -> Result<_, Failure> {
@@ -124,7 +147,7 @@ pub(crate) fn write(
             *index.and_then(|i| results.get(i)).ok_or_else(|| Failure::Work(format!("block {block} has no result")))?;
         let bytes = store.get(artefact)?;
         let splats = frame::decode_splats(&bytes).map_err(|error| Failure::Work(format!("block {block}: {error}")))?;
-        save(&blocks_folder.join(file_name(block)), &bytes)?;
+        save(&folder.join("blocks").join(file_name(block)), &bytes)?;
         blocks.push(Block { block, artefact, splats: splats.len() as u64 });
         Ok(splats)
     })?;
@@ -140,7 +163,7 @@ pub(crate) fn write(
         splats: splats.len() as u64,
         blocks,
     };
-    save_json(&manifest_path, &manifest)?;
+    save_json(&folder.join("model.json"), &manifest)?;
     let model = Model { splats, antialiased: manifest.antialiased, trained: Some((manifest, out.to_path_buf())) };
     save(&out.join("merged.ply"), &model.to_ply())?;
     Ok(model)

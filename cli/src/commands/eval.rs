@@ -12,7 +12,7 @@ use dataset::windows::WindowReader;
 use image::RgbImage;
 use scene::{BadInput, Capture, Pixels};
 use serde::Serialize;
-use store::{BlockingStore, Store};
+use store::BlockingStore;
 use train::metrics;
 
 use crate::args::EvalArgs;
@@ -66,17 +66,8 @@ pub(crate) fn run(args: &EvalArgs, output: &Output) -> Result<(), Failure> {
     let model = model::read(&args.model)?;
     let parts = Parts::read(args)?;
     let source = cameras::open(&args.capture, output)?;
-    let (trained, default_every, default_downscale) = match &model.trained {
-        Some((manifest, out)) => (Some(out.join("store")), manifest.test_every, manifest.downscale),
-        None => (None, 8, 1),
-    };
-    // A store that is gone with the command, unless there is one already.
-    let temporary = tempfile::tempdir().map_err(|e| Failure::Work(format!("no temporary folder: {e}")))?;
-    let store = match (&args.store, trained.filter(|store| store.is_dir())) {
-        (Some(url), _) => Store::open(url)?,
-        (None, Some(folder)) => Store::open(&folder.display().to_string())?,
-        (None, None) => Store::open(&temporary.path().display().to_string())?,
-    };
+    let (default_every, default_downscale) = model.photos_used();
+    let (store, _temporary) = model.photo_store(args.store.as_deref())?;
     let downscale = args.downscale.unwrap_or(default_downscale);
     let ingested = ingest_photos(&source, &store.blocking(), downscale, output)?;
     let out = args.out.clone().unwrap_or_else(|| model.folder(&args.model, "eval"));

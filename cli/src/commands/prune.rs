@@ -10,7 +10,7 @@ use dataset::windows::WindowReader;
 use glam::Vec3;
 use scene::{BadInput, Capture, Splats, column};
 use serde::Serialize;
-use store::{BlockingStore, Store};
+use store::BlockingStore;
 use tempfile::TempDir;
 use train::importance::{self, Order, Shares, Views};
 use train::prune::{self, PruneProgress, Pruned, Pruning};
@@ -139,16 +139,8 @@ struct Photos {
 impl Photos {
     fn open(model: &Model, capture: &Path, options: &PruneCapture, output: &Output) -> Result<Self, Failure> {
         let source = cameras::open(capture, output)?;
-        let (trained, every, downscale) = match &model.trained {
-            Some((manifest, out)) => (Some(out.join("store")), manifest.test_every, manifest.downscale),
-            None => (None, 8, 1),
-        };
-        let temporary = tempfile::tempdir().map_err(|e| Failure::Work(format!("no temporary folder: {e}")))?;
-        let store = match (&options.store, trained.filter(|store| store.is_dir())) {
-            (Some(url), _) => Store::open(url)?,
-            (None, Some(folder)) => Store::open(&folder.display().to_string())?,
-            (None, None) => Store::open(&temporary.path().display().to_string())?,
-        };
+        let (every, downscale) = model.photos_used();
+        let (store, temporary) = model.photo_store(options.store.as_deref())?;
         let store: BlockingStore = store.blocking();
         let (downscale, test_every) = (options.downscale.unwrap_or(downscale), options.test_every.unwrap_or(every));
         let ingested = ingest_photos(&source, &store, downscale, output)?;

@@ -5,7 +5,7 @@ use std::path::Path;
 
 use scene::{ArtefactId, BadInput, Splats, frame};
 
-use super::{Block, Manifest, Model, PLAN_FILE, Tree, file_name, read_tree, save, save_json};
+use super::{Block, Manifest, Model, Tree, begin, file_name, read_tree, save, save_json};
 use crate::failure::{Failure, cannot};
 
 /// Refuses a place for a model made of another that would overwrite that, or that is of another kind.
@@ -53,25 +53,17 @@ pub(crate) fn rewrite(path: &Path, out: &Path, model: Model, splats: Splats) -> 
         now.append(&result.filter(|i| leaves.owner_of(&plan.ground, result.mean(i).as_dvec3()) != Some(block)));
         *result = now;
     }
-    let folder = out.join("model");
-    let manifest_path = folder.join("model.json");
-    // An older model is no longer one from here on.
-    if manifest_path.exists() {
-        fs::remove_dir_all(&folder).map_err(cannot("replaced", &folder))?;
-    }
-    let blocks_folder = folder.join("blocks");
-    fs::create_dir_all(&blocks_folder).map_err(cannot("made", &blocks_folder))?;
-    save(&folder.join(PLAN_FILE), &plan.to_frame())?;
+    let folder = begin(out, &plan)?;
     let mut blocks = Vec::new();
     for (&block, result) in &results {
         let bytes = frame::encode_splats(result);
-        save(&blocks_folder.join(file_name(block)), &bytes)?;
+        save(&folder.join("blocks").join(file_name(block)), &bytes)?;
         blocks.push(Block { block, artefact: ArtefactId::of(&bytes), splats: result.len() as u64 });
     }
     // As `plat train` lists them.
     blocks.sort_by_key(|b| (b.block.level, b.block.y, b.block.x));
     let splats = Tree { plan, results, antialiased }.sewn(&leaves);
-    save_json(&manifest_path, &Manifest { splats: splats.len() as u64, blocks, ..manifest.clone() })?;
+    save_json(&folder.join("model.json"), &Manifest { splats: splats.len() as u64, blocks, ..manifest.clone() })?;
     let bytes = Model { splats, ..model }.to_ply();
     save(&out.join("merged.ply"), &bytes)?;
     Ok(bytes.len() as u64)
