@@ -9,12 +9,14 @@ use crate::ground::{Ground, HALO_SCALE};
 use crate::plan::{PlanSettings, Task};
 use crate::select::Sightings;
 
-/// Splats of all blocks of a level, against the level below it.
+/// Splats of a block, against those of its children.
 const INNER_BUDGET_RATIO: f64 = 1.0 / 2.5;
 /// Splats that a task gets at least, where the whole budget allows it.
 const MIN_BUDGET: u32 = 500;
-/// Work of all blocks of a level, against the level below it: leaves get 90 % of a deep tree.
+/// Work of all blocks of a height, against the height below it: leaves get 90 % of a deep tree.
 const INNER_WORK_RATIO: f64 = 0.1;
+/// A block that keeps this share of its own need, because too few of its children have a task, is worked on as a leaf.
+const KEEPS_MUCH: f64 = 0.25;
 /// A step costs its pixels and, for the projection and the optimiser, this many pixels for each splat.
 pub(crate) const PIXELS_PER_SPLAT: f64 = 0.25;
 /// Steps of a task at least.
@@ -65,32 +67,57 @@ impl Needs {
     }
 }
 
-/// Splits `settings.budget` so that the merged model has that many splats, where there is most to model. The parts of
-/// a block that its children take over get [`INNER_BUDGET_RATIO`] per level above the leaves; those that stay with it
-/// (children without a task) get what a leaf would.
-pub(crate) fn set_budgets(tasks: &mut [Task], needs: &Needs, settings: &PlanSettings, levels: u8) {
-    let blocks: BTreeSet<BlockId> = tasks.iter().map(|t| t.block).collect();
-    let total = f64::from(settings.budget);
-    let mut kept = 0.0;
-    for level in 0..=levels {
-        let of_level: Vec<&mut Task> = tasks.iter_mut().filter(|t| t.block.level == level).collect();
-        let ratio = INNER_BUDGET_RATIO.powi(i32::from(levels - level));
-        let need = |task: &Task| -> f64 {
-            if level == levels {
-                return needs.of_block(task.block);
-            }
-            let weight = |child: &BlockId| if blocks.contains(child) { ratio } else { 1.0 };
-            task.block.children().iter().map(|child| weight(child) * needs.of_block(*child)).sum()
+/// What a task's place in the tree says of its means.
+struct Standing {
+    /// Tasks below it on the way to the nearest leaf; 0 for blocks that keep much of their own ground, as a leaf does.
+    height: u8,
+    /// Share of the scene that stays with it: its own, less that of the children that have a task.
+    kept: f64,
+    /// Splats that it wants, as a share of the budget.
+    splats: f64,
+}
+
+/// The standing of each task. What a block's children take over gets [`INNER_BUDGET_RATIO`] of their splats, what it
+/// keeps as many as in a leaf.
+fn standings(tasks: &[Task], needs: &Needs) -> Vec<Standing> {
+    let mut known: BTreeMap<BlockId, Standing> = BTreeMap::new();
+    // Children come after their parents.
+    for block in tasks.iter().rev().map(|task| task.block) {
+        let below: Vec<BlockId> = block.children().into_iter().filter(|child| known.contains_key(child)).collect();
+        let need = needs.of_block(block);
+        let taken: f64 = below.iter().map(|child| needs.of_block(*child)).sum();
+        let kept = if below.is_empty() { need } else { (need - taken).max(0.0) };
+        let inner: f64 = below.iter().map(|child| INNER_BUDGET_RATIO * known[child].splats).sum();
+        let height = match below.iter().map(|child| known[child].height).min() {
+            Some(lowest) if kept < KEEPS_MUCH * need => lowest + 1,
+            _ => 0,
         };
-        let shares: Vec<f64> = of_level.iter().map(|t| need(t)).collect();
-        let pool = if level == levels { total - kept } else { total * shares.iter().sum::<f64>() };
-        kept += (of_level.iter().filter(|_| level < levels))
-            .flat_map(|t| t.block.children())
-            .filter(|child| !blocks.contains(child))
-            .map(|child| total * needs.of_block(child))
-            .sum::<f64>();
-        for (task, budget) in of_level.into_iter().zip(split(pool.round(), &shares, MIN_BUDGET)) {
-            task.budget = budget;
+        known.insert(block, Standing { height, kept, splats: kept + inner });
+    }
+    tasks.iter().filter_map(|task| known.remove(&task.block)).collect()
+}
+
+/// Shares out splats and steps. `mean_pixels`: of a full training image.
+pub(crate) fn set_means(tasks: &mut [Task], needs: &Needs, settings: &PlanSettings, mean_pixels: f64) {
+    let standings = standings(tasks, needs);
+    set_budgets(tasks, &standings, settings);
+    set_steps(tasks, &standings, settings, mean_pixels);
+}
+
+/// Splits `settings.budget` so that the merged model has that many splats, where there is most to model.
+fn set_budgets(tasks: &mut [Task], standings: &[Standing], settings: &PlanSettings) {
+    let total = f64::from(settings.budget);
+    let parents: BTreeSet<BlockId> = tasks.iter().filter_map(|task| task.parent).collect();
+    // Leaves together, and inner blocks level by level; what these keep is not the leaves' to have.
+    let group = |task: &Task| parents.contains(&task.block).then_some(task.block.level);
+    let kept: f64 = tasks.iter().zip(standings).filter(|(task, _)| group(task).is_some()).map(|(_, s)| s.kept).sum();
+    let groups: BTreeSet<Option<u8>> = tasks.iter().map(group).collect();
+    for of in groups {
+        let rows: Vec<usize> = (0..tasks.len()).filter(|&i| group(&tasks[i]) == of).collect();
+        let shares: Vec<f64> = rows.iter().map(|&i| standings[i].splats).collect();
+        let pool = if of.is_some() { total * shares.iter().sum::<f64>() } else { total * (1.0 - kept) };
+        for (row, budget) in rows.into_iter().zip(split(pool.round(), &shares, MIN_BUDGET)) {
+            tasks[row].budget = budget;
         }
     }
 }
@@ -115,9 +142,9 @@ fn split(pool: f64, shares: &[f64], minimum: u32) -> Vec<u32> {
         .collect()
 }
 
-/// Shares out the work of `settings.steps` full images of the whole scene: over levels by [`INNER_WORK_RATIO`], within
-/// a level so that every window is seen equally often.
-pub(crate) fn set_steps(tasks: &mut [Task], settings: &PlanSettings, levels: u8, mean_pixels: f64) {
+/// Shares out the work of `settings.steps` full images of the whole scene: over heights by [`INNER_WORK_RATIO`], within a
+/// height so that every window is seen equally often.
+fn set_steps(tasks: &mut [Task], standings: &[Standing], settings: &PlanSettings, mean_pixels: f64) {
     if let [task] = tasks
         && task.views.iter().all(|v| v.mip == 0)
     {
@@ -125,17 +152,18 @@ pub(crate) fn set_steps(tasks: &mut [Task], settings: &PlanSettings, levels: u8,
         return;
     }
     let work = f64::from(settings.steps) * (mean_pixels + PIXELS_PER_SPLAT * f64::from(settings.budget));
-    let present: BTreeSet<u8> = tasks.iter().map(|t| t.block.level).collect();
-    let weight = |level: u8| INNER_WORK_RATIO.powi(i32::from(levels - level));
-    let weights: f64 = present.iter().map(|&l| weight(l)).sum();
-    for &level in &present {
-        let of_level = |t: &&mut Task| t.block.level == level;
-        // One visit to every window of the level.
-        let visit: f64 = (tasks.iter().filter(|t| t.block.level == level))
+    let heights: BTreeSet<u8> = standings.iter().map(|s| s.height).collect();
+    let weight = |height: u8| INNER_WORK_RATIO.powi(i32::from(height));
+    let weights: f64 = heights.iter().map(|&height| weight(height)).sum();
+    for &height in &heights {
+        let rows: Vec<usize> = (0..tasks.len()).filter(|&i| standings[i].height == height).collect();
+        // One visit to every window of the height.
+        let visit: f64 = (rows.iter().map(|&i| &tasks[i]))
             .map(|t| t.window_pixels() as f64 + PIXELS_PER_SPLAT * f64::from(t.budget) * t.views.len() as f64)
             .sum();
-        let visits = work * weight(level) / weights / visit.max(1.0);
-        for task in tasks.iter_mut().filter(of_level) {
+        let visits = work * weight(height) / weights / visit.max(1.0);
+        for task in rows {
+            let task = &mut tasks[task];
             task.steps = ((visits * task.views.len() as f64).round() as u32).max(MIN_STEPS.min(settings.steps));
         }
     }

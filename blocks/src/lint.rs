@@ -87,11 +87,12 @@ impl Findings {
 fn ownership(plan: &Plan, capture: &Capture, findings: &mut Findings) {
     let (leaves, tasks) = (plan.leaves(), plan.tasks.iter().map(|t| t.block).collect::<BTreeSet<_>>());
     let (mut finite, mut coarse, mut outside) = (0usize, 0usize, 0usize);
+    let finest_metres = plan.rho_metres.iter().copied().fold(f64::INFINITY, f64::min);
     for &point in capture.points.positions.iter().filter(|p| p.is_finite()) {
         finite += 1;
         match leaves.owner_of(&plan.ground, point) {
             Some(owner) if tasks.contains(&owner) => {
-                coarse += usize::from(owner.level < plan.levels);
+                coarse += usize::from(plan.task(owner).is_some_and(|task| task.rho_metres > 1.5 * finest_metres));
                 outside += usize::from(!plan.ground.in_halo(owner, point));
             }
             _ => {

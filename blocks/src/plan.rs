@@ -46,6 +46,9 @@ pub struct PlanSettings {
     pub budget: u32,
     /// What leaves may lose of their PSNR for fewer splats, dB; 0 prunes nothing.
     pub tolerance_db: f64,
+    /// A block is refined where its parent's splats are off by more than this in its own photos, root mean square, 0 to 1; 0
+    /// refines all.
+    pub residual: f64,
     /// Every which view is held out; 0 holds out none.
     pub test_every: u32,
     /// Degree of the spherical harmonics, 0 to 3.
@@ -66,6 +69,7 @@ impl Default for PlanSettings {
             steps: 3000,
             budget: 200_000,
             tolerance_db: 0.0,
+            residual: 0.0,
             test_every: 8,
             sh_degree: 3,
             antialiased: false,

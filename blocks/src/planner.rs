@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use scene::{ArtefactId, BlockId, Capture};
 
-use crate::allot::{Needs, set_budgets, set_drawn, set_memory, set_steps};
+use crate::allot::{Needs, set_drawn, set_means, set_memory};
 use crate::ground::{Ground, quantile};
 use crate::lod::{context_of, finished_neighbours, training_order};
 use crate::plan::{MAX_LEVELS, Mode, Plan, PlanError, PlanSettings, Task, VERSION};
@@ -21,7 +21,11 @@ const MEAN_VIEWS: usize = 24;
 const MEAN_POINTS: usize = 500;
 /// ... and together this share of all of them.
 const MIN_COVERED: f64 = 0.9;
-/// A block with fewer views has no task (unless it is the root) ...
+/// A leaf is split once more where it holds this many times as many points as the others on average ...
+const CROWDED: f64 = 4.0;
+/// ... at most so often.
+const MAX_SPLITS: u8 = 3;
+/// A block that fewer views see finer than its parent could use has no task (unless it is the root) ...
 pub const MIN_VIEWS: usize = 6;
 /// ... nor has one with fewer sparse points in its core.
 pub const MIN_POINTS: u32 = 10;
@@ -62,14 +66,17 @@ pub fn plan(
         (_, Some(levels)) => levels,
         (_, None) => survey.choose_levels(finest_metres),
     };
-    let (levels, mut tasks) = survey.lay_out(settings.mode, levels, finest_metres)?;
+    let (base, mut tasks) = survey.lay_out(settings.mode, levels, finest_metres)?;
+    if settings.mode == Mode::Tree && settings.levels.is_none() {
+        survey.split_crowded(base, finest_metres, &mut tasks);
+    }
+    let levels = tasks.iter().map(|task| task.block.level).max().unwrap_or(base);
 
     let needs = Needs::of(capture, &sightings, &ground, levels, finest_metres);
-    set_budgets(&mut tasks, &needs, settings, levels);
     let train_views = usable_views.iter().filter(|&&v| !test(v));
     let pixels: Vec<f64> = train_views.map(|&v| capture.views[v].camera.full().area() as f64).collect();
     let mean_pixels = pixels.iter().sum::<f64>() / pixels.len() as f64;
-    set_steps(&mut tasks, settings, levels, mean_pixels);
+    set_means(&mut tasks, &needs, settings, mean_pixels);
     set_drawn(&mut tasks, capture, &ground);
     set_memory(&mut tasks, settings);
     Ok(Plan {
@@ -79,14 +86,14 @@ pub fn plan(
         backend: backend.to_owned(),
         ground,
         levels,
-        rho_metres: (0..=levels).map(|level| rho_of(finest_metres, levels, level)).collect(),
+        rho_metres: (0..=levels).map(|level| rho_of(finest_metres, base, level)).collect(),
         tasks,
     })
 }
 
-/// Metres per pixel of a level: the finest at the deepest, twice as much with every level up.
-fn rho_of(finest_metres: f64, levels: u8, level: u8) -> f64 {
-    finest_metres * f64::from(1u32 << (levels - level))
+/// Metres per pixel of a level: the finest at `base` and below, twice as much with every level up.
+fn rho_of(finest_metres: f64, base: u8, level: u8) -> f64 {
+    finest_metres * f64::from(1u32 << base.saturating_sub(level))
 }
 
 fn check(settings: &PlanSettings) -> Result<(), PlanError> {
@@ -99,6 +106,9 @@ fn check(settings: &PlanSettings) -> Result<(), PlanError> {
     }
     if !(settings.tolerance_db >= 0.0 && settings.tolerance_db.is_finite()) {
         return bad("--tolerance-db", format!("{} is no loss", settings.tolerance_db), "give decibels from 0");
+    }
+    if !(0.0..1.0).contains(&settings.residual) {
+        return bad("--residual", format!("{} is out of range", settings.residual), "give 0 to 1, such as 0.01");
     }
     if settings.sh_degree > 3 {
         return bad("sh_degree", format!("{} is not supported", settings.sh_degree), "give 0 to 3");
@@ -124,8 +134,31 @@ impl Survey<'_> {
     fn tasks_of(&self, level: u8, rho_metres: f64) -> BTreeMap<BlockId, Selection> {
         let mut selections =
             select_level(self.capture, self.sightings, self.ground, level, rho_metres, self.test_every);
-        selections.retain(|_, s| level == 0 || s.views.len() >= MIN_VIEWS && s.core_points >= MIN_POINTS);
+        selections.retain(|_, s| level == 0 || s.finer_views >= MIN_VIEWS && s.core_points >= MIN_POINTS);
         selections
+    }
+
+    /// Gives the most crowded leaves children that share their work, at the same resolution: those with several times
+    /// the points of the others, and views enough for all.
+    fn split_crowded(&self, base: u8, finest_metres: f64, tasks: &mut Vec<Task>) {
+        let points: Vec<f64> =
+            tasks.iter().filter(|task| task.block.level == base).map(|task| f64::from(task.points)).collect();
+        let mean = points.iter().sum::<f64>() / points.len().max(1) as f64;
+        for level in base + 1..=(base + MAX_SPLITS).min(MAX_LEVELS) {
+            let crowded: BTreeSet<BlockId> = (tasks.iter())
+                .filter(|task| task.block.level == level - 1)
+                .filter(|task| f64::from(task.points) > CROWDED * mean.max(MEAN_POINTS as f64))
+                .filter(|task| task.views.len() >= 2 * MEAN_VIEWS)
+                .map(|task| task.block)
+                .collect();
+            let mut selections = self.tasks_of(level, finest_metres);
+            selections.retain(|block, _| block.parent().is_some_and(|parent| crowded.contains(&parent)));
+            if selections.is_empty() {
+                return;
+            }
+            let existing: BTreeSet<BlockId> = tasks.iter().map(|task| task.block).collect();
+            tasks.append(&mut self.tasks_from(Mode::Tree, selections, &existing, finest_metres));
+        }
     }
 
     /// The deepest level that resolution allows and whose blocks have enough views and points.
@@ -163,38 +196,51 @@ impl Survey<'_> {
                     .into_iter()
                     .partition(|u| Capture::is_test(u.view as usize, self.test_every));
             }
-            let of_level: BTreeSet<BlockId> = selections.keys().copied().collect();
-            let context = |block| -> Vec<BlockId> {
-                if !tree {
-                    return Vec::new();
-                }
-                let coarser = context_of(self.ground, block, &existing);
-                coarser.into_iter().chain(finished_neighbours(block, &of_level)).collect()
-            };
-            let mut tasks_of_level: Vec<Task> = (selections.into_iter())
-                .map(|(block, selection)| Task {
-                    block,
-                    parent: block.parent().filter(|_| tree),
-                    context: context(block),
-                    views: selection.views,
-                    test_views: selection.test_views,
-                    points: selection.halo_points,
-                    budget: 0,
-                    steps: 0,
-                    rho_metres,
-                    drawn: 0,
-                    memory_bytes: 0,
-                })
-                .collect();
-            tasks_of_level.sort_by_key(|t| training_order(t.block));
-            existing.extend(of_level);
-            tasks.append(&mut tasks_of_level);
+            let mut of_level = self.tasks_from(mode, selections, &existing, rho_metres);
+            existing.extend(of_level.iter().map(|task| task.block));
+            tasks.append(&mut of_level);
         }
         match tasks.last().map(|t| t.block.level) {
             None => Err(PlanError::NoBlocks { levels, needed: MIN_VIEWS }),
             Some(reached) if reached < levels => self.lay_out(mode, reached, finest_metres),
             Some(_) => Ok((levels, tasks)),
         }
+    }
+
+    /// The tasks of one level, in training order.
+    fn tasks_from(
+        &self,
+        mode: Mode,
+        selections: BTreeMap<BlockId, Selection>,
+        existing: &BTreeSet<BlockId>,
+        rho_metres: f64,
+    ) -> Vec<Task> {
+        let tree = mode == Mode::Tree;
+        let of_level: BTreeSet<BlockId> = selections.keys().copied().collect();
+        let context = |block| -> Vec<BlockId> {
+            if !tree {
+                return Vec::new();
+            }
+            let coarser = context_of(self.ground, block, existing);
+            coarser.into_iter().chain(finished_neighbours(block, &of_level)).collect()
+        };
+        let mut tasks: Vec<Task> = (selections.into_iter())
+            .map(|(block, selection)| Task {
+                block,
+                parent: block.parent().filter(|_| tree),
+                context: context(block),
+                views: selection.views,
+                test_views: selection.test_views,
+                points: selection.halo_points,
+                budget: 0,
+                steps: 0,
+                rho_metres,
+                drawn: 0,
+                memory_bytes: 0,
+            })
+            .collect();
+        tasks.sort_by_key(|t| training_order(t.block));
+        tasks
     }
 }
 

@@ -5,6 +5,7 @@
 //! [`select_level`] hands each to the one to four blocks whose halo holds the point.
 
 use std::collections::BTreeMap;
+use std::f64::consts::SQRT_2;
 
 use glam::{DVec2, DVec3};
 use scene::{BlockId, Camera, Capture, Rect};
@@ -119,6 +120,9 @@ pub struct Selection {
     pub views: Vec<ViewUse>,
     /// Held-out views, by index.
     pub test_views: Vec<ViewUse>,
+    /// Training views whose finest pixels are as small as the block resolves (rounded as mips are): its parent, which
+    /// resolves half as much, cannot use them.
+    pub finer_views: usize,
     /// Sparse points in the halo.
     pub halo_points: u32,
     /// Sparse points in the core.
@@ -167,13 +171,15 @@ pub fn select_level(
         let (test, train): (Vec<Seen>, Vec<Seen>) =
             views.into_iter().partition(|s| Capture::is_test(s.view as usize, test_every));
         if let Some(selection) = selections.get_mut(&block) {
-            let pick = |seen| {
-                choose(seen, sightings, rho_metres)
-                    .iter()
-                    .filter_map(|s| s.window(capture, &content, rho_metres))
-                    .collect()
+            let pick = |seen| -> (Vec<ViewUse>, usize) {
+                let uses = choose(seen, sightings, rho_metres);
+                let uses = uses.iter().filter_map(|s| s.window(capture, &content, rho_metres).map(|used| (s, used)));
+                let (finer, uses): (Vec<bool>, Vec<ViewUse>) =
+                    uses.map(|(s, used)| (s.footprint_metres <= SQRT_2 * rho_metres, used)).unzip();
+                (uses, finer.into_iter().filter(|finer| *finer).count())
             };
-            (selection.views, selection.test_views) = (pick(train), pick(test));
+            (selection.views, selection.finer_views) = pick(train);
+            selection.test_views = pick(test).0;
         }
     }
     selections

@@ -67,6 +67,8 @@ pub(crate) enum BenchCommand {
     Prune(BenchPruneArgs),
     /// Build the demo, and append what it took and how good it is to the results
     Demo(BenchDemoArgs),
+    /// Train a city whose one half is a bare plain, as a tree of one depth and as one that follows the need; keep both
+    Adaptive(AdaptiveArgs),
 }
 
 /// A value, or `auto`: the program chooses.
@@ -167,6 +169,10 @@ pub(crate) struct PlanOptions {
     /// Prune the finest blocks within this loss of PSNR on the views that they are trained on; 0 prunes nothing
     #[arg(long, value_name = "X", value_parser = decibels, default_value_t = 0.1)]
     pub(crate) tolerance_db: f64,
+    /// Refine a block only where its parent's splats are off by more than this in the block's own photos (root mean square, as a
+    /// share of white); 0 refines all
+    #[arg(long, value_name = "R", value_parser = residual, default_value_t = 0.01)]
+    pub(crate) residual: f64,
     /// Seed of all random choices
     #[arg(long, value_name = "S", default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=i64::MAX as u64))]
     pub(crate) seed: u64,
@@ -203,6 +209,7 @@ impl PlanOptions {
             steps: self.steps.0.unwrap_or_else(steps),
             budget: self.budget.0.unwrap_or_else(budget),
             tolerance_db: self.tolerance_db,
+            residual: self.residual,
             test_every: self.test_every,
             antialiased: self.antialiased,
             ..PlanSettings::default()
@@ -437,6 +444,11 @@ fn decibels(text: &str) -> Result<f64, String> {
     value.ok_or_else(|| "give decibels from 0, such as 0.1".into())
 }
 
+fn residual(text: &str) -> Result<f64, String> {
+    let value = text.parse().ok().filter(|share: &f64| (0.0..1.0).contains(share));
+    value.ok_or_else(|| "give a share from 0 to 1, such as 0.01".into())
+}
+
 fn order(text: &str) -> Result<Order, String> {
     let names = || Order::ALL.map(Order::name).join(", ");
     Order::ALL.into_iter().find(|order| order.name() == text).ok_or_else(|| format!("give one of {}", names()))
@@ -545,6 +557,25 @@ pub(crate) struct BenchDemoArgs {
     pub(crate) results: PathBuf,
     #[command(flatten)]
     pub(crate) demo: DemoArgs,
+}
+
+#[derive(Debug, Clone, Args)]
+pub(crate) struct AdaptiveArgs {
+    /// Folder for the city and the models
+    #[arg(long, value_name = "DIR", default_value = "out/adaptive")]
+    pub(crate) out: PathBuf,
+    /// Seed of all random choices of the training
+    #[arg(long, value_name = "S", default_value_t = 0)]
+    pub(crate) seed: u64,
+    /// As of `plat train`, for both
+    #[arg(long, value_name = "X", value_parser = decibels, default_value_t = 0.1)]
+    pub(crate) tolerance_db: f64,
+    /// Threads
+    #[arg(long, value_name = "N", default_value_t = 1)]
+    pub(crate) threads: u32,
+    /// Folder of the result lines; these go to plat.jsonl there
+    #[arg(long, value_name = "DIR", default_value = "bench/results")]
+    pub(crate) results: PathBuf,
 }
 
 #[derive(Debug, Clone, Args)]

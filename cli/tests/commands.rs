@@ -31,7 +31,7 @@ fn refused(folder: &Path, words: &[&str], wanted: &str) {
 }
 
 fn city(folder: &Path, views: u32) {
-    let settings = CitySettings { seed: 3, extent_metres: 80.0, views, width: 64, height: 48 };
+    let settings = CitySettings { seed: 3, extent_metres: 80.0, views, width: 64, height: 48, plain: 0.0 };
     write_city(&folder.join("city"), &settings, |_, _| {}).unwrap();
 }
 

@@ -29,7 +29,7 @@ fn refused(folder: &Path, words: &[&str], wanted: &str) {
 fn cuts_and_seams_of_a_tree_are_measured() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
-    let settings = CitySettings { seed: 3, extent_metres: 80.0, views: 24, width: 96, height: 72 };
+    let settings = CitySettings { seed: 3, extent_metres: 80.0, views: 24, width: 96, height: 72, plain: 0.0 };
     write_city(&at.join("city"), &settings, |_, _| {}).unwrap();
     let train = |out: &str, blocks: &str| {
         let options = ["--steps", "300", "--budget", "3000", "--levels", "1", "--threads", "1", "--tolerance-db", "0"];

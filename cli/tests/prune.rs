@@ -68,7 +68,7 @@ fn a_file_is_pruned_by_opacity_and_size_alone() {
 fn a_trained_folder_is_pruned_within_a_tolerance_the_same_twice() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
-    let settings = CitySettings { seed: 3, extent_metres: 80.0, views: 20, width: 64, height: 48 };
+    let settings = CitySettings { seed: 3, extent_metres: 80.0, views: 20, width: 64, height: 48, plain: 0.0 };
     write_city(&at.join("city"), &settings, |_, _| {}).unwrap();
     let options = ["--steps", "80", "--budget", "1500", "--levels", "1", "--test-every", "5"];
     done(at, "2", &[&["train", "city", "--out", "model"][..], &options].concat());

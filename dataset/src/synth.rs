@@ -35,12 +35,14 @@ pub struct CitySettings {
     pub width: u32,
     /// Photo height, pixels: 16 to 4,096.
     pub height: u32,
+    /// Share of the city, from its west side, that is a bare plain: 0 to 0.8.
+    pub plain: f64,
 }
 
 impl Default for CitySettings {
     /// The demo's city: 200 m, 12 megapixels in all.
     fn default() -> Self {
-        Self { seed: 1, extent_metres: 200.0, views: 320, width: 240, height: 160 }
+        Self { seed: 1, extent_metres: 200.0, views: 320, width: 240, height: 160, plain: 0.0 }
     }
 }
 
@@ -80,7 +82,7 @@ pub fn write_city(
     progress: impl Fn(usize, usize) + Sync,
 ) -> Result<CitySummary, BadInput> {
     check(settings)?;
-    let world = World::new(Layout::new(settings.seed, settings.extent_metres));
+    let world = World::new(Layout::new(settings.seed, settings.extent_metres, settings.plain));
     let views = views(settings, &world.layout);
     let images = out.join("images");
     fs::create_dir_all(&images).map_err(|e| cannot_write(&images, e))?;
@@ -112,6 +114,7 @@ fn check(settings: &CitySettings) -> Result<(), BadInput> {
         s if !(16..=20_000).contains(&s.views) => refuse("the number of views", "choose 16 to 20,000"),
         s if !(16..=4096).contains(&s.width) => refuse("the photo width", "choose 16 to 4,096 pixels"),
         s if !(16..=4096).contains(&s.height) => refuse("the photo height", "choose 16 to 4,096 pixels"),
+        s if !(0.0..=0.8).contains(&s.plain) => refuse("the share of bare plain", "choose 0 to 0.8"),
         _ => Ok(()),
     }
 }
@@ -289,7 +292,8 @@ fn reconstruction(capture: &Capture) -> Reconstruction {
 mod tests {
     use super::*;
 
-    const SMALL: CitySettings = CitySettings { seed: 7, extent_metres: 90.0, views: 24, width: 48, height: 32 };
+    const SMALL: CitySettings =
+        CitySettings { seed: 7, extent_metres: 90.0, views: 24, width: 48, height: 32, plain: 0.0 };
 
     /// All files under a folder with their bytes.
     fn files(folder: &Path) -> BTreeMap<String, Vec<u8>> {
@@ -321,7 +325,7 @@ mod tests {
 
     #[test]
     fn views_are_in_name_order_and_see_the_city() {
-        let layout = Layout::new(1, 200.0);
+        let layout = Layout::new(1, 200.0, 0.0);
         let views = views(&CitySettings::default(), &layout);
         assert_eq!(views.len(), 320);
         assert!(views.is_sorted_by(|a, b| a.name < b.name));
@@ -348,7 +352,7 @@ mod tests {
     #[test]
     fn tracked_points_project_onto_their_own_colour() {
         let settings = CitySettings { width: 96, height: 64, ..SMALL };
-        let world = World::new(Layout::new(settings.seed, settings.extent_metres));
+        let world = World::new(Layout::new(settings.seed, settings.extent_metres, settings.plain));
         let views = views(&settings, &world.layout);
         let points = sparse_points(&settings, &world, &views);
         // seen from where it was sampled, a point has the colour of its pixel, but for edges and blur

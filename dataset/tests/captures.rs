@@ -15,7 +15,7 @@ use scene::colmap::{self, Reconstruction};
 use store::Store;
 use tempfile::TempDir;
 
-const CITY: CitySettings = CitySettings { seed: 3, extent_metres: 90.0, views: 24, width: 48, height: 32 };
+const CITY: CitySettings = CitySettings { seed: 3, extent_metres: 90.0, views: 24, width: 48, height: 32, plain: 0.0 };
 
 /// Opens, ingests, loads and plans; all words in one line if the capture is at fault.
 fn run(path: &Path) -> Result<Source, String> {

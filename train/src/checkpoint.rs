@@ -6,11 +6,12 @@ use scene::{CodecError, Splats};
 use serde::{Deserialize, Serialize};
 
 use crate::growth::Evidence;
+use crate::need::Need;
 use crate::optimiser::Adam;
 
 /// A checkpoint; the header is [`Header`], the bulk all columns of the splats and of both moments, then what was seen of each
 /// splat since the last refinement: error, weight (f32) and views (u32).
-const CHECKPOINT: Kind = Kind(*b"ckpt", 1);
+const CHECKPOINT: Kind = Kind(*b"ckpt", 2);
 
 /// All that a step depends on besides its job.
 #[derive(Debug, Clone)]
@@ -21,6 +22,7 @@ pub struct State {
     pub(crate) skipped: u32,
     /// Splats that counted at first.
     pub(crate) start_count: usize,
+    pub(crate) need: Need,
     pub(crate) splats: Splats,
     pub(crate) adam: Adam,
     pub(crate) evidence: Evidence,
@@ -31,6 +33,7 @@ struct Header {
     step: u32,
     skipped: u32,
     start_count: u64,
+    need: Need,
     adam_step: i32,
     sh_degree: u8,
     count: u64,
@@ -52,6 +55,7 @@ impl State {
             step: self.step,
             skipped: self.skipped,
             start_count: self.start_count as u64,
+            need: self.need.clone(),
             adam_step,
             sh_degree: self.splats.sh_degree(),
             count: self.splats.len() as u64,
@@ -98,6 +102,7 @@ impl State {
             step: header.step,
             skipped: header.skipped,
             start_count: usize::try_from(header.start_count).map_err(|_| wrong())?,
+            need: header.need,
             splats,
             adam: Adam::from_parts(Isa::detect(), header.adam_step, first, second),
             evidence: Evidence { error: floats(part(0)), weight: floats(part(1)), views },
@@ -123,7 +128,15 @@ mod tests {
         let evidence = Evidence { error: vec![0.5; 20], weight: vec![0.25; 20], views: (0..20).collect() };
         for evidence in [evidence, Evidence::default()] {
             let adam = Adam::from_parts(Isa::detect(), 41, moments(0.5), moments(2.0));
-            let state = State { step: 40, skipped: 1, start_count: 7, splats: splats.clone(), adam, evidence };
+            let state = State {
+                step: 40,
+                skipped: 1,
+                start_count: 7,
+                need: Need::default(),
+                splats: splats.clone(),
+                adam,
+                evidence,
+            };
             let bytes = state.to_frame();
             let read = State::from_frame(&bytes).unwrap();
             assert_eq!((read.step, read.skipped, read.start_count), (40, 1, 7));
@@ -135,8 +148,16 @@ mod tests {
             assert!(State::from_frame(&[]).is_err());
         }
         // A header that promises what the bulk does not have.
-        let header =
-            Header { step: 1, skipped: 0, start_count: 0, adam_step: 1, sh_degree: 3, count: u64::MAX / 3, evident: 0 };
+        let header = Header {
+            step: 1,
+            skipped: 0,
+            start_count: 0,
+            need: Need::default(),
+            adam_step: 1,
+            sh_degree: 3,
+            count: u64::MAX / 3,
+            evident: 0,
+        };
         assert!(State::from_frame(&frame::encode(CHECKPOINT, &header, &[0; 64])).is_err());
     }
 }

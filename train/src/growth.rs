@@ -19,6 +19,8 @@ pub struct Growth {
     pub from: f32,
     /// See `from`.
     pub until: f32,
+    /// Growth ends when it brings less than this for each five percent of splats, dB.
+    pub worth_db: f32,
     /// Most new splats in one refinement, as a share of those there.
     pub at_most: f32,
     /// Splats less opaque than this are removed.
@@ -37,6 +39,7 @@ impl Default for Growth {
             every: 50,
             from: 0.05,
             until: 0.7,
+            worth_db: 0.02,
             at_most: 0.3,
             min_opacity: 0.01,
             offset: 0.7,

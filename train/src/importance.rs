@@ -115,6 +115,21 @@ impl<'a> Views<'a> {
         Ok(sum / count.max(1.0))
     }
 
+    /// Root of the mean squared error over all that counts in the views, 0 to 1; `None` where that is next to nothing.
+    ///
+    /// # Errors
+    /// A window that cannot be read.
+    pub fn residual(&self, splats: &Splats, shares: &Shares) -> Result<Option<f64>, TrainError> {
+        /// Pixels without which there is nothing to tell.
+        const MIN_PIXELS: f64 = 64.0;
+        let (mut sum, mut pixels) = (0.0, 0.0);
+        self.compare(splats, Some(shares), |_, compared| {
+            sum += compared.mse * compared.pixels;
+            pixels += compared.pixels;
+        })?;
+        Ok((pixels >= MIN_PIXELS).then(|| (sum / pixels).sqrt()))
+    }
+
     /// The importance of each splat in an order; not seen is the least.
     ///
     /// # Errors

@@ -10,6 +10,7 @@ pub mod importance;
 pub mod init;
 pub mod loss;
 pub mod metrics;
+pub mod need;
 pub mod optimiser;
 pub mod prune;
 pub mod random;

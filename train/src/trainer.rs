@@ -12,6 +12,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::growth::{self, Evidence, Growth};
 use crate::loss::Photometric;
+use crate::need::{self, Need};
 use crate::optimiser::{Adam, Rates};
 use crate::{State, WindowSource, random};
 
@@ -40,8 +41,11 @@ pub struct Recipe {
     pub needle_pull: f32,
     /// Each entry is the share of the steps after which the next SH degree joins.
     pub sh_from: [f32; 3],
-    /// Each entry is the share of the steps that is trained at one mip coarser than the next, coarsest first.
+    /// Each entry is the largest share of the steps that is trained at one mip coarser than the next, coarsest first.
     pub coarse: Vec<f32>,
+    /// Finer pixels are looked at once the error is this many times what coarse photos lack (see [`crate::need`]); with 0 only
+    /// after those shares.
+    pub closer_at: f32,
     /// Opacity of the first splats.
     pub initial_opacity: f32,
     /// When and how splats are added and removed.
@@ -62,7 +66,8 @@ impl Default for Recipe {
             opacity_pull: 0.0,
             needle_pull: 0.01,
             sh_from: [0.3, 0.45, 0.6],
-            coarse: vec![0.15, 0.3],
+            coarse: vec![0.2, 0.5],
+            closer_at: 2.0,
             initial_opacity: 0.1,
             growth: Growth::default(),
         }
@@ -70,8 +75,8 @@ impl Default for Recipe {
 }
 
 impl Recipe {
-    /// For splats that already fit one mip coarser: no coarse beginning, full SH degree at once, and longer first steps, as
-    /// there are fewer of them.
+    /// For splats that already fit one mip coarser: full SH degree at once, and longer first steps, as there are fewer of
+    /// them. Those that do not fit it yet are trained there first.
     pub fn refinement() -> Self {
         let recipe = Self::default();
         let longer = |[first, last]: [f32; 2]| [1.5 * first, last];
@@ -82,7 +87,7 @@ impl Recipe {
             opacity: longer(recipe.opacity),
             sh_dc: longer(recipe.sh_dc),
             sh_from: [0.0; 3],
-            coarse: Vec::new(),
+            coarse: vec![0.7],
             ..recipe
         }
     }
@@ -215,11 +220,20 @@ pub fn train_on(
         step: 0,
         skipped: 0,
         start_count: (0..initial.len()).filter(|&i| counts(initial.mean(i))).count(),
+        need: Need::default(),
         adam: Adam::new(isa, &initial),
         evidence: Evidence::default(),
         splats: initial,
     });
     let log_scale_bounds = job.size_bounds_metres.map(f32::ln);
+    let lacks = (now.need.stage..recipe.coarse.len() as u8)
+        .map(|stage| match recipe.closer_at > 0.0 {
+            true => need::detail(views, job.source, recipe.coarse.len() as u8 - stage),
+            false => Ok(0.0),
+        })
+        .collect::<Result<Vec<f64>, _>>()?;
+    let first_stage = now.need.stage;
+    let until = (recipe.growth.until * steps as f32) as u32;
 
     while now.step < steps {
         let step = now.step;
@@ -228,8 +242,8 @@ pub fn train_on(
         }
         let progress = step as f32 / steps as f32;
         let view = pick(views, job.seed, step);
-        let (mip, rect, camera) =
-            (0..=coarser(recipe, progress)).rev().find_map(|c| view.at(c)).expect("at(0) always is");
+        let coarser = (recipe.coarse.len() as u8).saturating_sub(now.need.stage);
+        let (mip, rect, camera) = (0..=coarser).rev().find_map(|c| view.at(c)).expect("at(0) always is");
         let photo = job.source.window(view.view, mip, rect).map_err(TrainError::Source)?;
 
         let sh_degree = recipe.sh_from.iter().filter(|&&from| progress >= from).count() as u8;
@@ -252,7 +266,21 @@ pub fn train_on(
 
         let growth = &recipe.growth;
         now.step = step + 1;
-        let last_refinement = (growth.until * steps as f32) as u32 + growth.every;
+        let epoch = views.len() as u32;
+        let seen = value.total.is_finite().then_some(value.l1);
+        let error = now.need.note(seen, now.splats.len(), epoch, now.step.is_multiple_of(epoch));
+        if coarser > 0 {
+            let stage = usize::from(now.need.stage);
+            let fits =
+                error.is_some_and(|e| e <= f64::from(recipe.closer_at) * lacks[stage - usize::from(first_stage)]);
+            if fits || now.step.saturating_sub(now.need.since) >= (recipe.coarse[stage] * steps as f32) as u32 {
+                now.need.look_closer(now.step);
+            }
+        }
+        if error.is_some() && now.step < until && now.need.gains_less_than(f64::from(growth.worth_db)) {
+            now.step = until;
+        }
+        let last_refinement = until + growth.every;
         if now.step.is_multiple_of(growth.every)
             && progress >= growth.from
             && now.step <= last_refinement
@@ -283,18 +311,6 @@ fn pick(views: &[TrainView], seed: u64, step: u32) -> &TrainView {
     let n = views.len() as u32;
     let order = random::shuffle(random::bits(seed, u64::from(step / n)), views.len());
     &views[order[(step % n) as usize] as usize]
-}
-
-/// How many mips coarser than the last a step is trained.
-fn coarser(recipe: &Recipe, progress: f32) -> u8 {
-    let mut from = 0.0;
-    for (n, share) in recipe.coarse.iter().enumerate() {
-        from += share;
-        if progress < from {
-            return (recipe.coarse.len() - n) as u8;
-        }
-    }
-    0
 }
 
 /// Step sizes at a share of the way: geometric between first and last.

@@ -175,7 +175,8 @@ fn rehearse(job: &Job, cap: &Cap, until: f64) -> Pace {
             at if coarser > 0 => coarse[at],
             _ => 1.0 - coarse.iter().sum::<f32>(),
         };
-        let mut recipe = Recipe { coarse: vec![1.0; coarser], sh_from: [0.0; 3], ..job.recipe.clone() };
+        let coarse = vec![1.0; coarser];
+        let mut recipe = Recipe { coarse, closer_at: 0.0, sh_from: [0.0; 3], ..job.recipe.clone() };
         // Never begins.
         recipe.growth.from = 2.0;
         let steps = 2 * count as u32;

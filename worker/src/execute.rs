@@ -24,6 +24,7 @@ use crate::cap::{Cap, Limit};
 use crate::clock::Stopwatch;
 use crate::memory::Memory;
 use crate::merged::{Finished, Judge};
+use crate::refine::{self, Start};
 use crate::{Execute, ExecuteError, Flow, Report, TaskOrder};
 
 /// Steps between two reports.
@@ -53,6 +54,8 @@ pub struct Shared {
     pub cap: Option<Cap>,
     /// Tasks that an earlier run had finished, or begun and left a checkpoint of.
     pub resumed: AtomicU32,
+    /// Blocks that were trained no finer than their parent.
+    pub settled: AtomicU32,
 }
 
 /// Trains blocks on the CPU backend.
@@ -168,19 +171,35 @@ impl Block<'_> {
         let Shared { finished, cap, .. } = &*self.trainer.shared;
         let eval_every = self.trainer.options.eval_every;
         let recipe = self.recipe();
-        let views = self.windows(&task.views)?;
+        let wrong = |error| match error {
+            TrainError::NoViews | TrainError::Empty(_) => {
+                ExecuteError { message: format!("block {}: {error}", task.block), is_input: true }
+            }
+            TrainError::Source(_) => failed(error),
+        };
+        let counts = |p: Vec3| plan.ground.owns(task.block, p.as_dvec3());
         let budget = self.budget(&results);
         let mut judge = Judge::new(plan, self.capture, &self.trainer.store);
         if judge.is_some() {
             finished.learn(self.order.plan, plan, &results);
         }
+        let mut views = self.windows(&task.views)?;
+        let mut start = self.start(results, &views, &recipe)?;
+        let settled = self.is_settled(&start, &views, &counts).map_err(wrong)?;
+        if settled {
+            let coarser = refine::coarser(&views);
+            if !plan.settings.antialiased {
+                start = refine::moved(start, &views, &coarser);
+            }
+            views = coarser;
+            self.trainer.shared.settled.fetch_add(1, Ordering::Relaxed);
+        }
+        let (initial, context) = start;
         let mut measure = |splats: &Splats| {
             let judge = judge.as_mut()?;
             let merged = finished.with(self.order.plan, plan, task.block, &self.handed_on(splats.clone(), &views));
             judge.psnr(&merged).map(|psnr| (psnr, merged.len() as u64))
         };
-        let (initial, context) = self.start(results, &views, &recipe)?;
-        let counts = |p: Vec3| plan.ground.owns(task.block, p.as_dvec3());
         let cut = task.context_cut();
         let keeps = |p: Vec3| self.trains(&cut, p.as_dvec3());
         let job_of = |initial, steps| train::Job {
@@ -199,11 +218,13 @@ impl Block<'_> {
         };
         let pruning = self.pruning();
         let mut job = job_of(initial, task.steps);
-        if pruning.is_some() {
+        if settled {
+            job.steps = 0;
+        } else if pruning.is_some() {
             job.steps = prune::steps_before(task.steps);
         }
         let planned = job.steps;
-        let limit = cap.as_ref().map(|cap| {
+        let limit = cap.as_ref().filter(|_| !settled).map(|cap| {
             let evaluate = |splats: &Splats| stopwatch.paused(|| measure(splats));
             let part = f64::from(planned) / f64::from(task.steps.max(1));
             Limit::of(cap, plan, self.order.task, &mut job, part, eval_every, evaluate)
@@ -211,7 +232,10 @@ impl Block<'_> {
         let over = || limit.as_ref().is_some_and(Limit::is_over);
         let trained = job.steps;
         // In proportion, where the cap left fewer.
-        let whole = (u64::from(task.steps) * u64::from(trained)).div_ceil(u64::from(planned.max(1))) as u32;
+        let whole = match planned {
+            0 => task.steps,
+            _ => (u64::from(task.steps) * u64::from(trained)).div_ceil(u64::from(planned)) as u32,
+        };
         let steps = trained + pruning.map_or(0, |pruning| pruning.steps(whole));
         let (mut cancelled, mut late) = (false, false);
         // Reports a step if one is due; whether to go on.
@@ -236,12 +260,6 @@ impl Block<'_> {
             !cancelled
         };
         let going = |on: bool| if on { train::Flow::Continue } else { train::Flow::Stop };
-        let wrong = |error| match error {
-            TrainError::NoViews | TrainError::Empty(_) => {
-                ExecuteError { message: format!("block {}: {error}", task.block), is_input: true }
-            }
-            TrainError::Source(_) => failed(error),
-        };
         let (mut loss, mut stopped) = (f64::NAN, false);
         let from = self.memory.and_then(|memory| memory.checkpoint(&self.trainer.store));
         if from.is_some() {
@@ -275,6 +293,9 @@ impl Block<'_> {
             tracing::info!(block = %task.block, before = outcome.splats[0], after = outcome.splats[1], "pruned");
             splats = pruned;
             tell(steps, loss, &splats, true);
+        }
+        if settled && pruning.is_none() {
+            tell(task.steps, loss, &splats, true);
         }
         if cancelled {
             return Err(failed("stopped before its end, as asked"));
@@ -323,6 +344,20 @@ impl Block<'_> {
         (is_leaf && tolerance_db > 0.0).then(|| Pruning::within(tolerance_db))
     }
 
+    /// Does the block stay at its parent's resolution?
+    fn is_settled(
+        &self,
+        start: &Start,
+        views: &[TrainView],
+        counts: &(dyn Fn(Vec3) -> bool + Sync),
+    ) -> Result<bool, TrainError> {
+        let settings = &self.plan.settings;
+        if self.task.parent.is_none() || settings.residual == 0.0 {
+            return Ok(false);
+        }
+        refine::is_settled(start, settings.residual, views, counts, settings.antialiased, self.reader)
+    }
+
     /// The recipe of the block's level: a child starts from splats that fit already, one mip coarser.
     fn recipe(&self) -> Recipe {
         if self.task.parent.is_some() { Recipe::refinement() } else { Recipe::default() }
@@ -354,7 +389,7 @@ impl Block<'_> {
         results: BTreeMap<BlockId, Splats>,
         views: &[TrainView],
         recipe: &Recipe,
-    ) -> Result<(Splats, Option<Splats>), ExecuteError> {
+    ) -> Result<Start, ExecuteError> {
         let Self { plan, task, capture, .. } = self;
         let sh_degree = plan.settings.sh_degree;
         if results.is_empty() {

@@ -16,6 +16,7 @@ pub mod estimate;
 pub mod execute;
 mod memory;
 mod merged;
+mod refine;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;

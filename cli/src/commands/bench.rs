@@ -5,10 +5,13 @@ use std::path::Path;
 
 use ::bench::parts::Ingest;
 use ::bench::{CurvePoint, PartLine, append, append_part, read_folder, replace_table, table};
+use dataset::synth::{CitySettings, write_city};
 use serde::Serialize;
 use store::Store;
 
-use crate::args::{BenchDemoArgs, ChartArgs, IngestArgs, ParetoArgs, TrainArgs};
+use crate::args::{
+    AdaptiveArgs, Auto, BenchDemoArgs, ChartArgs, DemoArgs, IngestArgs, ParetoArgs, PlanOptions, TrainArgs,
+};
 use crate::cameras;
 use crate::clock::{self, Stopwatch};
 use crate::commands::demo;
@@ -48,6 +51,38 @@ pub(crate) fn demo(args: &BenchDemoArgs, output: &Output) -> Result<(), Failure>
     let mut record = built.shown.report.record;
     record.scene = if args.demo.quick { "demo quick" } else { "demo" }.to_owned();
     keep_run(&args.results, &args.label, &record, built.curve, built.text, output)
+}
+
+/// Trains a city whose one half is a bare plain as a tree of one depth, and as one that follows the need; appends a line
+/// for each.
+pub(crate) fn adaptive(args: &AdaptiveArgs, output: &Output) -> Result<(), Failure> {
+    let demo = DemoArgs { out: args.out.clone(), quick: false };
+    let (city, settings) = demo::settings(&demo);
+    let city = CitySettings { plain: 0.5, ..city };
+    let progress = output.progress("city", u64::from(city.views));
+    write_city(&settings.capture, &city, |done, _| progress.at(done as u64, ""))?;
+    drop(progress);
+    for (label, residual) in [("fixed depth", 0.0), ("adaptive", settings.plan.residual)] {
+        let levels = Auto(Some(2));
+        let plan =
+            PlanOptions { residual, levels, seed: args.seed, tolerance_db: args.tolerance_db, ..settings.plan.clone() };
+        let train = TrainArgs { plan, threads: Auto(Some(args.threads)), ..settings.clone() };
+        let trained = self::train(&train, output)?;
+        let store = Store::open(&args.out.join("store").display().to_string())?.blocking();
+        let every = train.plan.test_every;
+        let out = args.out.join("eval").join(label.replace(' ', "_"));
+        let mut record = trained.report.record.clone();
+        let evaluated = evaluate(&trained.model, trained.capture, store, every, None, &out, output)?;
+        record.scene = "half a bare plain".into();
+        record.measured(&evaluated.record);
+        let settled = format!(
+            "{} of {} blocks stayed at their parent's resolution",
+            trained.report.settled, trained.report.tasks
+        );
+        let text = format!("{label}: {settled}\n{}", eval::text(&evaluated));
+        keep_run(&args.results, label, &record, trained.curve, text, output)?;
+    }
+    Ok(())
 }
 
 /// Appends a run, whose curve ends with the merged model at the end of all work.

@@ -99,7 +99,7 @@ pub(crate) fn build(args: &DemoArgs, output: &Output) -> Result<Built, Failure> 
 }
 
 /// The city and how it is trained.
-fn settings(args: &DemoArgs) -> (CitySettings, TrainArgs) {
+pub(crate) fn settings(args: &DemoArgs) -> (CitySettings, TrainArgs) {
     let whole = CitySettings::default();
     let (city, steps, budget) = if args.quick {
         (CitySettings { extent_metres: 100.0, views: 64, width: 160, height: 112, ..whole }, 2500, 20_000)
@@ -116,6 +116,7 @@ fn settings(args: &DemoArgs) -> (CitySettings, TrainArgs) {
             steps: Auto(Some(steps)),
             budget: Auto(Some(budget)),
             tolerance_db: 0.1,
+            residual: 0.01,
             seed: 0,
             antialiased: false,
             test_every: 8,

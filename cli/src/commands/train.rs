@@ -55,6 +55,8 @@ pub(crate) struct Report {
     pub(crate) capped: bool,
     /// Tasks that an earlier run had finished or begun; their time is not in this report.
     pub(crate) resumed: u32,
+    /// Blocks that stayed at their parent's resolution, of those that this run finished.
+    pub(crate) settled: u32,
     /// What the plan said before anything ran.
     pub(crate) predicted: Estimate,
 }
@@ -160,6 +162,7 @@ pub(crate) fn train(args: &TrainArgs, output: &Output) -> Result<Trained, Failur
         ingest_cpu_seconds,
         capped,
         resumed,
+        settled: shared.settled.load(Ordering::Relaxed),
         predicted: Estimate::of(&plan),
     };
     save_json(&args.out.join("report.json"), &report)?;

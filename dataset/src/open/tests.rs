@@ -10,7 +10,7 @@ mod reprojection;
 
 use crate::synth::{CitySettings, write_city};
 
-const CITY: CitySettings = CitySettings { seed: 3, extent_metres: 90.0, views: 24, width: 48, height: 32 };
+const CITY: CitySettings = CitySettings { seed: 3, extent_metres: 90.0, views: 24, width: 48, height: 32, plain: 0.0 };
 
 fn city() -> tempfile::TempDir {
     let folder = tempfile::tempdir().unwrap();

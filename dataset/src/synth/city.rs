@@ -56,13 +56,16 @@ pub(super) struct Layout {
     pub(super) blocks: u32,
     /// Distance of neighbouring street lines.
     pub(super) pitch: f32,
+    /// West of this is a bare plain.
+    pub(super) plain: f32,
 }
 
 impl Layout {
-    pub(super) fn new(seed: u64, extent_metres: f64) -> Self {
+    pub(super) fn new(seed: u64, extent_metres: f64, plain: f64) -> Self {
         let blocks = ((extent_metres / 66.0).round() as u32).max(2);
         let extent = extent_metres as f32;
-        Self { seed: hash(seed as u32, (seed >> 32) as u32, 1), extent, blocks, pitch: extent / blocks as f32 }
+        let plain = if plain > 0.0 { (plain as f32 - 0.5) * extent } else { f32::NEG_INFINITY };
+        Self { seed: hash(seed as u32, (seed >> 32) as u32, 1), extent, blocks, pitch: extent / blocks as f32, plain }
     }
 
     /// The coordinate of street line `k`, `0..=blocks`.
@@ -106,6 +109,7 @@ pub(super) fn build(layout: &Layout) -> Vec<Solid> {
             city.kerbside(layout, layout.line(k), along_x);
         }
     }
+    city.solids.retain(|solid| solid.min.x >= layout.plain);
     city.solids
 }
 

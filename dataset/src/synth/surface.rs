@@ -63,6 +63,9 @@ pub(super) fn ground_colour(layout: &Layout, p: Vec2, footprint: f32) -> Vec3 {
     let (dx, dy) = (layout.off_line(p.x), layout.off_line(p.y));
     let (ax, ay) = (dx.abs(), dy.abs());
     let across = ax.min(ay);
+    if p.x < layout.plain {
+        return vec3(0.56, 0.53, 0.46) + 0.04 * noise(p, 25.0, seed ^ 8, footprint);
+    }
     let in_city = p.abs().max_element() < 0.5 * layout.extent + HALF_ROAD + PAVEMENT;
     if !in_city {
         return field(seed, p, footprint);

@@ -200,7 +200,7 @@ impl Corpus {
 
     fn written(&mut self) {
         let folder = tempfile::tempdir().expect("a folder");
-        let city = synth::CitySettings { seed: 3, extent_metres: 90.0, views: 24, width: 48, height: 32 };
+        let city = synth::CitySettings { seed: 3, extent_metres: 90.0, views: 24, width: 48, height: 32, plain: 0.0 };
         synth::write_city(folder.path(), &city, |_, _| ()).expect("a city");
         for (name, codec) in ["cameras", "images", "points3D"].into_iter().zip(&colmap_binary()) {
             let bytes = fs::read(folder.path().join(format!("sparse/0/{name}.bin"))).expect("the city has it");

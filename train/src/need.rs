@@ -1,0 +1,106 @@
+//! What a block still lacks, as its training says: when to look closer, and when to stop growing.
+//!
+//! The mean absolute error of an epoch (every view once) is known for free. Two rules follow from it:
+//!
+//! - **Finer pixels when they have something to say.** While the error at a coarse mip is larger than what the photos show
+//!   beyond that mip, three of four fine pixels repeat what the coarse one says. So training goes to the next finer mip when its
+//!   error has come down to that detail, or at the latest after the recipe's share of the steps.
+//! - **Growth that pays.** When the last tenths of growth brought less than [`Growth::worth_db`](crate::growth::Growth::worth_db)
+//!   for each five percent of splats, it ends, and the rest of the schedule follows at once.
+
+use serde::{Deserialize, Serialize};
+
+use crate::{TrainError, TrainView, WindowSource};
+
+/// Views whose photos say how much detail a mip lacks, at most: of more, evenly many.
+const DETAIL_VIEWS: usize = 16;
+/// Growth is judged over at least this factor in the number of splats.
+const JUDGED_GROWTH: f64 = 1.3;
+
+/// Mean absolute difference between the photos at `coarser` mips and one finer, 0 to 1; infinite where no window is that
+/// coarse, so that there nobody waits for it.
+///
+/// # Errors
+/// A window that cannot be read.
+pub fn detail(views: &[TrainView], source: &dyn WindowSource, coarser: u8) -> Result<f64, TrainError> {
+    let (mut sum, mut count) = (0.0, 0.0f64);
+    for view in views.iter().step_by(views.len().div_ceil(DETAIL_VIEWS).max(1)) {
+        let (Some((mip, rect, _)), Some((fine_mip, fine_rect, _))) = (view.at(coarser), view.at(coarser - 1)) else {
+            continue;
+        };
+        let coarse = source.window(view.view, mip, rect).map_err(TrainError::Source)?;
+        let fine = source.window(view.view, fine_mip, fine_rect).map_err(TrainError::Source)?;
+        let (width, fine_width) = (coarse.width as usize, fine.width as usize);
+        for y in 0..fine.height {
+            for x in 0..fine.width {
+                // Windows of a mip start at any pixel, so a pixel's coarser one is found in the image.
+                let (cx, cy) = ((x + fine_rect.x) / 2, (y + fine_rect.y) / 2);
+                if cx < rect.x || cy < rect.y || cx >= rect.x + coarse.width || cy >= rect.y + coarse.height {
+                    continue;
+                }
+                let at = (cy - rect.y) as usize * width + (cx - rect.x) as usize;
+                let fine_at = y as usize * fine_width + x as usize;
+                if fine.mask.as_ref().is_some_and(|mask| mask[fine_at] < 128) {
+                    continue;
+                }
+                let (area, fine_area) = (coarse.area(), fine.area());
+                for c in 0..3 {
+                    let (coarse, fine) = (coarse.rgb[c * area + at], fine.rgb[c * fine_area + fine_at]);
+                    sum += f64::from(coarse.abs_diff(fine)) / 255.0;
+                }
+                count += 3.0;
+            }
+        }
+    }
+    Ok(if count > 0.0 { sum / count } else { f64::INFINITY })
+}
+
+/// What the steps so far say.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub(crate) struct Need {
+    /// Stages of coarse mips that are over.
+    pub(crate) stage: u8,
+    /// Step at which the present one began.
+    pub(crate) since: u32,
+    /// Of the epoch under way: Σ of errors, and steps.
+    sum: f64,
+    count: u32,
+    /// Of the epochs of this stage: splats at the end, and the mean error in dB.
+    epochs: Vec<(u32, f32)>,
+}
+
+impl Need {
+    /// Notes a step's error; `last` is the last step of an epoch. The epoch's mean, if this ends a full one.
+    pub(crate) fn note(&mut self, error: Option<f64>, splats: usize, epoch: u32, last: bool) -> Option<f64> {
+        if let Some(error) = error {
+            self.sum += error;
+            self.count += 1;
+        }
+        if !last {
+            return None;
+        }
+        let (mean, full) = (self.sum / f64::from(self.count.max(1)), self.count == epoch);
+        (self.sum, self.count) = (0.0, 0);
+        if full {
+            self.epochs.push((splats as u32, (-20.0 * mean.max(1e-9).log10()) as f32));
+        }
+        full.then_some(mean)
+    }
+
+    /// Begins the next stage: errors at another mip cannot be compared.
+    pub(crate) fn look_closer(&mut self, step: u32) {
+        (self.stage, self.since) = (self.stage + 1, step);
+        (self.sum, self.count) = (0.0, 0);
+        self.epochs.clear();
+    }
+
+    /// Did the last of growth gain less than so many dB for each five percent of splats?
+    pub(crate) fn gains_less_than(&self, worth_db: f64) -> bool {
+        let Some(&(splats, now)) = self.epochs.last() else { return false };
+        let before = self.epochs.iter().rev().find(|(n, _)| f64::from(*n) * JUDGED_GROWTH <= f64::from(splats));
+        before.is_some_and(|&(n, then)| {
+            let steps_of_growth = (f64::from(splats) / f64::from(n.max(1))).ln() / 1.05f64.ln();
+            f64::from(now - then) < worth_db * steps_of_growth
+        })
+    }
+}
