@@ -61,6 +61,9 @@ const COMPRESSED: Budget = Budget { factor: 20, base: 34 << 20 };
 /// A photo's pixels several times over; what it may claim is bounded by `photo::FREE_PIXELS`.
 const PHOTO: Budget = Budget { factor: 0, base: 256 << 20 };
 
+/// Of the photos that are written here: their TIFF, which is not compressed, fits a fuzzer's seed.
+const PHOTO_SIZE: (u32, u32) = (80, 60);
+
 pub(crate) struct Seed {
     pub(crate) name: String,
     pub(crate) bytes: Vec<u8>,
@@ -260,11 +263,12 @@ impl Corpus {
         self.plain("mip", mips::encode(&pixels).expect("an image"), &mip_codec());
 
         let [photo, mask] = [photo_codec(false), photo_codec(true)];
-        let image = RgbImage::from_fn(200, 100, |x, y| Rgb([(x * 5) as u8, (y * 3) as u8, (x ^ y) as u8]));
+        let image =
+            RgbImage::from_fn(PHOTO_SIZE.0, PHOTO_SIZE.1, |x, y| Rgb([(x * 5) as u8, (y * 3) as u8, (x ^ y) as u8]));
         for format in [ImageFormat::Jpeg, ImageFormat::Png, ImageFormat::Tiff, ImageFormat::WebP] {
             self.photo(&format!("photo, {format:?}"), encoded(image.clone(), format), &photo);
         }
-        let alpha = RgbaImage::from_fn(200, 100, |x, y| Rgba([x as u8, y as u8, 9, (x + y) as u8]));
+        let alpha = RgbaImage::from_fn(PHOTO_SIZE.0, PHOTO_SIZE.1, |x, y| Rgba([x as u8, y as u8, 9, (x + y) as u8]));
         self.photo("photo with alpha", encoded(alpha, ImageFormat::Png), &photo);
         self.photo("mask", encoded(DynamicImage::from(image).to_luma8(), ImageFormat::Png), &mask);
     }
@@ -476,8 +480,9 @@ fn photo_codec(as_mask: bool) -> Read {
     let file = Transforms { frames: vec![frame(0.0, as_mask)], ply_file_path: Some("cloud.ply".into()) };
     fs::write(folder.path().join("transforms.json"), transforms::write(&file)).expect("written");
     fs::write(folder.path().join("cloud.ply"), CLOUD).expect("written");
-    fs::write(folder.path().join("good.png"), encoded(RgbImage::new(200, 100), ImageFormat::Png)).expect("written");
-    Reader::new("", move |bytes| {
+    fs::write(folder.path().join("good.png"), encoded(RgbImage::new(PHOTO_SIZE.0, PHOTO_SIZE.1), ImageFormat::Png))
+        .expect("written");
+    Reader::new("image", move |bytes| {
         fs::write(folder.path().join("photo"), bytes).expect("written");
         let source = open::open(folder.path(), &OpenOptions::default()).map_err(|error| error.to_string())?;
         let store = Store::open("memory://").expect("memory").blocking();
