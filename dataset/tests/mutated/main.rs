@@ -7,6 +7,7 @@
 mod corpus;
 mod memory;
 mod mutate;
+mod readers;
 
 use std::io::{Read, Write};
 use std::panic::{AssertUnwindSafe, catch_unwind};
