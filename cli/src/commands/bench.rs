@@ -7,6 +7,7 @@ use ::bench::parts::Ingest;
 use ::bench::{CurvePoint, PartLine, append, append_part, read_folder, replace_table, table};
 use serde::Serialize;
 use store::Store;
+use store::file::save;
 
 use crate::args::{BenchDemoArgs, ChartArgs, IngestArgs, ParetoArgs, TrainArgs};
 use crate::cameras;
@@ -16,7 +17,7 @@ use crate::commands::eval::{self, evaluate};
 use crate::commands::train::{ingest_photos, make_folder, train};
 use crate::failure::Failure;
 use crate::lpips::Lpips;
-use crate::model::{save, save_json};
+use crate::model::save_json;
 use crate::output::Output;
 use crate::record::{Record, commit};
 
