@@ -238,6 +238,7 @@ impl Corpus {
         let id = scene::ArtefactId::of(b"city");
         let plan = blocks::plan(&source.capture, id, &settings, "cpu").expect("a city can be planned");
         self.put("plan", plan.to_frame(), &plan_codec(source.capture.clone()), Seal::Frame, PLAIN);
+        // Of the size that its fuzz target expects.
         let bytes = (0..3 * 150 * 140).map(|i| (i * 7 / 11) as u8).collect();
         let pixels = Pixels { width: 150, height: 140, rgb: bytes, mask: None };
         self.plain("mip", mips::encode(&pixels).expect("an image"), &mip_codec());

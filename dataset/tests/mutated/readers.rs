@@ -18,7 +18,7 @@ use crate::corpus::{CLOUD, PHOTO_SIZE, encoded};
 
 /// A reader of files.
 pub(crate) struct Reader {
-    /// The fuzz target (`fuzz/fuzz_targets`) that the file is a seed of; empty if none.
+    /// The fuzz target (`fuzz/fuzz_targets`) that the file is a seed of.
     pub(crate) target: &'static str,
     call: Box<Call>,
 }
@@ -173,7 +173,7 @@ pub(crate) fn capture_codec() -> Read {
 }
 
 pub(crate) fn mip_codec() -> Read {
-    Reader::new("", |bytes| {
+    Reader::new("mips", |bytes| {
         let layout = mips::Layout { width: 150, height: 140, masked: false };
         let index = layout.index(bytes.get(..layout.index_len()).unwrap_or(bytes)).map_err(|e| e.to_string())?;
         let rect = Rect { x: 100, y: 100, width: 50, height: 40 };
