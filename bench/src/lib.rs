@@ -11,11 +11,11 @@ pub mod sheet;
 pub mod table;
 
 use std::fs;
-use std::io::Write;
 use std::path::Path;
 
 use scene::BadInput;
 use serde::{Deserialize, Serialize};
+use store::file::SaveError;
 
 pub use birdseye::{birdseye_camera, oblique_camera};
 pub use chart::chart;
@@ -123,20 +123,19 @@ impl ResultLine {
 ///
 /// # Errors
 /// A number that is not finite (JSON has none), or a file that cannot be written.
-pub fn append(path: &Path, line: &ResultLine) -> Result<(), BadInput> {
+pub fn append(path: &Path, line: &ResultLine) -> Result<(), SaveError> {
     append_line(path, line, line.is_finite())
 }
 
-fn append_line(path: &Path, line: &impl Serialize, is_finite: bool) -> Result<(), BadInput> {
-    let name = path.display().to_string();
+fn append_line(path: &Path, line: &impl Serialize, is_finite: bool) -> Result<(), SaveError> {
+    let refuse = |e: std::io::Error| SaveError::new(path, &e);
     if !is_finite {
-        return Err(BadInput::new(name, "a result with a number that is not finite", "give null for what is unknown"));
+        return Err(refuse(std::io::Error::other("the result has a number that is not finite; measure it again")));
     }
-    let refuse = |e: std::io::Error| BadInput::new(name.clone(), format!("cannot be written: {e}"), "check the folder");
     let mut text = serde_json::to_string(line).expect("a result line is plain data");
     text.push('\n');
     let mut file = fs::OpenOptions::new().create(true).append(true).open(path).map_err(refuse)?;
-    file.write_all(text.as_bytes()).map_err(refuse)
+    store::file::append(&mut file, text.as_bytes()).map_err(refuse)
 }
 
 /// Whether a line is of a [`PartLine`].

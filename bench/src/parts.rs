@@ -3,8 +3,8 @@
 
 use std::path::Path;
 
-use scene::BadInput;
 use serde::{Deserialize, Serialize};
+use store::file::SaveError;
 
 /// A measurement of a part, as one line of JSON.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -130,6 +130,6 @@ impl PartLine {
 ///
 /// # Errors
 /// As [`crate::append`].
-pub fn append_part(path: &Path, line: &PartLine) -> Result<(), BadInput> {
+pub fn append_part(path: &Path, line: &PartLine) -> Result<(), SaveError> {
     crate::append_line(path, line, line.is_finite())
 }

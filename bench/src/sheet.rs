@@ -1,11 +1,12 @@
 //! Contact sheets: photo, render and error side by side, with figures, for eyes.
 
+use std::io::Cursor;
 use std::path::Path;
 
 use font8x8::legacy::BASIC_LEGACY;
 use image::imageops::{self, FilterType};
 use image::{Rgb, RgbImage};
-use scene::BadInput;
+use store::file::{SaveError, save};
 
 /// Width of each of a row's three pictures, pixels.
 const COLUMN: u32 = 480;
@@ -105,10 +106,10 @@ pub fn text(image: &mut RgbImage, x: u32, y: u32, text: &str, colour: Rgb<u8>) {
 ///
 /// # Errors
 /// A file that cannot be written.
-pub fn write_png(path: &Path, image: &RgbImage) -> Result<(), BadInput> {
-    image.save_with_format(path, image::ImageFormat::Png).map_err(|e| {
-        BadInput::new(path.display().to_string(), format!("cannot be written: {e}"), "check that its folder exists")
-    })
+pub fn write_png(path: &Path, image: &RgbImage) -> Result<(), SaveError> {
+    let mut png = Cursor::new(Vec::new());
+    image.write_to(&mut png, image::ImageFormat::Png).map_err(|error| SaveError::new(path, &error))?;
+    save(path, png.get_ref())
 }
 
 fn caption(row: &SheetRow) -> String {

@@ -3,8 +3,10 @@
 use blocks::PlanError;
 use coordinator::LocalError;
 use dataset::ingest::IngestError;
+use dataset::synth::SynthError;
 use scene::BadInput;
 use store::StoreError;
+use store::file::SaveError;
 
 /// Why a command did not do what it was asked.
 #[derive(Debug)]
@@ -46,7 +48,25 @@ impl From<PlanError> for Failure {
 
 impl From<StoreError> for Failure {
     fn from(error: StoreError) -> Self {
+        match error {
+            StoreError::BadUrl(error) => error.into(),
+            other => Self::Work(other.to_string()),
+        }
+    }
+}
+
+impl From<SaveError> for Failure {
+    fn from(error: SaveError) -> Self {
         Self::Work(error.to_string())
+    }
+}
+
+impl From<SynthError> for Failure {
+    fn from(error: SynthError) -> Self {
+        match error {
+            SynthError::BadInput(error) => error.into(),
+            SynthError::Save(error) => error.into(),
+        }
     }
 }
 

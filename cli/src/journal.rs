@@ -1,7 +1,6 @@
 //! The news of a job as `metrics.jsonl`, progress and clocks.
 
 use std::fs::File;
-use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use bench::CurvePoint;
@@ -10,6 +9,7 @@ use proto::TaskState;
 use proto::watch_event::Event as News;
 use scene::BlockId;
 use serde::Serialize;
+use store::file::{SaveError, append};
 
 use crate::clock::Stopwatch;
 use crate::failure::{Failure, cannot};
@@ -151,10 +151,10 @@ impl<'a> Journal<'a> {
             self.total.last_psnr = Some(psnr);
             self.total.curve.push(CurvePoint { cpu_seconds, psnr, splats: report.merged_splats });
         }
-        let written = serde_json::to_string(&line).map_err(std::io::Error::from);
-        let written = written.and_then(|text| self.file.write_all((text + "\n").as_bytes()));
-        if let Err(error) = written {
-            self.failed.get_or_insert(cannot("written", &self.path)(error));
+        if self.failed.is_none() {
+            let written = serde_json::to_string(&line).map_err(std::io::Error::from);
+            let written = written.and_then(|text| append(&mut self.file, (text + "\n").as_bytes()));
+            self.failed = written.err().map(|error| SaveError::new(&self.path, &error).into());
         }
         let psnr = self.total.last_psnr.map_or(String::new(), |psnr| format!(", {psnr:.2} dB"));
         let message = format!("block {}, {} splats{psnr}", line.task, report.splats);

@@ -28,8 +28,7 @@ fn main() -> ExitCode {
     let cli = match config::parse(std::env::args_os().collect()) {
         Ok(cli) => cli,
         Err(config::Stop::Shown(text)) => {
-            output::print(&text);
-            return ExitCode::SUCCESS;
+            return output::print(&text).map_or_else(|failure| fail(&failure), |()| ExitCode::SUCCESS);
         }
         Err(config::Stop::Usage(line)) => return fail(&Failure::Input(line)),
     };

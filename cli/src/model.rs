@@ -16,6 +16,7 @@ use std::path::{Path, PathBuf};
 use blocks::{Cut, Ground, Plan};
 use scene::{ArtefactId, BadInput, BlockId, CodecError, GeoOrigin, Splats, frame, ply, spz};
 use serde::{Deserialize, Serialize};
+use store::file::save;
 use store::{BlockingStore, Store};
 use tempfile::TempDir;
 
@@ -26,6 +27,7 @@ const VERSION: u32 = 1;
 /// Said in a PLY's comments of a model that is to be drawn anti-aliased.
 const ANTIALIASED: &str = "antialiased";
 const PLAN_FILE: &str = "plan.plat";
+const MERGED_FILE: &str = "merged.ply";
 
 /// `model.json`.
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -116,12 +118,17 @@ impl Model {
     }
 }
 
-/// Begins a model's folder under `out`: an older model is none from here on, and the new one is none before its
-/// `model.json` is there.
+/// Begins a model's folder under `out`: an older model is none from here on, nor what was said of it, and the new one is
+/// none before its `model.json` is there.
 fn begin(out: &Path, plan: &Plan) -> Result<PathBuf, Failure> {
     let folder = out.join("model");
     if folder.join("model.json").exists() {
         fs::remove_dir_all(&folder).map_err(cannot("replaced", &folder))?;
+    }
+    for file in [MERGED_FILE, "report.json"].map(|name| out.join(name)) {
+        if file.exists() {
+            fs::remove_file(&file).map_err(cannot("replaced", &file))?;
+        }
     }
     let blocks = folder.join("blocks");
     fs::create_dir_all(&blocks).map_err(cannot("made", &blocks))?;
@@ -163,10 +170,20 @@ pub(crate) fn write(
         splats: splats.len() as u64,
         blocks,
     };
-    save_json(&folder.join("model.json"), &manifest)?;
-    let model = Model { splats, antialiased: manifest.antialiased, trained: Some((manifest, out.to_path_buf())) };
-    save(&out.join("merged.ply"), &model.to_ply())?;
+    let antialiased = manifest.antialiased;
+    let model = Model { splats, antialiased, trained: Some((manifest, out.to_path_buf())) };
+    finish(out, &model)?;
     Ok(model)
+}
+
+/// Ends what [`begin`] began, once the blocks are there; returns the bytes of `merged.ply`.
+fn finish(out: &Path, model: &Model) -> Result<u64, Failure> {
+    let merged = model.to_ply();
+    save(&out.join(MERGED_FILE), &merged)?;
+    if let Some((manifest, _)) = &model.trained {
+        save_json(&out.join("model/model.json"), manifest)?;
+    }
+    Ok(merged.len() as u64)
 }
 
 /// The finest cut: of every task's splats those that its block owns among all of them.
@@ -284,14 +301,9 @@ fn damaged(path: &Path, error: &CodecError) -> BadInput {
     BadInput::new(path.display().to_string(), error.to_string(), "restore the file or train the model again")
 }
 
-/// Writes a file.
-pub(crate) fn save(path: &Path, bytes: &[u8]) -> Result<(), Failure> {
-    fs::write(path, bytes).map_err(cannot("written", path))
-}
-
 /// Writes a file of JSON for people: indented, with a last newline.
 pub(crate) fn save_json(path: &Path, value: &impl Serialize) -> Result<(), Failure> {
     let mut text = serde_json::to_vec_pretty(value).map_err(cannot("written", path))?;
     text.push(b'\n');
-    save(path, &text)
+    Ok(save(path, &text)?)
 }

@@ -1,11 +1,13 @@
 //! What a person or a script sees: results on stdout, notes and progress on stderr.
 
 use std::fmt::Display;
-use std::io::{IsTerminal, Write};
+use std::io::{ErrorKind, IsTerminal, Write};
+use std::path::Path;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde::Serialize;
+use store::file::SaveError;
 
 use crate::failure::Failure;
 
@@ -33,11 +35,10 @@ impl Output {
     pub(crate) fn result(&self, object: &impl Serialize, text: &str) -> Result<(), Failure> {
         if self.json {
             let line = serde_json::to_string(object).map_err(|error| Failure::Work(error.to_string()))?;
-            print(&(line + "\n"));
+            print(&(line + "\n"))
         } else {
-            print(&format!("{}\n", text.trim_end()));
+            print(&format!("{}\n", text.trim_end()))
         }
-        Ok(())
     }
 
     /// Progress of something with this many parts.
@@ -93,10 +94,15 @@ impl Drop for Progress {
     }
 }
 
-/// Text on stdout. A reader that went away (`plat … | head`) is no reason to fail.
-pub(crate) fn print(text: &str) {
+/// Text on stdout. A reader that went away (`plat … | head`) is no reason to fail, a full disk is.
+pub(crate) fn print(text: &str) -> Result<(), Failure> {
     let mut out = std::io::stdout().lock();
-    let _ = out.write_all(text.as_bytes()).and_then(|()| out.flush());
+    match out.write_all(text.as_bytes()).and_then(|()| out.flush()) {
+        Err(error) if error.kind() != ErrorKind::BrokenPipe => {
+            Err(SaveError::new(Path::new("standard output"), &error).into())
+        }
+        _ => Ok(()),
+    }
 }
 
 /// The one line of an error, on stderr.

@@ -1,39 +1,11 @@
 //! The program as scripts see it: exit codes, files, bytes.
 
-use std::path::Path;
-use std::process::{Command, Output};
+mod common;
 
-use dataset::synth::{CitySettings, write_city};
+use common::{city, done, plat, refused};
 use glam::Vec3;
 use scene::{Splat, Splats, npy, ply};
 use serde_json::Value;
-
-fn plat(folder: &Path, words: &[&str]) -> Output {
-    let program = env!("CARGO_BIN_EXE_plat");
-    Command::new(program).args(words).current_dir(folder).output().expect("plat runs")
-}
-
-/// Runs a command that must succeed, and its JSON.
-fn done(folder: &Path, words: &[&str]) -> Value {
-    let output = plat(folder, &[words, &["--json"]].concat());
-    assert!(output.status.success(), "{words:?}: {}", String::from_utf8_lossy(&output.stderr));
-    let text = String::from_utf8(output.stdout).unwrap();
-    serde_json::from_str(text.lines().last().expect("an object on the last line")).unwrap()
-}
-
-/// Runs a command that must be refused with one line that says this.
-fn refused(folder: &Path, words: &[&str], wanted: &str) {
-    let output = plat(folder, words);
-    let line = String::from_utf8(output.stderr).unwrap();
-    assert_eq!(output.status.code(), Some(2), "{words:?}: {line}");
-    assert!(line.contains(wanted) && line.trim_end().lines().count() == 1, "{words:?}: {line}");
-    assert!(output.stdout.is_empty());
-}
-
-fn city(folder: &Path, views: u32) {
-    let settings = CitySettings { seed: 3, extent_metres: 80.0, views, width: 64, height: 48, plain: 0.0 };
-    write_city(&folder.join("city"), &settings, |_, _| {}).unwrap();
-}
 
 /// One red splat five metres in front of the origin.
 fn red_splat() -> Vec<u8> {
@@ -58,7 +30,7 @@ fn bad_usage_and_bad_input_exit_with_2_and_one_line() {
     std::fs::write(at.join("cameras.json"), CAMERAS).unwrap();
     std::fs::write(at.join("bad.toml"), "stepps = 3\n").unwrap();
     std::fs::create_dir(at.join("empty")).unwrap();
-    city(at, 16);
+    city(at, 16, 64, 48);
     refused(at, &[], "plat demo");
     refused(at, &["fly"], "fly");
     refused(at, &["train", "city", "--out", "o", "--speed", "9"], "--speed");
@@ -115,7 +87,7 @@ fn views_are_drawn_from_cameras_alone() {
 fn a_city_is_trained_measured_and_exported_the_same_twice() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
-    city(at, 20);
+    city(at, 20, 64, 48);
     let train = |out: &str, threads: &str| {
         let options = ["--steps", "60", "--budget", "800", "--levels", "1", "--eval-every", "20", "--threads", threads];
         done(at, &[&["train", "city", "--out", out][..], &options].concat())
@@ -170,7 +142,7 @@ fn a_city_is_trained_measured_and_exported_the_same_twice() {
 fn captures_are_inspected_and_planned() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
-    city(at, 20);
+    city(at, 20, 64, 48);
     let found = done(at, &["inspect", "city"]);
     assert_eq!((&found["views"], &found["format"]), (&20.into(), &"colmap".into()));
     assert!(found["estimate"]["memory_bytes"].as_u64().unwrap() > 0 && found["problem"].is_null());
@@ -193,7 +165,7 @@ fn captures_are_inspected_and_planned() {
 fn a_cap_in_time_shortens_every_task_and_leaves_a_whole_model() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
-    city(at, 20);
+    city(at, 20, 64, 48);
     // Without the cap this would take half an hour.
     let options = ["--steps", "1000000", "--budget", "800", "--levels", "1", "--minutes", "0.05", "--store", "store"];
     for blocks in ["whole", "tree"] {
@@ -264,7 +236,7 @@ fn squares(inputs: usize) -> Vec<u8> {
 fn lpips_is_measured_with_a_network_that_the_user_names() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
-    city(at, 16);
+    city(at, 16, 64, 48);
     std::fs::write(at.join("red.ply"), red_splat()).unwrap();
     std::fs::write(at.join("net.onnx"), squares(2)).unwrap();
     assert!(done(at, &["eval", "red.ply", "city", "--out", "o"])["lpips"].is_null());
@@ -296,7 +268,7 @@ fn lpips_is_measured_with_a_network_that_the_user_names() {
 fn measurements_are_kept_as_lines() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
-    city(at, 16);
+    city(at, 16, 64, 48);
     let lines = |file: &str| -> Vec<Value> {
         let text = std::fs::read_to_string(at.join("results").join(file)).unwrap();
         text.lines().map(|line| serde_json::from_str(line).unwrap()).collect()

@@ -1,36 +1,14 @@
 //! `plat eval` of cuts and seams, as scripts see it.
 
-use std::path::Path;
-use std::process::{Command, Output};
+mod common;
 
-use dataset::synth::{CitySettings, write_city};
-use serde_json::Value;
-
-fn plat(folder: &Path, words: &[&str]) -> Output {
-    let program = env!("CARGO_BIN_EXE_plat");
-    Command::new(program).args(words).arg("--json").current_dir(folder).output().expect("plat runs")
-}
-
-fn done(folder: &Path, words: &[&str]) -> Value {
-    let output = plat(folder, words);
-    assert!(output.status.success(), "{words:?}: {}", String::from_utf8_lossy(&output.stderr));
-    let text = String::from_utf8(output.stdout).unwrap();
-    serde_json::from_str(text.lines().last().expect("an object on the last line")).unwrap()
-}
-
-fn refused(folder: &Path, words: &[&str], wanted: &str) {
-    let output = plat(folder, words);
-    let line = String::from_utf8(output.stderr).unwrap();
-    assert_eq!(output.status.code(), Some(2), "{words:?}: {line}");
-    assert!(line.contains(wanted) && line.trim_end().lines().count() == 1, "{words:?}: {line}");
-}
+use common::{city, done, refused};
 
 #[test]
 fn cuts_and_seams_of_a_tree_are_measured() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
-    let settings = CitySettings { seed: 3, extent_metres: 80.0, views: 24, width: 96, height: 72, plain: 0.0 };
-    write_city(&at.join("city"), &settings, |_, _| {}).unwrap();
+    city(at, 24, 96, 72);
     let train = |out: &str, blocks: &str| {
         let options = ["--steps", "300", "--budget", "3000", "--levels", "1", "--threads", "1", "--tolerance-db", "0"];
         done(at, &[&["train", "city", "--out", out, "--blocks", blocks][..], &options].concat())

@@ -1,10 +1,11 @@
 //! `plat render` against images that an independent float64 program made (reference tensors kept outside the repository).
 
+mod common;
+
 use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::Read;
 use std::path::{Path, PathBuf};
-use std::process::Command;
 
 use glam::{DMat3, DQuat, DVec3};
 use scene::transforms::{Frame, Intrinsics, Transforms};
@@ -69,12 +70,7 @@ fn rendered_pngs_agree_with_an_independent_float64_renderer() {
         let Some(case) = oracle(name) else { return };
         let folder = tempfile::tempdir().unwrap();
         write_case(&case, folder.path());
-        let done = Command::new(env!("CARGO_BIN_EXE_plat"))
-            .current_dir(folder.path())
-            .args(["--quiet", "render", "model.ply", "--cameras", "transforms.json", "--out", "renders"])
-            .output()
-            .unwrap();
-        assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
+        common::done(folder.path(), &["render", "model.ply", "--cameras", "transforms.json", "--out", "renders"]);
         let png = image::open(folder.path().join("renders/view.png")).unwrap().to_rgb8();
         // plat draws on black: take the reference's background out again.
         let (image, alpha, background) = (&case["image"], &case["alpha"], &case["bg"]);

@@ -1,34 +1,10 @@
 //! `plat prune` as scripts see it.
 
-use std::path::Path;
-use std::process::{Command, Output};
+mod common;
 
-use dataset::synth::{CitySettings, write_city};
+use common::{city, command, done, json_of, refused};
 use glam::Vec3;
 use scene::{Splat, Splats, ply};
-use serde_json::Value;
-
-fn plat(folder: &Path, threads: &str, words: &[&str]) -> Output {
-    let mut program = Command::new(env!("CARGO_BIN_EXE_plat"));
-    program.args(words).current_dir(folder).env("RAYON_NUM_THREADS", threads).output().expect("plat runs")
-}
-
-/// Runs a command that must succeed, and its JSON.
-fn done(folder: &Path, threads: &str, words: &[&str]) -> Value {
-    let output = plat(folder, threads, &[words, &["--json"]].concat());
-    assert!(output.status.success(), "{words:?}: {}", String::from_utf8_lossy(&output.stderr));
-    let text = String::from_utf8(output.stdout).unwrap();
-    serde_json::from_str(text.lines().last().expect("an object on the last line")).unwrap()
-}
-
-/// Runs a command that must be refused with one line that says this.
-fn refused(folder: &Path, words: &[&str], wanted: &str) {
-    let output = plat(folder, "1", words);
-    let line = String::from_utf8(output.stderr).unwrap();
-    assert_eq!(output.status.code(), Some(2), "{words:?}: {line}");
-    assert!(line.contains(wanted) && line.trim_end().lines().count() == 1, "{words:?}: {line}");
-    assert!(output.stdout.is_empty());
-}
 
 #[test]
 fn a_file_is_pruned_by_opacity_and_size_alone() {
@@ -40,7 +16,7 @@ fn a_file_is_pruned_by_opacity_and_size_alone() {
         splats.push(&Splat::round(Vec3::new(i as f32, 0.0, 0.0), -1.0, Vec3::splat(0.5), opacity));
     }
     std::fs::write(at.join("ten.ply"), ply::write(&splats, &["antialiased"])).unwrap();
-    let said = done(at, "1", &["prune", "ten.ply", "--keep", "0.5", "--out", "new/five.ply"]);
+    let said = done(at, &["prune", "ten.ply", "--keep", "0.5", "--out", "new/five.ply"]);
     assert_eq!((&said["splats_before"], &said["splats"], &said["order"]), (&10.into(), &5.into(), &"surface".into()));
     let bytes = std::fs::read(at.join("new/five.ply")).unwrap();
     assert_eq!(ply::read(&bytes).unwrap(), splats.select(&[0, 2, 4, 6, 8]));
@@ -68,12 +44,12 @@ fn a_file_is_pruned_by_opacity_and_size_alone() {
 fn a_trained_folder_is_pruned_within_a_tolerance_the_same_twice() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
-    let settings = CitySettings { seed: 3, extent_metres: 80.0, views: 20, width: 64, height: 48, plain: 0.0 };
-    write_city(&at.join("city"), &settings, |_, _| {}).unwrap();
+    city(at, 20, 64, 48);
     let options = ["--steps", "80", "--budget", "1500", "--levels", "1", "--test-every", "5"];
-    done(at, "2", &[&["train", "city", "--out", "model"][..], &options].concat());
+    done(at, &[&["train", "city", "--out", "model"][..], &options].concat());
     let prune = |out: &str, threads: &str, more: &[&str]| {
-        done(at, threads, &[&["prune", "model", "--capture", "city", "--out", out][..], more].concat())
+        let words = [&["prune", "model", "--capture", "city", "--out", out][..], more].concat();
+        json_of(command(at, &words).env("RAYON_NUM_THREADS", threads))
     };
     let said = prune("one", "1", &["--tolerance-db", "0.3"]);
     prune("two", "2", &["--tolerance-db", "0.3"]);
@@ -88,9 +64,9 @@ fn a_trained_folder_is_pruned_within_a_tolerance_the_same_twice() {
     let held_in = said["held_in_psnr"].as_array().unwrap();
     assert!(held_in[1].as_f64().unwrap() >= held_in[0].as_f64().unwrap() - 0.3 - 1e-6, "{said}");
     // The folder is a model like any other: its blocks sew to the same splats, and measure the same.
-    done(at, "1", &["export", "one", "--to", "ply", "--out", "sewn.ply"]);
+    done(at, &["export", "one", "--to", "ply", "--out", "sewn.ply"]);
     assert_eq!(bytes("sewn.ply"), bytes("one/merged.ply"));
-    let measured = done(at, "1", &["eval", "one", "city"])["psnr"].as_f64().unwrap();
+    let measured = done(at, &["eval", "one", "city"])["psnr"].as_f64().unwrap();
     assert!((measured - said["psnr"].as_f64().unwrap()).abs() < 1e-3, "{measured} {said}");
 
     let said = prune("half", "2", &["--keep", "0.5"]);

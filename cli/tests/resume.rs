@@ -1,33 +1,30 @@
 //! A job that is killed goes on where it was, and ends with the same bytes.
 
+mod common;
+
 use std::path::Path;
 use std::process::{Command, Stdio};
 use std::time::Duration;
 
-use dataset::synth::{CitySettings, write_city};
 use serde_json::Value;
 
 const JOB: [&str; 10] =
     ["train", "city", "--steps", "240", "--budget", "900", "--levels", "1", "--checkpoint-every", "0"];
 
-fn plat(at: &Path, words: &[&str]) -> Command {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_plat"));
-    command.args(JOB).args(words).arg("--json").current_dir(at).stdout(Stdio::piped()).stderr(Stdio::null());
-    command
+/// The job, not yet begun.
+fn job(at: &Path, words: &[&str]) -> Command {
+    common::command(at, &[&JOB, words].concat())
 }
 
 fn done(at: &Path, words: &[&str]) -> Value {
-    let output = plat(at, words).output().unwrap();
-    assert!(output.status.success(), "{words:?}");
-    serde_json::from_str(String::from_utf8(output.stdout).unwrap().lines().last().unwrap()).unwrap()
+    common::json_of(&mut job(at, words))
 }
 
 #[test]
 fn killed_five_times_the_bytes_are_the_same() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
-    let city = CitySettings { extent_metres: 80.0, views: 20, width: 64, height: 48, ..CitySettings::default() };
-    write_city(&at.join("city"), &city, |_, _| {}).unwrap();
+    common::city(at, 20, 64, 48);
     let undisturbed = done(at, &["--out", "calm", "--threads", "1"]);
     assert_eq!(undisturbed["resumed"], 0);
 
@@ -35,7 +32,8 @@ fn killed_five_times_the_bytes_are_the_same() {
     let mut kills = 0;
     for (n, lines) in [2, 9, 1, 14, 5].into_iter().enumerate() {
         let threads = ["1", "2"][n % 2];
-        let mut run = plat(at, &["--out", "killed", "--threads", threads]).spawn().unwrap();
+        let mut run = job(at, &["--out", "killed", "--threads", threads]);
+        let mut run = run.stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
         let journal = at.join("killed/metrics.jsonl");
         let _ = std::fs::remove_file(&journal);
         loop {

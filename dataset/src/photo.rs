@@ -2,9 +2,9 @@
 //!
 //! EXIF orientation is not applied: poses and lens models refer to the pixels as they are stored.
 
-use std::io::Cursor;
+use std::io::{BufRead, Cursor, Seek};
 
-use image::{DynamicImage, ImageDecoder, ImageError, ImageReader, Limits};
+use image::{DynamicImage, ImageDecoder, ImageError, ImageReader, ImageResult, Limits};
 use scene::CodecError;
 
 /// What a decoder may allocate beyond the pixels.
@@ -18,6 +18,18 @@ const PIXELS_PER_BYTE: u64 = 32;
 /// The largest file that can be a photo of this size: 16 bytes a pixel, and room for what cameras append.
 pub(crate) fn file_limit(width: u32, height: u32) -> u64 {
     DECODER_BYTES + 16 * u64::from(width) * u64::from(height)
+}
+
+/// Width and height as an image's header says; no pixel is decoded.
+///
+/// # Errors
+/// Not an image, or one whose header takes more memory than any photo's.
+pub(crate) fn size(file: impl BufRead + Seek) -> ImageResult<(u32, u32)> {
+    let mut reader = ImageReader::new(file).with_guessed_format()?;
+    let mut limits = Limits::default();
+    limits.max_alloc = Some(DECODER_BYTES);
+    reader.limits(limits);
+    reader.into_dimensions()
 }
 
 /// A photo as its file has it.

@@ -11,13 +11,16 @@ mod trace;
 
 use std::collections::BTreeMap;
 use std::fs;
+use std::io::Cursor;
 use std::path::Path;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use glam::{DMat3, DQuat, DVec3, Vec2, Vec3};
+use image::{ColorType, ImageFormat};
 use rayon::prelude::*;
 use scene::colmap::{self, ColmapCamera, ColmapImage, ColmapPoints, Reconstruction};
 use scene::{BadInput, Camera, CameraModel, Capture, Pinhole, Rigid, SparsePoints, View};
+use store::file::{SaveError, save};
 
 use city::{Layout, Random};
 use trace::World;
@@ -59,6 +62,20 @@ pub struct CitySummary {
     pub solids: usize,
 }
 
+/// Why there is no city.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum SynthError {
+    /// A setting is out of range.
+    #[error(transparent)]
+    BadInput(#[from] BadInput),
+    /// A file or folder could not be written.
+    #[error(transparent)]
+    Save(#[from] SaveError),
+}
+
+/// Where the sparse model goes, and which of its files is written last.
+const SPARSE: &str = "sparse/0";
+const IMAGES: &str = "images.bin";
 /// Share of the photos that the drone takes.
 const AERIAL: (usize, usize) = (3, 8);
 const DRONE_HEIGHT: f64 = 55.0;
@@ -80,20 +97,27 @@ pub fn write_city(
     out: &Path,
     settings: &CitySettings,
     progress: impl Fn(usize, usize) + Sync,
-) -> Result<CitySummary, BadInput> {
+) -> Result<CitySummary, SynthError> {
     check(settings)?;
     let world = World::new(Layout::new(settings.seed, settings.extent_metres, settings.plain));
     let views = views(settings, &world.layout);
     let images = out.join("images");
-    fs::create_dir_all(&images).map_err(|e| cannot_write(&images, e))?;
+    make(&images)?;
+    // An older city is none from here on, and the new one is none before this file is there.
+    let last = out.join(SPARSE).join(IMAGES);
+    if last.exists() {
+        fs::remove_file(&last).map_err(|e| SaveError::new(&last, &e))?;
+    }
     let done = AtomicUsize::new(0);
     views.par_iter().try_for_each(|view| {
         let path = images.join(&view.name);
-        let k = &view.camera.pinhole;
-        image::save_buffer(&path, &world.view(&view.camera), k.width, k.height, image::ColorType::Rgb8)
-            .map_err(|e| cannot_write(&path, e))?;
+        let (k, mut png) = (&view.camera.pinhole, Cursor::new(Vec::new()));
+        let pixels = world.view(&view.camera);
+        image::write_buffer_with_format(&mut png, &pixels, k.width, k.height, ColorType::Rgb8, ImageFormat::Png)
+            .map_err(|e| SaveError::new(&path, &e))?;
+        save(&path, png.get_ref())?;
         progress(done.fetch_add(1, Ordering::Relaxed) + 1, views.len());
-        Ok::<_, BadInput>(())
+        Ok::<_, SynthError>(())
     })?;
     let points = sparse_points(settings, &world, &views);
     let summary = CitySummary {
@@ -102,7 +126,7 @@ pub fn write_city(
         mean_track: points.seen_by.len() as f64 / points.len().max(1) as f64,
         solids: world.solids.len(),
     };
-    write_sparse(&out.join("sparse/0"), &Capture { views, points, geo_origin: None })?;
+    write_sparse(&out.join(SPARSE), &Capture { views, points, geo_origin: None })?;
     Ok(summary)
 }
 
@@ -119,8 +143,8 @@ fn check(settings: &CitySettings) -> Result<(), BadInput> {
     }
 }
 
-fn cannot_write(path: &Path, error: impl std::fmt::Display) -> BadInput {
-    BadInput::new(path.display().to_string(), format!("cannot be written: {error}"), "choose another --out directory")
+fn make(folder: &Path) -> Result<(), SaveError> {
+    fs::create_dir_all(folder).map_err(|e| SaveError::new(folder, &e))
 }
 
 /// All views in name order: the drone's first, then the vehicle's.
@@ -250,16 +274,15 @@ fn sees(world: &World, camera: &Camera, point: Vec3, normal: Vec3) -> bool {
     normal.dot(to_eye) > 0.09 && !world.is_blocked(point + 5e-3 * normal, to_eye, distance)
 }
 
-fn write_sparse(folder: &Path, capture: &Capture) -> Result<(), BadInput> {
-    fs::create_dir_all(folder).map_err(|e| cannot_write(folder, e))?;
+fn write_sparse(folder: &Path, capture: &Capture) -> Result<(), SaveError> {
+    make(folder)?;
     let model = reconstruction(capture);
     for (name, bytes) in [
         ("cameras.bin", colmap::write_cameras_bin(&model)),
-        ("images.bin", colmap::write_images_bin(&model)),
         ("points3D.bin", colmap::write_points_bin(&model)),
+        (IMAGES, colmap::write_images_bin(&model)),
     ] {
-        let path = folder.join(name);
-        fs::write(&path, bytes).map_err(|e| cannot_write(&path, e))?;
+        save(&folder.join(name), &bytes)?;
     }
     Ok(())
 }

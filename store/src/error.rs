@@ -3,11 +3,22 @@
 use std::error::Error;
 use std::io;
 
-use scene::ArtefactId;
+use scene::{ArtefactId, BadInput};
 
 /// A store that did not do what was asked.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum StoreError {
+    /// Not the URL of a store.
+    #[error(transparent)]
+    BadUrl(#[from] BadInput),
+    /// A folder that cannot be made or opened.
+    #[error("{store}: cannot be made or opened as a folder: {reason}; choose a folder that you may write to")]
+    Closed {
+        /// The store's URL.
+        store: String,
+        /// What the file system said.
+        reason: String,
+    },
     /// No such artefact.
     #[error("artefact {id} is not in the store {store}; run the step that makes it again")]
     Missing {
@@ -53,6 +64,9 @@ pub(crate) fn reason(error: &(dyn Error + 'static)) -> String {
                 io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded => {
                     return "the disk is full; free some space and run again".into();
                 }
+                io::ErrorKind::FileTooLarge => {
+                    return "the system allows no file as long (ulimit -f); raise that and run again".into();
+                }
                 io::ErrorKind::ReadOnlyFilesystem => return "the file system is read-only; choose another".into(),
                 io::ErrorKind::PermissionDenied => return "permission denied; choose a folder you may write to".into(),
                 _ => {}
@@ -73,6 +87,7 @@ mod tests {
     fn known_failures_are_said_in_plain_words() {
         for (kind, words) in [
             (io::ErrorKind::StorageFull, "the disk is full"),
+            (io::ErrorKind::FileTooLarge, "the system allows no file as long"),
             (io::ErrorKind::ReadOnlyFilesystem, "read-only"),
             (io::ErrorKind::PermissionDenied, "permission denied"),
         ] {

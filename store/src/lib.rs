@@ -8,7 +8,9 @@
 
 mod blocking;
 mod error;
+pub mod file;
 
+use std::error::Error;
 use std::ops::Range;
 use std::path::Path as FilePath;
 use std::sync::Arc;
@@ -50,11 +52,11 @@ impl Store {
     /// which is empty, and gone with its last clone.
     ///
     /// # Errors
-    /// A folder that cannot be made or opened, or a kind of store that this program does not know.
-    pub fn open(url: &str) -> Result<Self, BadInput> {
+    /// A URL that is none, or of a kind that this program does not know; a folder that cannot be made or opened.
+    pub fn open(url: &str) -> Result<Self, StoreError> {
         const ADVICE: &str = "give the path of a folder, file:///path or memory://";
         let objects: Arc<dyn ObjectStore> = match url.split_once("://") {
-            None if url.is_empty() => return Err(BadInput::new("the store", "has an empty URL", ADVICE)),
+            None if url.is_empty() => return Err(BadInput::new("the store", "has an empty URL", ADVICE).into()),
             None => Arc::new(folder(url, FilePath::new(url))?),
             Some(("memory", "")) => Arc::new(InMemory::new()),
             Some(("file", _)) => {
@@ -64,7 +66,7 @@ impl Store {
             }
             Some((scheme, _)) => {
                 let problem = format!("stores of the kind {scheme}:// are not supported by this version");
-                return Err(BadInput::new(url, problem, ADVICE));
+                return Err(BadInput::new(url, problem, ADVICE).into());
             }
         };
         Ok(Self { objects, url: url.into(), read: Arc::default(), written: Arc::default() })
@@ -202,12 +204,10 @@ impl Store {
     }
 }
 
-fn folder(url: &str, path: &FilePath) -> Result<LocalFileSystem, BadInput> {
-    let advice = "choose a folder that you may write to";
-    std::fs::create_dir_all(path)
-        .map_err(|error| BadInput::new(url, format!("cannot be made as a folder ({error})"), advice))?;
-    LocalFileSystem::new_with_prefix(path)
-        .map_err(|error| BadInput::new(url, format!("cannot be opened ({})", error::reason(&error)), advice))
+fn folder(url: &str, path: &FilePath) -> Result<LocalFileSystem, StoreError> {
+    let closed = |error: &(dyn Error + 'static)| StoreError::Closed { store: url.into(), reason: error::reason(error) };
+    std::fs::create_dir_all(path).map_err(|error| closed(&error))?;
+    LocalFileSystem::new_with_prefix(path).map_err(|error| closed(&error))
 }
 
 fn artefact_path(id: ArtefactId) -> Path {

@@ -8,6 +8,7 @@ use ::bench::{CurvePoint, PartLine, append, append_part, read_folder, replace_ta
 use dataset::synth::{CitySettings, write_city};
 use serde::Serialize;
 use store::Store;
+use store::file::save;
 
 use crate::args::{
     AdaptiveArgs, Auto, BenchDemoArgs, ChartArgs, DemoArgs, IngestArgs, ParetoArgs, PlanOptions, TrainArgs,
@@ -19,7 +20,7 @@ use crate::commands::eval::{self, evaluate};
 use crate::commands::train::{ingest_photos, make_folder, train};
 use crate::failure::Failure;
 use crate::lpips::Lpips;
-use crate::model::{save, save_json};
+use crate::model::save_json;
 use crate::output::Output;
 use crate::record::{Record, commit};
 

@@ -3,6 +3,7 @@
 use std::path::Path;
 
 use serde::Serialize;
+use store::file::save;
 
 use crate::args::{ExportArgs, Format};
 use crate::commands::train::make_folder;
@@ -28,7 +29,7 @@ pub(crate) fn run(args: &ExportArgs, output: &Output) -> Result<(), Failure> {
     if let Some(folder) = args.out.parent().filter(|folder| !folder.as_os_str().is_empty()) {
         make_folder(folder)?;
     }
-    model::save(&args.out, &bytes)?;
+    save(&args.out, &bytes)?;
     let exported = Exported {
         command: "export",
         out: &args.out,

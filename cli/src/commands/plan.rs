@@ -4,13 +4,14 @@
 use blocks::{Finding, Plan};
 use scene::{ArtefactId, Capture, frame};
 use serde::Serialize;
+use store::file::save;
 use worker::estimate::Estimate;
 
 use crate::args::{PlanArgs, PlanOptions};
 use crate::cameras;
 use crate::commands::train::check_plan;
 use crate::failure::Failure;
-use crate::model::{save, save_json};
+use crate::model::save_json;
 use crate::output::Output;
 
 #[derive(Serialize)]

@@ -9,6 +9,7 @@ use ::render::{Frame, Options};
 use image::RgbImage;
 use scene::{BadInput, npy};
 use serde::Serialize;
+use store::file::save;
 
 use crate::args::RenderArgs;
 use crate::cameras;
@@ -62,7 +63,7 @@ pub(crate) fn run(args: &RenderArgs, output: &Output) -> Result<(), Failure> {
         make_folder(picture.parent().unwrap_or(&args.out))?;
         bench::write_png(&picture, &to_image(frame))?;
         if args.depth {
-            model::save(&file(".depth.npy"), &npy::write_f32(&[frame.height, frame.width], &depth_metres(frame)))?;
+            save(&file(".depth.npy"), &npy::write_f32(&[frame.height, frame.width], &depth_metres(frame)))?;
         }
         progress.at(i as u64 + 1, "");
     }

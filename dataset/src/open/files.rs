@@ -1,12 +1,14 @@
 //! Files inside a capture, and nowhere else.
 
 use std::fmt;
+use std::fs::File;
+use std::io::BufReader;
 use std::path::{Component, Path, PathBuf};
 
-use image::{ImageError, ImageReader};
+use image::ImageError;
 use scene::BadInput;
 
-use crate::mips;
+use crate::{mips, photo};
 
 /// Pixels of the longest side of a photo: as many as a JPEG can have.
 const LONGEST_SIDE: u32 = 65_535;
@@ -87,8 +89,8 @@ pub(super) fn image_size(path: &Path) -> Result<(u32, u32), BadInput> {
         let problem = format!("is not an image that can be read ({e})");
         BadInput::new(show(path), problem, "replace the file or take its image out of the capture")
     };
-    let reader = ImageReader::open(path).and_then(ImageReader::with_guessed_format).map_err(|e| cannot(&e))?;
-    let (width, height) = reader.into_dimensions().map_err(|e| match e {
+    let file = File::open(path).map_err(|e| cannot(&e))?;
+    let (width, height) = photo::size(BufReader::new(file)).map_err(|e| match e {
         ImageError::Limits(_) => cannot(&"it claims more pixels than any photo has"),
         other => cannot(&other),
     })?;

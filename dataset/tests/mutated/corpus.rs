@@ -4,37 +4,17 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::rc::Rc;
 
-use dataset::ingest::{self, IngestOptions};
+use dataset::ingest;
 use dataset::open::{self, OpenOptions};
 use dataset::{mips, synth};
-use glam::{DQuat, DVec3, Vec3};
+use glam::Vec3;
 use image::{DynamicImage, ImageFormat, Rgb, RgbImage, Rgba, RgbaImage};
-use scene::frame::{self, Kind};
+use scene::frame;
 use scene::transforms::{Frame, Intrinsics, Transforms};
-use scene::{CameraModel, Capture, CodecError, Pixels, Rect, Rigid, Splat, Splats};
-use scene::{colmap, kitti360, npy, opensfm, ply, spz, transforms};
-use store::Store;
+use scene::{CameraModel, Pixels, Splat, Splats};
+use scene::{npy, ply, spz, transforms};
 
-/// A reader of files.
-pub(crate) struct Reader {
-    /// The fuzz target (`fuzz/fuzz_targets`) that the file is a seed of; empty if none.
-    pub(crate) target: &'static str,
-    call: Box<Call>,
-}
-
-type Call = dyn Fn(&[u8]) -> Result<(), String>;
-type Read = Rc<Reader>;
-
-impl Reader {
-    fn new(target: &'static str, call: impl Fn(&[u8]) -> Result<(), String> + 'static) -> Read {
-        Rc::new(Self { target, call: Box::new(call) })
-    }
-
-    /// Reads the bytes and checks that what comes out is what the reader promises; one line if it refuses them.
-    pub(crate) fn read(&self, bytes: &[u8]) -> Result<(), String> {
-        (self.call)(bytes)
-    }
-}
+use crate::readers::*;
 
 /// What keeps damage from getting further than a checksum, and is made to fit again most of the time.
 #[derive(Clone, Copy, PartialEq)]
@@ -60,6 +40,9 @@ const PLAIN: Budget = Budget { factor: 16, base: 16 << 20 };
 const COMPRESSED: Budget = Budget { factor: 20, base: 34 << 20 };
 /// A photo's pixels several times over; what it may claim is bounded by `photo::FREE_PIXELS`.
 const PHOTO: Budget = Budget { factor: 0, base: 256 << 20 };
+
+/// Of the photos that are written here: their TIFF, which is not compressed, fits a fuzzer's seed.
+pub(crate) const PHOTO_SIZE: (u32, u32) = (80, 60);
 
 pub(crate) struct Seed {
     pub(crate) name: String,
@@ -255,22 +238,24 @@ impl Corpus {
         let id = scene::ArtefactId::of(b"city");
         let plan = blocks::plan(&source.capture, id, &settings, "cpu").expect("a city can be planned");
         self.put("plan", plan.to_frame(), &plan_codec(source.capture.clone()), Seal::Frame, PLAIN);
+        // Of the size that its fuzz target expects.
         let bytes = (0..3 * 150 * 140).map(|i| (i * 7 / 11) as u8).collect();
         let pixels = Pixels { width: 150, height: 140, rgb: bytes, mask: None };
         self.plain("mip", mips::encode(&pixels).expect("an image"), &mip_codec());
 
         let [photo, mask] = [photo_codec(false), photo_codec(true)];
-        let image = RgbImage::from_fn(200, 100, |x, y| Rgb([(x * 5) as u8, (y * 3) as u8, (x ^ y) as u8]));
+        let image =
+            RgbImage::from_fn(PHOTO_SIZE.0, PHOTO_SIZE.1, |x, y| Rgb([(x * 5) as u8, (y * 3) as u8, (x ^ y) as u8]));
         for format in [ImageFormat::Jpeg, ImageFormat::Png, ImageFormat::Tiff, ImageFormat::WebP] {
             self.photo(&format!("photo, {format:?}"), encoded(image.clone(), format), &photo);
         }
-        let alpha = RgbaImage::from_fn(200, 100, |x, y| Rgba([x as u8, y as u8, 9, (x + y) as u8]));
+        let alpha = RgbaImage::from_fn(PHOTO_SIZE.0, PHOTO_SIZE.1, |x, y| Rgba([x as u8, y as u8, 9, (x + y) as u8]));
         self.photo("photo with alpha", encoded(alpha, ImageFormat::Png), &photo);
         self.photo("mask", encoded(DynamicImage::from(image).to_luma8(), ImageFormat::Png), &mask);
     }
 }
 
-fn encoded(image: impl Into<DynamicImage>, format: ImageFormat) -> Vec<u8> {
+pub(crate) fn encoded(image: impl Into<DynamicImage>, format: ImageFormat) -> Vec<u8> {
     let mut bytes = std::io::Cursor::new(Vec::new());
     image.into().write_to(&mut bytes, format).expect("an image is encoded");
     bytes.into_inner()
@@ -317,179 +302,7 @@ fn packed() -> Vec<u8> {
     bytes
 }
 
-/// A refusal in one line, or a promise that was kept.
-fn codec<T: 'static>(target: &'static str, read: fn(&[u8]) -> Result<T, CodecError>, kept: fn(T) -> bool) -> Read {
-    Reader::new(target, move |bytes| {
-        let value = read(bytes).map_err(|error| error.to_string())?;
-        assert!(kept(value), "accepted what it promises to refuse");
-        Ok(())
-    })
-}
-
-fn camera_is_sane(model: &CameraModel, width: u32, height: u32) -> bool {
-    let finite = model.focal_and_centre().iter().chain(&model.distortion()).all(|v| v.is_finite());
-    finite && model.focal_and_centre()[..2].iter().all(|f| *f > 0.0) && width > 0 && height > 0
-}
-
-fn colmap_binary() -> [Read; 3] {
-    let images: fn(&[u8]) -> _ = |bytes| {
-        let keypoints = colmap::read_keypoints_bin(bytes);
-        colmap::read_images_bin(bytes).inspect(|_| assert!(keypoints.is_ok()))
-    };
-    [
-        codec("colmap_binary", colmap::read_cameras_bin, |c| {
-            c.values().all(|c| camera_is_sane(&c.model, c.width, c.height))
-        }),
-        codec("colmap_binary", images, |i| i.iter().all(|i| i.camera_from_world.is_sane() && !i.name.is_empty())),
-        codec("colmap_binary", colmap::read_points_bin, points_are_sane),
-    ]
-}
-
-fn colmap_text() -> [Read; 3] {
-    [
-        codec("colmap_text", colmap::read_cameras_txt, |c| {
-            c.values().all(|c| camera_is_sane(&c.model, c.width, c.height))
-        }),
-        codec("colmap_text", colmap::read_images_txt, |i| {
-            i.iter().all(|i| i.camera_from_world.is_sane() && !i.name.is_empty())
-        }),
-        codec("colmap_text", colmap::read_points_txt, points_are_sane),
-    ]
-}
-
-fn points_are_sane(points: colmap::ColmapPoints) -> bool {
-    points.positions.iter().all(|p| p.is_finite())
-        && (0..points.len()).map(|i| points.track(i).len()).sum::<usize>() == points.track_images.len()
-}
-
-fn transforms_codec() -> Read {
-    codec("transforms", transforms::read, |file| {
-        let sane = |frame: &Frame| {
-            let (width, height) = frame.intrinsics.size.unwrap_or((40, 30));
-            frame.intrinsics.model(width, height);
-            frame.camera_from_world.is_sane() && width > 0 && height > 0
-        };
-        file.frames.iter().all(sane) && transforms::read(&transforms::write(&file)).is_ok()
-    })
-}
-
-fn opensfm_codec() -> Read {
-    codec("opensfm", opensfm::read, |sfm| {
-        sfm.shots
-            .iter()
-            .all(|s| s.camera_from_world.is_sane() && camera_is_sane(&s.camera.model, s.camera.width, s.camera.height))
-            && sfm.positions.iter().all(|p| p.is_finite())
-            && sfm.colours.len() == sfm.positions.len()
-    })
-}
-
-fn kitti_codecs() -> [Read; 5] {
-    [
-        codec("kitti360", kitti360::read_perspective, |c| {
-            c.values().all(|c| camera_is_sane(&c.model, c.width, c.height))
-        }),
-        codec("kitti360", kitti360::read_cam_to_pose, |poses| poses.values().all(Rigid::is_sane)),
-        codec("kitti360", kitti360::read_cam_to_velo, |pose| pose.is_sane()),
-        codec("kitti360", kitti360::read_poses, |poses| poses.values().all(Rigid::is_sane)),
-        codec("kitti360", |bytes| kitti360::read_scan(bytes, 1), |points| points.iter().all(|p| p.is_finite())),
-    ]
-}
-
-fn ply_codec() -> Read {
-    let both: fn(&[u8]) -> _ = |bytes| {
-        ply::comments(bytes);
-        ply::read(bytes)
-    };
-    codec("ply", both, |splats| splats.columns().iter().all(|c| c.len() == splats.len()))
-}
-
-fn cloud_codec() -> Read {
-    codec("ply", ply::read_points, |(points, colours)| {
-        points.len() == colours.len() && points.iter().all(|p| p.is_finite())
-    })
-}
-
-fn spz_codec() -> Read {
-    codec("spz", spz::read, |(splats, _)| (0..splats.len()).all(|i| splats.is_finite(i)))
-}
-
-fn splats_codec() -> Read {
-    codec("frames", frame::decode_splats, |splats| splats.columns().iter().all(|c| c.len() == splats.len()))
-}
-
-fn npy_codec() -> Read {
-    codec("npy", npy::read_f32, |(shape, data)| shape.iter().product::<usize>() == data.len())
-}
-
-/// With the capture that it may or may not be a plan of.
-fn plan_codec(capture: Capture) -> Read {
-    Reader::new("frames", move |bytes| {
-        let plan = blocks::Plan::from_frame(bytes).map_err(|error| error.to_string())?;
-        plan.leaves();
-        for task in &plan.tasks {
-            task.window_pixels();
-            task.context_cut();
-            plan.ground.halo(task.block);
-            assert!(plan.task(task.block).is_some());
-        }
-        blocks::lint(&plan, &capture);
-        Ok(())
-    })
-}
-
-/// Through the store, as programs do; then what they ask of a capture.
-fn capture_codec() -> Read {
-    let store = Store::open("memory://").expect("memory").blocking();
-    Reader::new("frames", move |bytes| {
-        let kind: Kind = ingest::CAPTURE;
-        frame::decode::<Capture>(kind, bytes).map_err(|error| error.to_string())?;
-        let id = store.put(bytes.to_vec()).expect("memory takes it");
-        let capture = ingest::load_capture(&store, id).map_err(|error| error.to_string())?;
-        let settings = blocks::PlanSettings { budget: 1000, ..Default::default() };
-        // Whether there is a plan is not asked, as the numbers may be wild.
-        let _ = blocks::plan(&capture, id, &settings, "cpu").map_err(|error| error.to_string())?;
-        Ok(())
-    })
-}
-
-fn mip_codec() -> Read {
-    Reader::new("", |bytes| {
-        let layout = mips::Layout { width: 150, height: 140, masked: false };
-        let index = layout.index(bytes.get(..layout.index_len()).unwrap_or(bytes)).map_err(|e| e.to_string())?;
-        let rect = Rect { x: 100, y: 100, width: 50, height: 40 };
-        let ranges = index.ranges(rect).expect("the window is inside");
-        let part = |r: &std::ops::Range<u64>| bytes.get(r.start as usize..r.end as usize).unwrap_or(&[]);
-        index.window(rect, &ranges.iter().map(part).collect::<Vec<_>>()).map_err(|e| e.to_string())?;
-        Ok(())
-    })
-}
-
-/// A capture whose photo, or whose mask, is the file: opened and ingested.
-fn photo_codec(as_mask: bool) -> Read {
-    let folder = tempfile::tempdir().expect("a folder");
-    let frame = |x: f64, mask: bool| Frame {
-        file_path: if mask { "good.png" } else { "photo" }.into(),
-        mask_path: mask.then(|| "photo".to_string()),
-        intrinsics: Intrinsics::from_model(&CameraModel::Pinhole([90.0, 90.0, 50.0, 50.0]), None),
-        camera_from_world: Rigid { rotation: DQuat::IDENTITY, translation: DVec3::new(x, 0.0, 0.0) },
-    };
-    let file = Transforms { frames: vec![frame(0.0, as_mask)], ply_file_path: Some("cloud.ply".into()) };
-    fs::write(folder.path().join("transforms.json"), transforms::write(&file)).expect("written");
-    fs::write(folder.path().join("cloud.ply"), CLOUD).expect("written");
-    fs::write(folder.path().join("good.png"), encoded(RgbImage::new(200, 100), ImageFormat::Png)).expect("written");
-    Reader::new("", move |bytes| {
-        fs::write(folder.path().join("photo"), bytes).expect("written");
-        let source = open::open(folder.path(), &OpenOptions::default()).map_err(|error| error.to_string())?;
-        let store = Store::open("memory://").expect("memory").blocking();
-        let options = IngestOptions { downscale: 1, threads: 1 };
-        let ingested = ingest::ingest(&source, &store, &options, &|_, _| ()).map_err(|error| error.to_string())?;
-        let loaded = ingest::load_capture(&store, ingested.id).map_err(|error| error.to_string())?;
-        assert_eq!(loaded, ingested.capture);
-        Ok(())
-    })
-}
-
-const CLOUD: &str = "ply\nformat ascii 1.0\ncomment a cloud\nelement vertex 3\nproperty float x\nproperty double y\n\
+pub(crate) const CLOUD: &str = "ply\nformat ascii 1.0\ncomment a cloud\nelement vertex 3\nproperty float x\nproperty double y\n\
     property float z\nproperty uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n\
     0 0 -3 1 2 3\n1 0.5 -3 4 5 6\n-1 1e-3 -4 7 8 9\n";
 const RECONSTRUCTION: &str = r#"[{"cameras": {

@@ -7,6 +7,7 @@
 mod corpus;
 mod memory;
 mod mutate;
+mod readers;
 
 use std::io::{Read, Write};
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -96,7 +97,7 @@ fn damaged_files_are_refused_or_read() {
 
 /// The files as seeds of the fuzz targets, without what guards them: the targets put that back.
 fn write_seeds(folder: &Path, seeds: &[Seed]) {
-    for (i, file) in seeds.iter().enumerate().filter(|(_, file)| !file.reader.target.is_empty()) {
+    for (i, file) in seeds.iter().enumerate() {
         let mut bytes = opened(file);
         bytes.truncate(LARGEST_SEED);
         let folder = folder.join(file.reader.target);

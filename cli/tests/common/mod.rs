@@ -1,0 +1,53 @@
+//! plat as scripts run it, and what must come of that.
+#![allow(dead_code, reason = "each test program uses some of it")]
+
+use std::path::Path;
+use std::process::{Command, Output};
+
+use dataset::synth::{CitySettings, write_city};
+use serde_json::Value;
+
+/// The program in a folder with these words, not yet run.
+pub(crate) fn command(folder: &Path, words: &[&str]) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_plat"));
+    command.args(words).current_dir(folder);
+    command
+}
+
+/// Runs it.
+pub(crate) fn plat(folder: &Path, words: &[&str]) -> Output {
+    command(folder, words).output().expect("plat runs")
+}
+
+/// Runs a command that must succeed, and its JSON.
+pub(crate) fn done(folder: &Path, words: &[&str]) -> Value {
+    json_of(&mut command(folder, words))
+}
+
+/// As [`done`], of a command that is set up in another way too.
+pub(crate) fn json_of(command: &mut Command) -> Value {
+    let output = command.arg("--json").output().expect("plat runs");
+    assert!(output.status.success(), "{command:?}: {}", String::from_utf8_lossy(&output.stderr));
+    let text = String::from_utf8(output.stdout).unwrap();
+    serde_json::from_str(text.lines().last().expect("an object on the last line")).unwrap()
+}
+
+/// Runs a command that must be refused with one line that says this.
+pub(crate) fn refused(folder: &Path, words: &[&str], wanted: &str) {
+    stopped(&mut command(folder, words), 2, wanted);
+}
+
+/// Runs a command that must end with this exit code and one line that says this.
+pub(crate) fn stopped(command: &mut Command, code: i32, wanted: &str) {
+    let output = command.output().expect("plat runs");
+    let line = String::from_utf8(output.stderr).unwrap();
+    assert_eq!(output.status.code(), Some(code), "{command:?}: {line}");
+    assert!(line.contains(wanted) && line.trim_end().lines().count() == 1, "{command:?}: {line}");
+    assert!(output.stdout.is_empty(), "{command:?}");
+}
+
+/// Writes the capture of a small city into the folder `city`.
+pub(crate) fn city(folder: &Path, views: u32, width: u32, height: u32) {
+    let settings = CitySettings { seed: 3, extent_metres: 80.0, views, width, height, plain: 0.0 };
+    write_city(&folder.join("city"), &settings, |_, _| {}).unwrap();
+}
