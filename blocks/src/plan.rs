@@ -8,7 +8,7 @@ use crate::ground::Ground;
 use crate::lod::{Cut, training_order};
 
 /// The version of [`Plan`] that this program writes and reads.
-pub const VERSION: u32 = 1;
+pub const VERSION: u32 = 2;
 /// The frame that carries a plan.
 pub const PLAN: Kind = Kind(*b"plan", VERSION);
 /// The deepest level a plan may have: 65,536 blocks a side.
@@ -53,6 +53,8 @@ pub struct PlanSettings {
     /// Opacity compensated for the pixel's blur, so that the model may be drawn at any resolution (Mip-Splatting's 2D filter);
     /// else a plain 3DGS model.
     pub antialiased: bool,
+    /// Whether the root trains an exposure of each view, which all others take as it is.
+    pub exposure: bool,
     /// What one task may take, bytes.
     pub memory_limit_bytes: u64,
 }
@@ -69,6 +71,7 @@ impl Default for PlanSettings {
             test_every: 8,
             sh_degree: 3,
             antialiased: false,
+            exposure: false,
             memory_limit_bytes: 4 << 30,
         }
     }

@@ -100,6 +100,10 @@ fn check(settings: &PlanSettings) -> Result<(), PlanError> {
     if !(settings.tolerance_db >= 0.0 && settings.tolerance_db.is_finite()) {
         return bad("--tolerance-db", format!("{} is no loss", settings.tolerance_db), "give decibels from 0");
     }
+    if settings.exposure && settings.mode == Mode::Flat {
+        let problem = "flat blocks have no root to share exposures from";
+        return bad("--exposure", problem.into(), "leave it off, or use --blocks tree or whole");
+    }
     if settings.sh_degree > 3 {
         return bad("sh_degree", format!("{} is not supported", settings.sh_degree), "give 0 to 3");
     }

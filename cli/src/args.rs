@@ -177,6 +177,10 @@ pub(crate) struct PlanOptions {
     /// 0.2 to 0.6 dB at its own
     #[arg(long)]
     pub(crate) antialiased: bool,
+    /// Train an exposure of each view where the whole scene is trained, and give it to all blocks below. For photos whose
+    /// exposure or white balance differs; not with --blocks flat
+    #[arg(long)]
+    pub(crate) exposure: bool,
     /// Use photos at one N-th of their size
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
     pub(crate) downscale: u32,
@@ -205,6 +209,7 @@ impl PlanOptions {
             tolerance_db: self.tolerance_db,
             test_every: self.test_every,
             antialiased: self.antialiased,
+            exposure: self.exposure,
             ..PlanSettings::default()
         }
     }

@@ -14,7 +14,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use blocks::{Cut, Ground, Plan};
-use scene::{ArtefactId, BadInput, BlockId, CodecError, GeoOrigin, Splats, frame, ply, spz};
+use scene::{ArtefactId, BadInput, BlockId, CodecError, Exposures, GeoOrigin, Splats, frame, ply, spz};
 use serde::{Deserialize, Serialize};
 use store::{BlockingStore, Store};
 use tempfile::TempDir;
@@ -26,6 +26,7 @@ const VERSION: u32 = 1;
 /// Said in a PLY's comments of a model that is to be drawn anti-aliased.
 const ANTIALIASED: &str = "antialiased";
 const PLAN_FILE: &str = "plan.plat";
+const EXPOSURES_FILE: &str = "exposures.plat";
 
 /// `model.json`.
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -42,6 +43,9 @@ pub(crate) struct Manifest {
     pub(crate) test_every: u32,
     /// Photos were used at one over this of their size.
     pub(crate) downscale: u32,
+    /// Hash of the file of the training views' exposures, where there are any.
+    #[serde(default)]
+    pub(crate) exposures: Option<ArtefactId>,
     /// Splats of the finest cut.
     pub(crate) splats: u64,
     /// By (level, y, x).
@@ -64,6 +68,8 @@ pub(crate) struct Model {
     /// The finest cut.
     pub(crate) splats: Splats,
     pub(crate) antialiased: bool,
+    /// What its training views are compared through, by view of the plan's capture; nobody draws a model with it.
+    pub(crate) exposures: Option<Exposures>,
     /// Of a trained model: its manifest and the folder that `plat train` wrote.
     pub(crate) trained: Option<(Manifest, PathBuf)>,
 }
@@ -140,13 +146,15 @@ pub(crate) fn write(
 ) -> Result<Model, Failure> {
     let folder = begin(out, plan)?;
 
-    let mut blocks = Vec::new();
+    let (mut blocks, mut exposures) = (Vec::new(), None);
     let splats = sew(plan, |block| -> Result<_, Failure> {
         let index = plan.tasks.iter().position(|task| task.block == block);
         let artefact =
             *index.and_then(|i| results.get(i)).ok_or_else(|| Failure::Work(format!("block {block} has no result")))?;
         let bytes = store.get(artefact)?;
-        let splats = frame::decode_splats(&bytes).map_err(|error| Failure::Work(format!("block {block}: {error}")))?;
+        let damaged = |error: CodecError| Failure::Work(format!("block {block}: {error}"));
+        let (splats, trained_with) = frame::decode_result(&bytes).map_err(damaged)?;
+        exposures = exposures.or(trained_with);
         save(&folder.join("blocks").join(file_name(block)), &bytes)?;
         blocks.push(Block { block, artefact, splats: splats.len() as u64 });
         Ok(splats)
@@ -160,13 +168,24 @@ pub(crate) fn write(
         ground: plan.ground,
         test_every: plan.settings.test_every,
         downscale,
+        exposures,
         splats: splats.len() as u64,
         blocks,
     };
+    let exposures = match exposures {
+        Some(id) => Some(Exposures::from_frame(&store.get(id)?).map_err(|error| Failure::Work(error.to_string()))?),
+        None => None,
+    };
+    save_exposures(&folder, exposures.as_ref())?;
     save_json(&folder.join("model.json"), &manifest)?;
-    let model = Model { splats, antialiased: manifest.antialiased, trained: Some((manifest, out.to_path_buf())) };
+    let trained = Some((manifest.clone(), out.to_path_buf()));
+    let model = Model { splats, antialiased: manifest.antialiased, exposures, trained };
     save(&out.join("merged.ply"), &model.to_ply())?;
     Ok(model)
+}
+
+fn save_exposures(folder: &Path, exposures: Option<&Exposures>) -> Result<(), Failure> {
+    exposures.map_or(Ok(()), |exposures| save(&folder.join(EXPOSURES_FILE), &exposures.to_frame()))
 }
 
 /// The finest cut: of every task's splats those that its block owns among all of them.
@@ -200,18 +219,26 @@ pub(crate) fn read(path: &Path) -> Result<Model, BadInput> {
     let bytes = load(path)?;
     if is("spz") {
         let (splats, antialiased) = spz::read(&bytes).map_err(|error| damaged(path, &error))?;
-        return Ok(Model { splats, antialiased, trained: None });
+        return Ok(Model { splats, antialiased, exposures: None, trained: None });
     }
     let splats = ply::read(&bytes).map_err(|error| damaged(path, &error))?;
     let antialiased = ply::comments(&bytes).iter().any(|comment| comment.trim() == ANTIALIASED);
-    Ok(Model { splats, antialiased, trained: None })
+    Ok(Model { splats, antialiased, exposures: None, trained: None })
 }
 
 fn read_trained(folder: &Path) -> Result<Model, BadInput> {
     let (manifest, plan) = read_plan(folder)?;
     let splats = sew(&plan, |block| read_block(folder, block))?;
     let out = folder.parent().filter(|_| folder.ends_with("model")).unwrap_or(folder);
-    Ok(Model { splats, antialiased: manifest.antialiased, trained: Some((manifest, out.to_path_buf())) })
+    let exposures = match manifest.exposures {
+        Some(_) => {
+            let path = folder.join(EXPOSURES_FILE);
+            Some(Exposures::from_frame(&load(&path)?).map_err(|error| damaged(&path, &error))?)
+        }
+        None => None,
+    };
+    let antialiased = manifest.antialiased;
+    Ok(Model { splats, antialiased, exposures, trained: Some((manifest, out.to_path_buf())) })
 }
 
 /// A trained model block by block.

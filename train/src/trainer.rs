@@ -7,9 +7,10 @@
 use glam::Vec3;
 use render::cpu::{Isa, Renderer};
 use render::{Options, Upstream};
-use scene::{Camera, Pixels, Rect, Splats};
+use scene::{Camera, Exposures, Pixels, Rect, Splats};
 use serde::{Deserialize, Serialize};
 
+use crate::exposure::{ExposureTraining, expose, expose_backward};
 use crate::growth::{self, Evidence, Growth};
 use crate::loss::Photometric;
 use crate::optimiser::{Adam, Rates};
@@ -32,6 +33,8 @@ pub struct Recipe {
     pub sh_dc: [f32; 2],
     /// The other coefficients' step relative to that.
     pub sh_rest: f32,
+    /// Step of the views' exposures, where they are trained: at first, at the end.
+    pub exposure: [f32; 2],
     /// Decay of Adam's second moment.
     pub beta2: f32,
     /// Pull on opacities and needles, see [`Rates`].
@@ -58,6 +61,7 @@ impl Default for Recipe {
             opacity: [0.05, 0.02],
             sh_dc: [0.01, 0.0025],
             sh_rest: 0.05,
+            exposure: [0.01, 0.001],
             beta2: 0.999,
             opacity_pull: 0.0,
             needle_pull: 0.01,
@@ -138,6 +142,10 @@ pub struct Job<'a> {
     pub seed: u64,
     /// Smallest and largest standard deviation, metres.
     pub size_bounds_metres: [f32; 2],
+    /// Exposures of the views, not moved; views without one are drawn as they are.
+    pub exposures: Option<&'a Exposures>,
+    /// Whether exposures are trained instead, from the identity on.
+    pub trains_exposures: bool,
     /// How.
     pub recipe: &'a Recipe,
     /// Pixels.
@@ -189,10 +197,11 @@ pub enum TrainError {
 /// # Errors
 /// See [`TrainError`].
 pub fn train(job: Job, report: &mut dyn FnMut(Progress) -> Flow) -> Result<Splats, TrainError> {
-    train_on(job, None, report)
+    train_on(job, None, report).map(|(splats, _)| splats)
 }
 
-/// Trains a block on from where an earlier run of the same job stood: the result is what that would have come to.
+/// Trains a block on from where an earlier run of the same job stood: the result is what that would have come to. With the
+/// splats come the exposures, where those are trained.
 ///
 /// # Errors
 /// See [`TrainError`].
@@ -200,7 +209,7 @@ pub fn train_on(
     mut job: Job,
     from: Option<State>,
     report: &mut dyn FnMut(Progress) -> Flow,
-) -> Result<Splats, TrainError> {
+) -> Result<(Splats, Option<Exposures>), TrainError> {
     let Job { context, views, counts, keeps, budget, steps, recipe, .. } = job;
     if views.is_empty() {
         return Err(TrainError::NoViews);
@@ -209,6 +218,7 @@ pub fn train_on(
     let mut renderer = Renderer::new(isa);
     let mut loss = Photometric::new(isa, recipe.lambda);
     let mut upstream = Upstream::default();
+    let mut exposed = Vec::new();
     let mut weights = Vec::new();
     let initial = std::mem::replace(&mut job.initial, Splats::new(0));
     let mut now = from.unwrap_or_else(|| State {
@@ -217,6 +227,7 @@ pub fn train_on(
         start_count: (0..initial.len()).filter(|&i| counts(initial.mean(i))).count(),
         adam: Adam::new(isa, &initial),
         evidence: Evidence::default(),
+        exposures: job.trains_exposures.then(|| ExposureTraining::new(views)),
         splats: initial,
     });
     let log_scale_bounds = job.size_bounds_metres.map(f32::ln);
@@ -241,8 +252,20 @@ pub fn train_on(
         };
         let frame = renderer.forward(&now.splats, context, &camera, &options);
         pixel_weights(frame, &photo, &mut weights);
-        let value = loss.evaluate(&frame.colour, &photo, &weights, &mut upstream.colour);
+        let trained = now.exposures.as_ref().map(|exposures| exposures.of(view.view));
+        let exposure = trained.unwrap_or_else(|| job.exposures?.of(view.view).copied());
+        let shown = exposure.as_ref().map_or(&frame.colour, |exposure| {
+            expose(exposure, &frame.colour, &mut exposed);
+            &exposed
+        });
+        let value = loss.evaluate(shown, &photo, &weights, &mut upstream.colour);
         if value.total.is_finite() {
+            if let Some(exposure) = &exposure {
+                let by_exposure = expose_backward(exposure, &frame.colour, &mut upstream.colour);
+                if let Some(exposures) = &mut now.exposures {
+                    exposures.step(view.view, &by_exposure, between(recipe.exposure, progress));
+                }
+            }
             let gradients = renderer.backward(&now.splats, &upstream);
             now.evidence.add(gradients, photo.area() as f32);
             now.adam.step(&mut now.splats, gradients, options.sh_degree, &rates(recipe, progress, log_scale_bounds));
@@ -275,7 +298,8 @@ pub fn train_on(
             break;
         }
     }
-    Ok(now.splats)
+    let exposures = now.exposures.map(|exposures| exposures.exposures());
+    Ok((now.splats, exposures))
 }
 
 /// Every view once per epoch, each epoch in another order.
@@ -297,9 +321,14 @@ fn coarser(recipe: &Recipe, progress: f32) -> u8 {
     0
 }
 
-/// Step sizes at a share of the way: geometric between first and last.
+/// A step size at a share of the way: geometric between first and last.
+fn between([first, last]: [f32; 2], progress: f32) -> f32 {
+    first * (last / first).powf(progress)
+}
+
+/// Step sizes at a share of the way.
 fn rates(recipe: &Recipe, progress: f32, log_scale_bounds: [f32; 2]) -> Rates {
-    let at = |[first, last]: [f32; 2]| first * (last / first).powf(progress);
+    let at = |bounds| between(bounds, progress);
     Rates {
         mean: at(recipe.mean),
         log_scale: at(recipe.log_scale),

@@ -146,6 +146,8 @@ impl<'a> Setup<'a> {
             antialiased: false,
             seed: 5,
             size_bounds_metres: [1e-3, 2.0],
+            exposures: None,
+            trains_exposures: false,
             recipe: &self.recipe,
             source: self.photos,
         };
@@ -445,6 +447,8 @@ fn a_report_can_stop_and_errors_say_why() {
         antialiased: false,
         seed: 0,
         size_bounds_metres: [1e-3, 1.0],
+        exposures: None,
+        trains_exposures: false,
         recipe: &Recipe::default(),
         source: &photos,
     };

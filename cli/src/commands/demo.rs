@@ -118,6 +118,7 @@ fn settings(args: &DemoArgs) -> (CitySettings, TrainArgs) {
             tolerance_db: 0.1,
             seed: 0,
             antialiased: false,
+            exposure: false,
             test_every: 8,
             downscale: 1,
         },

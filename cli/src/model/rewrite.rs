@@ -5,7 +5,7 @@ use std::path::Path;
 
 use scene::{ArtefactId, BadInput, Splats, frame};
 
-use super::{Block, Manifest, Model, Tree, begin, file_name, read_tree, save, save_json};
+use super::{Block, Manifest, Model, Tree, begin, file_name, read_tree, save, save_exposures, save_json};
 use crate::failure::{Failure, cannot};
 
 /// Refuses a place for a model made of another that would overwrite that, or that is of another kind.
@@ -63,6 +63,7 @@ pub(crate) fn rewrite(path: &Path, out: &Path, model: Model, splats: Splats) -> 
     // As `plat train` lists them.
     blocks.sort_by_key(|b| (b.block.level, b.block.y, b.block.x));
     let splats = Tree { plan, results, antialiased }.sewn(&leaves);
+    save_exposures(&folder, model.exposures.as_ref())?;
     save_json(&folder.join("model.json"), &Manifest { splats: splats.len() as u64, blocks, ..manifest.clone() })?;
     let bytes = Model { splats, ..model }.to_ply();
     save(&out.join("merged.ply"), &bytes)?;

@@ -11,7 +11,7 @@ use glam::{DQuat, DVec3, Vec3};
 use image::{DynamicImage, ImageFormat, Rgb, RgbImage, Rgba, RgbaImage};
 use scene::frame::{self, Kind};
 use scene::transforms::{Frame, Intrinsics, Transforms};
-use scene::{CameraModel, Capture, CodecError, Pixels, Rect, Rigid, Splat, Splats};
+use scene::{CameraModel, Capture, CodecError, Exposure, Exposures, Pixels, Rect, Rigid, Splat, Splats};
 use scene::{colmap, kitti360, npy, opensfm, ply, spz, transforms};
 use store::Store;
 
@@ -243,6 +243,8 @@ impl Corpus {
             }
             self.put("splat columns", frame::encode_splats(&splats), &splats_codec(), Seal::Frame, PLAIN);
         }
+        let exposures: Exposures = (0..40).map(|view| (3 * view, Exposure::IDENTITY)).collect();
+        self.put("exposures", exposures.to_frame(), &exposures_codec(), Seal::Frame, PLAIN);
         self.plain("packed.compressed.ply", packed(), &ply_codec());
         self.plain("cloud.ply", CLOUD, &cloud_codec());
         let [shape, data] = [vec![7, 3], vec![]];
@@ -415,6 +417,12 @@ fn spz_codec() -> Read {
 
 fn splats_codec() -> Read {
     codec("frames", frame::decode_splats, |splats| splats.columns().iter().all(|c| c.len() == splats.len()))
+}
+
+fn exposures_codec() -> Read {
+    codec("frames", Exposures::from_frame, |exposures| {
+        exposures.iter().all(|(_, exposure)| exposure.0.iter().flatten().all(|value| value.is_finite()))
+    })
 }
 
 fn npy_codec() -> Read {
