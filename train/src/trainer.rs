@@ -33,7 +33,8 @@ pub struct Recipe {
     pub sh_dc: [f32; 2],
     /// The other coefficients' step relative to that.
     pub sh_rest: f32,
-    /// Step of the views' exposures, where they are trained: at first, at the end.
+    /// How far the steps of a view's exposure may take it in all, at the first rate and at the last, where exposures are trained:
+    /// a view is drawn 7 times by a tree's root or 60 times by a job of one block, and has to get as far.
     pub exposure: [f32; 2],
     /// Decay of Adam's second moment.
     pub beta2: f32,
@@ -61,7 +62,7 @@ impl Default for Recipe {
             opacity: [0.05, 0.02],
             sh_dc: [0.01, 0.0025],
             sh_rest: 0.05,
-            exposure: [0.01, 0.001],
+            exposure: [0.2, 0.02],
             beta2: 0.999,
             opacity_pull: 0.0,
             needle_pull: 0.01,
@@ -263,7 +264,8 @@ pub fn train_on(
             if let Some(exposure) = &exposure {
                 let by_exposure = expose_backward(exposure, &frame.colour, &mut upstream.colour);
                 if let Some(exposures) = &mut now.exposures {
-                    exposures.step(view.view, &by_exposure, between(recipe.exposure, progress));
+                    let visits = (steps as f32 / views.len() as f32).max(1.0);
+                    exposures.step(view.view, &by_exposure, between(recipe.exposure, progress) / visits);
                 }
             }
             let gradients = renderer.backward(&now.splats, &upstream);
