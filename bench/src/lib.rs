@@ -50,6 +50,9 @@ pub struct ResultLine {
     pub cpu_seconds: f64,
     /// Held-out views, dB.
     pub psnr: f64,
+    /// Held-out views, dB, each after the affine transform of colours that comes nearest to its photo.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub cc_psnr: Option<f64>,
     /// Held-out views, 0..1.
     pub ssim: Option<f64>,
     /// Held-out views.
@@ -113,7 +116,7 @@ impl ResultLine {
 
     fn is_finite(&self) -> bool {
         let numbers = [Some(self.cpu_seconds), Some(self.psnr), self.wall_seconds, self.ssim, self.lpips];
-        let more = [self.perceptual, self.zone_psnr, self.detections_kept, self.fps];
+        let more = [self.cc_psnr, self.perceptual, self.zone_psnr, self.detections_kept, self.fps];
         numbers.iter().chain(&more).flatten().all(|v| v.is_finite())
             && self.curve.iter().all(|p| p.cpu_seconds.is_finite() && p.psnr.is_finite())
     }

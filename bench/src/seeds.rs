@@ -46,6 +46,7 @@ fn mean(last: &ResultLine, runs: &[&ResultLine]) -> Averaged {
     let line = ResultLine {
         cpu_seconds: of(&|run| run.cpu_seconds),
         psnr: of(&|run| run.psnr),
+        cc_psnr: maybe(&|run| run.cc_psnr),
         ssim: maybe(&|run| run.ssim),
         lpips: maybe(&|run| run.lpips),
         perceptual: maybe(&|run| run.perceptual),

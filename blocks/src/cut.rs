@@ -78,7 +78,13 @@ mod tests {
     fn ground() -> impl Strategy<Value = Ground> {
         let turn = prop_oneof![Just(DQuat::IDENTITY), Just(DQuat::from_rotation_x(1.1))];
         (turn, -9i32..3, prop_oneof![Just(8.0), 0.1f64..30.0]).prop_map(|(ground_from_world, min, edge_metres)| {
-            Ground { ground_from_world, min: DVec2::splat(f64::from(min)), edge_metres }
+            Ground {
+                ground_from_world,
+                min: DVec2::splat(f64::from(min)),
+                edge_metres,
+                height_metres: 0.0,
+                near_metres: 1e300,
+            }
         })
     }
 
@@ -103,7 +109,13 @@ mod tests {
 
     #[test]
     fn what_is_nowhere_is_dropped() {
-        let ground = Ground { ground_from_world: DQuat::IDENTITY, min: DVec2::ZERO, edge_metres: 1.0 };
+        let ground = Ground {
+            ground_from_world: DQuat::IDENTITY,
+            min: DVec2::ZERO,
+            edge_metres: 1.0,
+            height_metres: 0.0,
+            near_metres: 1e300,
+        };
         let mut s = Splats::new(0);
         for x in [0.5, f32::NAN, f32::INFINITY] {
             s.push(&Splat::round(Vec3::new(x, 0.5, 0.0), 0.0, Vec3::ONE, 0.5));

@@ -18,6 +18,9 @@ const MIN_UP_AGREEMENT: f64 = 0.5;
 const FAR_METRES: f64 = 1e8;
 /// The root is larger than the robust extent by this share of it, on each side.
 const ROOT_PAD: f64 = 0.02;
+/// What is farther from the middle of the scene than this many of its extents is far (see [`Ground::is_far`]): places in the
+/// root square are within 0.71, the backdrop stands beyond 1.7.
+const NEAR_EXTENTS: f64 = 1.5;
 
 /// A square of the ground plane, half-open, metres. Sides may be infinite.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -54,6 +57,10 @@ pub struct Ground {
     pub min: DVec2,
     /// Side of the root square, metres; positive.
     pub edge_metres: f64,
+    /// Middle of the scene's heights, ground metres.
+    pub height_metres: f64,
+    /// Places farther than this from the middle of the root square at that height are far; positive.
+    pub near_metres: f64,
 }
 
 impl Ground {
@@ -69,19 +76,23 @@ impl Ground {
         let ground_from_world = DQuat::from_rotation_arc(up, DVec3::Z);
 
         let centres: Vec<DVec3> = cameras.iter().map(|c| c.centre()).collect();
-        let (mut min, mut max) = (DVec2::INFINITY, DVec2::NEG_INFINITY);
+        let (mut min, mut max) = (DVec3::INFINITY, DVec3::NEG_INFINITY);
         for places in [&points, &centres] {
             if let Some((low, high)) = robust_box(places, |p| ground_from_world * p) {
-                (min, max) = (min.min(low.truncate()), max.max(high.truncate()));
+                (min, max) = (min.min(low), max.max(high));
             }
         }
         if min.cmpgt(max).any() {
-            return Self { ground_from_world, min: DVec2::ZERO, edge_metres: 1.0 };
+            let (min, near_metres) = (DVec2::ZERO, NEAR_EXTENTS);
+            return Self { ground_from_world, min, edge_metres: 1.0, height_metres: 0.0, near_metres };
         }
+        let (heights, tall) = (0.5 * (min.z + max.z), max.z - min.z);
+        let (min, max) = (min.truncate(), max.truncate());
         let (centre, extent) = ((min + max) * 0.5, (max - min).max_element() * (1.0 + 2.0 * ROOT_PAD));
         // All in one spot: any size will do, as long as halving it twenty times still moves a coordinate.
         let edge_metres = if extent > 1e-6 * (1.0 + centre.abs().max_element()) { extent } else { 1.0 };
-        Self { ground_from_world, min: centre - 0.5 * edge_metres, edge_metres }
+        let near_metres = NEAR_EXTENTS * edge_metres.max(tall);
+        Self { ground_from_world, min: centre - 0.5 * edge_metres, edge_metres, height_metres: heights, near_metres }
     }
 
     /// World metres to ground metres.
@@ -113,6 +124,13 @@ impl Ground {
     /// True when the place is in the block's core. A place that is not finite belongs to no block.
     pub fn owns(&self, block: BlockId, world: DVec3) -> bool {
         world.is_finite() && self.block_at(block.level, world) == block
+    }
+
+    /// True for what is not of the ground but around all of it: the sky, and whatever is seen at a distance. Columns above the
+    /// ground say nothing of whose that is, so the root alone owns and trains it ([`crate::Cut::owner_of`]).
+    pub fn is_far(&self, world: DVec3) -> bool {
+        let middle = (self.min + 0.5 * self.edge_metres).extend(self.height_metres);
+        self.from_world(world).distance(middle) > self.near_metres
     }
 
     /// The nominal core: finite, also at the rim (where ownership reaches on to infinity).
@@ -171,7 +189,10 @@ impl Ground {
     /// Every number finite, the rotation of unit length, the edge positive.
     pub fn is_sane(&self) -> bool {
         let unit = (self.ground_from_world.length() - 1.0).abs() < 1e-6;
-        unit && self.min.is_finite() && self.edge_metres.is_finite() && self.edge_metres > 0.0
+        let positive = |metres: f64| metres.is_finite() && metres > 0.0;
+        unit && self.min.is_finite()
+            && self.height_metres.is_finite()
+            && [self.edge_metres, self.near_metres].into_iter().all(positive)
     }
 }
 
@@ -286,7 +307,7 @@ mod tests {
     proptest! {
         #[test]
         fn every_place_has_one_owner_per_level(x in -30.0f64..30.0, y in prop_oneof![-1e9f64..1e9, (-20i32..20).prop_map(|k| f64::from(k) * 0.5)]) {
-            let ground = Ground { ground_from_world: DQuat::IDENTITY, min: DVec2::new(-8.0, -7.0), edge_metres: 16.0 };
+            let ground = Ground { ground_from_world: DQuat::IDENTITY, min: DVec2::new(-8.0, -7.0), edge_metres: 16.0, height_metres: 0.0, near_metres: 1e300 };
             let at = DVec3::new(x, y, 3.0);
             for level in 0..6 {
                 let owner = ground.block_at(level, at);
@@ -310,7 +331,13 @@ mod tests {
 
     #[test]
     fn half_open_faces() {
-        let ground = Ground { ground_from_world: DQuat::IDENTITY, min: DVec2::ZERO, edge_metres: 4.0 };
+        let ground = Ground {
+            ground_from_world: DQuat::IDENTITY,
+            min: DVec2::ZERO,
+            edge_metres: 4.0,
+            height_metres: 0.0,
+            near_metres: 1e300,
+        };
         let x_of = |x: f64| ground.block_at(2, DVec3::new(x, 0.0, 0.0)).x;
         assert_eq!([x_of(-5.0), x_of(0.0), x_of(1.0), x_of(2.0), x_of(4.0), x_of(9.0)], [0, 0, 1, 2, 3, 3]);
         assert_eq!(x_of(1.0 - 1e-9), 0);

@@ -64,10 +64,14 @@ impl Cut {
         self.regions.iter().map(|(&region, &owner)| (region, owner))
     }
 
-    /// The block that owns a place; `None` for a place that is not finite, or in a hole of the cut.
+    /// The block that owns a place; `None` for a place that is not finite, or in a hole of the cut. What is far belongs to the
+    /// root, if that is in the cut, whichever blocks are: no other trains it.
     pub fn owner_of(&self, ground: &Ground, world: DVec3) -> Option<BlockId> {
         if !world.is_finite() {
             return None;
+        }
+        if let Some(&root) = self.regions.get(&BlockId::ROOT).filter(|_| ground.is_far(world)) {
+            return Some(root);
         }
         let cell = ground.block_at(self.deepest, world);
         (0..=self.deepest).rev().find_map(|level| self.regions.get(&cell.ancestor(level)).copied())
@@ -89,7 +93,7 @@ pub fn wanted_level(level: u8, distance_metres: f64, core_edge_metres: f64) -> u
 
 /// What a block trains against: the cut, by [`wanted_level`], of the levels above it that exist. With the block's
 /// parent (which is left out here) it covers the plane. Where all blocks exist none lies inside another; where some
-/// do not, their nearest ancestor is in the cut to fill in. Empty for the root.
+/// do not, their nearest ancestor is in the cut to fill in. The root is always there, for what is far. Empty for the root.
 pub fn context_of(ground: &Ground, block: BlockId, existing: &BTreeSet<BlockId>) -> Vec<BlockId> {
     let (halo, edge) = (ground.nominal_halo(block), ground.core_edge_metres(block.level));
     let mut found = BTreeSet::new();
@@ -104,6 +108,7 @@ pub fn context_of(ground: &Ground, block: BlockId, existing: &BTreeSet<BlockId>)
         open.extend(children.into_iter().flatten());
     }
     if let Some(parent) = block.parent() {
+        found.extend(existing.get(&BlockId::ROOT));
         found.remove(&parent);
     }
     found.into_iter().collect()
@@ -136,7 +141,13 @@ mod tests {
     use super::*;
 
     fn ground() -> Ground {
-        Ground { ground_from_world: DQuat::IDENTITY, min: DVec2::ZERO, edge_metres: 64.0 }
+        Ground {
+            ground_from_world: DQuat::IDENTITY,
+            min: DVec2::ZERO,
+            edge_metres: 64.0,
+            height_metres: 0.0,
+            near_metres: 1e300,
+        }
     }
 
     fn all(levels: u8) -> BTreeSet<BlockId> {
@@ -169,6 +180,10 @@ mod tests {
             let context = context_of(&ground, block, &existing);
             let parent = block.parent().unwrap();
             let members: Vec<BlockId> = context.iter().copied().chain([parent]).collect();
+            assert!(members.contains(&BlockId::ROOT), "{block}: what is far is missing");
+            // Where others cover the plane the root is there for what is far alone.
+            let of_ground = |b: &BlockId| b.level > 0 || block.level == 1;
+            let members: Vec<BlockId> = members.into_iter().filter(of_ground).collect();
             // Areas add up to the root's, and none lies inside another: an exact cover.
             assert_eq!(members.iter().map(|b| 1u64 << (2 * (8 - b.level))).sum::<u64>(), 1 << 16, "{block}");
             for a in &members {
@@ -236,5 +251,21 @@ mod tests {
         }
         let kept: usize = blocks.iter().map(|&b| cut.keep(&splats, &ground, b).len()).sum();
         assert_eq!(kept, splats.len());
+    }
+
+    #[test]
+    fn what_is_far_is_the_roots_alone() {
+        let ground = Ground { near_metres: 96.0, ..ground() };
+        let cut: Cut = all(2).into_iter().collect();
+        let middle = DVec3::new(32.0, 32.0, 0.0);
+        for direction in [DVec3::X, DVec3::NEG_Y, DVec3::Z, DVec3::NEG_Z, DVec3::new(0.6, 0.0, 0.8)] {
+            let (near, far) = (middle + direction * 95.9, middle + direction * 96.1);
+            assert_eq!(cut.owner_of(&ground, near).map(|b| b.level), Some(2));
+            assert_eq!(cut.owner_of(&ground, far), Some(BlockId::ROOT));
+            // Without a root, as in flat plans, whoever is below.
+            let flat = Cut::nearest(&ground, all(2).into_iter().filter(|b| b.level == 2));
+            assert_eq!(flat.owner_of(&ground, far), Some(ground.block_at(2, far)));
+        }
+        assert_eq!(cut.owner_of(&ground, DVec3::INFINITY), None);
     }
 }

@@ -8,7 +8,7 @@ use crate::ground::Ground;
 use crate::lod::{Cut, training_order};
 
 /// The version of [`Plan`] that this program writes and reads.
-pub const VERSION: u32 = 1;
+pub const VERSION: u32 = 2;
 /// The frame that carries a plan.
 pub const PLAN: Kind = Kind(*b"plan", VERSION);
 /// The deepest level a plan may have: 65,536 blocks a side.
@@ -46,8 +46,8 @@ pub struct PlanSettings {
     pub budget: u32,
     /// What leaves may lose of their PSNR for fewer splats, dB; 0 prunes nothing.
     pub tolerance_db: f64,
-    /// A block is refined where its parent's splats are off by more than this in its own photos, root mean square, 0 to 1; 0
-    /// refines all.
+    /// A block is refined where its parent's splats are off, in its own photos, by more than this many times what the root is
+    /// off by in all (root mean squares); 0 refines all.
     pub residual: f64,
     /// Every which view is held out; 0 holds out none.
     pub test_every: u32,
@@ -56,6 +56,8 @@ pub struct PlanSettings {
     /// Opacity compensated for the pixel's blur, so that the model may be drawn at any resolution (Mip-Splatting's 2D filter);
     /// else a plain 3DGS model.
     pub antialiased: bool,
+    /// Whether the root trains an exposure of each view, which all others take as it is.
+    pub exposure: bool,
     /// What one task may take, bytes.
     pub memory_limit_bytes: u64,
 }
@@ -73,6 +75,7 @@ impl Default for PlanSettings {
             test_every: 8,
             sh_degree: 3,
             antialiased: false,
+            exposure: false,
             memory_limit_bytes: 4 << 30,
         }
     }

@@ -108,7 +108,11 @@ fn check(settings: &PlanSettings) -> Result<(), PlanError> {
         return bad("--tolerance-db", format!("{} is no loss", settings.tolerance_db), "give decibels from 0");
     }
     if !(0.0..1.0).contains(&settings.residual) {
-        return bad("--residual", format!("{} is out of range", settings.residual), "give 0 to 1, such as 0.01");
+        return bad("--residual", format!("{} is out of range", settings.residual), "give 0 to 1, such as 0.25");
+    }
+    if settings.exposure && settings.mode == Mode::Flat {
+        let problem = "flat blocks have no root to share exposures from";
+        return bad("--exposure", problem.into(), "leave it off, or use --blocks tree or whole");
     }
     if settings.sh_degree > 3 {
         return bad("sh_degree", format!("{} is not supported", settings.sh_degree), "give 0 to 3");
@@ -347,6 +351,7 @@ mod tests {
             let at = DVec3::new(noise(2 * i) * 300.0 - 100.0, noise(2 * i + 1) * 300.0 - 150.0, 0.0);
             let cell = plan.ground.block_at(plan.levels, at);
             let deepest = (0..=plan.levels).rev().map(|l| cell.ancestor(l)).find(|b| tasks.contains(b));
+            let deepest = if plan.ground.is_far(at) { Some(BlockId::ROOT) } else { deepest };
             assert_eq!(leaves.owner_of(&plan.ground, at), deepest);
         }
         let owned: u64 = leaves.blocks().iter().filter_map(|&b| plan.task(b)).map(|t| u64::from(t.budget)).sum();

@@ -147,7 +147,13 @@ mod tests {
     use super::*;
 
     fn ground() -> Ground {
-        Ground { ground_from_world: DQuat::IDENTITY, min: DVec2::ZERO, edge_metres: 64.0 }
+        Ground {
+            ground_from_world: DQuat::IDENTITY,
+            min: DVec2::ZERO,
+            edge_metres: 64.0,
+            height_metres: 0.0,
+            near_metres: 1e300,
+        }
     }
 
     fn block(level: u8, x: u32, y: u32) -> BlockId {

@@ -12,7 +12,7 @@ use crate::plan::Plan;
 /// What a viewer has to know of a block before it loads it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Node {
-    /// Its splats in each child's core.
+    /// Its splats in each child's core, without what is far.
     in_children: [usize; 4],
     /// Between these heights are nearly all of them, ground metres.
     heights: [f64; 2],
@@ -25,6 +25,8 @@ pub struct ViewTree {
     /// Metres per pixel, by level.
     rho_metres: Vec<f64>,
     nodes: BTreeMap<BlockId, Node>,
+    /// Splats of the root that are far: every cut shows them.
+    far: usize,
 }
 
 impl ViewTree {
@@ -36,15 +38,23 @@ impl ViewTree {
             let (mut in_children, mut heights) = ([0; 4], Vec::new());
             for i in 0..splats.len() {
                 let place = splats.mean(i).as_dvec3();
-                if let Some(child) = children.iter().position(|&child| ground.owns(child, place)) {
+                let child = children.iter().position(|&child| ground.owns(child, place) && !ground.is_far(place));
+                if let Some(child) = child {
                     in_children[child] += 1;
                     heights.push(ground.from_world(place).z);
                 }
             }
             Node { in_children, heights: [0.02, 0.98].map(|share| quantile(&mut heights, share)) }
         };
-        let nodes: BTreeMap<_, _> = results.into_iter().map(|(block, splats)| (block, node(block, splats))).collect();
-        Self { ground, rho_metres, nodes: if nodes.contains_key(&BlockId::ROOT) { nodes } else { BTreeMap::new() } }
+        let (mut nodes, mut far) = (BTreeMap::new(), None);
+        for (block, splats) in results {
+            nodes.insert(block, node(block, splats));
+            if block == BlockId::ROOT {
+                far = Some((0..splats.len()).filter(|&i| ground.is_far(splats.mean(i).as_dvec3())).count());
+            }
+        }
+        let Some(far) = far else { return Self { ground, rho_metres, nodes: BTreeMap::new(), far: 0 } };
+        Self { ground, rho_metres, nodes, far }
     }
 
     /// Pixels of this camera that a pixel of the block's own resolution covers where it comes nearest; 0 out of sight.
@@ -65,7 +75,7 @@ impl ViewTree {
     /// Divides, from the root, the block that shows the coarsest pixels, as long as no more than `budget` splats come to be
     /// shown and until no pixel shows more than one of the model's. Never fewer than the root's. `None` without a tree.
     pub fn cut(&self, camera: &Camera, budget: usize) -> Option<Cut> {
-        let mut shown: usize = self.nodes.get(&BlockId::ROOT)?.in_children.iter().sum();
+        let mut shown = self.far + self.nodes.get(&BlockId::ROOT)?.in_children.iter().sum::<usize>();
         let mut members = vec![BlockId::ROOT];
         let mut open = BinaryHeap::from([Open(self.screen_error(BlockId::ROOT, camera), BlockId::ROOT)]);
         while let Some(Open(error, block)) = open.pop() {
@@ -146,6 +156,12 @@ mod tests {
                 let at = plan.ground.to_world((halo.min + share * (halo.max - halo.min)).extend(0.0));
                 splats.push(&Splat::round(at.as_vec3(), 0.0, Vec3::ONE, 0.5));
             }
+            // A dome, as the root has it and as a block might have left it.
+            for i in 0..50 {
+                let at = DVec3::new(noise(1000 + i) - 0.5, noise(2000 + i) - 0.5, 0.3).normalize();
+                let at = plan.ground.to_world(plan.ground.core(BlockId::ROOT).centre().extend(0.0)) + at * 1500.0;
+                splats.push(&Splat::round(at.as_vec3(), 0.0, Vec3::ONE, 0.5));
+            }
             results.insert(task.block, splats);
         }
         (plan, results)
@@ -174,6 +190,12 @@ mod tests {
         assert_eq!(level_at(centre), 2, "near and in sight");
         let opposite = plan.ground.to_world(plan.ground.core(BlockId { level: 2, x: 3, y: 3 }).centre().extend(0.0));
         assert!(level_at(opposite) < 2, "out of sight");
+        // What is far is the root's alone, in every cut.
+        let far = |block: BlockId| {
+            let kept = cut.keep(&results[&block], &plan.ground, block);
+            (0..kept.len()).filter(|&i| plan.ground.is_far(kept.mean(i).as_dvec3())).count()
+        };
+        assert!(cut.blocks().into_iter().all(|block| far(block) == if block == BlockId::ROOT { 50 } else { 0 }));
     }
 
     #[test]

@@ -169,9 +169,9 @@ pub(crate) struct PlanOptions {
     /// Prune the finest blocks within this loss of PSNR on the views that they are trained on; 0 prunes nothing
     #[arg(long, value_name = "X", value_parser = decibels, default_value_t = 0.1)]
     pub(crate) tolerance_db: f64,
-    /// Refine a block only where its parent's splats are off by more than this in the block's own photos (root mean square, as a
-    /// share of white); 0 refines all
-    #[arg(long, value_name = "R", value_parser = residual, default_value_t = 0.01)]
+    /// Refine a block only where its parent's splats are off, in the block's own photos, by more than R times what the root is
+    /// off by in all (root mean squares); 0 refines all
+    #[arg(long, value_name = "R", value_parser = residual, default_value_t = 0.25)]
     pub(crate) residual: f64,
     /// Seed of all random choices
     #[arg(long, value_name = "S", default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=i64::MAX as u64))]
@@ -183,6 +183,10 @@ pub(crate) struct PlanOptions {
     /// 0.2 to 0.6 dB at its own
     #[arg(long)]
     pub(crate) antialiased: bool,
+    /// Train an exposure of each view where the whole scene is trained, and give it to all blocks below. For photos whose
+    /// exposure or white balance differs; not with --blocks flat
+    #[arg(long)]
+    pub(crate) exposure: bool,
     /// Use photos at one N-th of their size
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
     pub(crate) downscale: u32,
@@ -212,6 +216,7 @@ impl PlanOptions {
             residual: self.residual,
             test_every: self.test_every,
             antialiased: self.antialiased,
+            exposure: self.exposure,
             ..PlanSettings::default()
         }
     }
@@ -446,7 +451,7 @@ fn decibels(text: &str) -> Result<f64, String> {
 
 fn residual(text: &str) -> Result<f64, String> {
     let value = text.parse().ok().filter(|share: &f64| (0.0..1.0).contains(share));
-    value.ok_or_else(|| "give a share from 0 to 1, such as 0.01".into())
+    value.ok_or_else(|| "give a share from 0 to 1, such as 0.25".into())
 }
 
 fn order(text: &str) -> Result<Order, String> {

@@ -14,7 +14,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use blocks::{Cut, Ground, Plan};
-use scene::{ArtefactId, BadInput, BlockId, CodecError, GeoOrigin, Splats, frame, ply, spz};
+use scene::{ArtefactId, BadInput, BlockId, CodecError, Exposures, GeoOrigin, Splats, frame, ply, spz};
 use serde::{Deserialize, Serialize};
 use store::file::save;
 use store::{BlockingStore, Store};
@@ -28,6 +28,7 @@ const VERSION: u32 = 1;
 const ANTIALIASED: &str = "antialiased";
 const PLAN_FILE: &str = "plan.plat";
 const MERGED_FILE: &str = "merged.ply";
+const EXPOSURES_FILE: &str = "exposures.plat";
 
 /// `model.json`.
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -44,6 +45,9 @@ pub(crate) struct Manifest {
     pub(crate) test_every: u32,
     /// Photos were used at one over this of their size.
     pub(crate) downscale: u32,
+    /// Hash of the file of the training views' exposures, where there are any.
+    #[serde(default)]
+    pub(crate) exposures: Option<ArtefactId>,
     /// Splats of the finest cut.
     pub(crate) splats: u64,
     /// By (level, y, x).
@@ -66,6 +70,8 @@ pub(crate) struct Model {
     /// The finest cut.
     pub(crate) splats: Splats,
     pub(crate) antialiased: bool,
+    /// What its training views are compared through, by view of the plan's capture; nobody draws a model with it.
+    pub(crate) exposures: Option<Exposures>,
     /// Of a trained model: its manifest and the folder that `plat train` wrote.
     pub(crate) trained: Option<(Manifest, PathBuf)>,
 }
@@ -147,13 +153,15 @@ pub(crate) fn write(
 ) -> Result<Model, Failure> {
     let folder = begin(out, plan)?;
 
-    let mut blocks = Vec::new();
+    let (mut blocks, mut exposures) = (Vec::new(), None);
     let splats = sew(plan, |block| -> Result<_, Failure> {
         let index = plan.tasks.iter().position(|task| task.block == block);
         let artefact =
             *index.and_then(|i| results.get(i)).ok_or_else(|| Failure::Work(format!("block {block} has no result")))?;
         let bytes = store.get(artefact)?;
-        let splats = frame::decode_splats(&bytes).map_err(|error| Failure::Work(format!("block {block}: {error}")))?;
+        let damaged = |error: CodecError| Failure::Work(format!("block {block}: {error}"));
+        let (splats, about) = frame::decode_result(&bytes).map_err(damaged)?;
+        exposures = exposures.or(about.exposures);
         save(&folder.join("blocks").join(file_name(block)), &bytes)?;
         blocks.push(Block { block, artefact, splats: splats.len() as u64 });
         Ok(splats)
@@ -167,11 +175,16 @@ pub(crate) fn write(
         ground: plan.ground,
         test_every: plan.settings.test_every,
         downscale,
+        exposures,
         splats: splats.len() as u64,
         blocks,
     };
+    let exposures = match exposures {
+        Some(id) => Some(Exposures::from_frame(&store.get(id)?).map_err(|error| Failure::Work(error.to_string()))?),
+        None => None,
+    };
     let antialiased = manifest.antialiased;
-    let model = Model { splats, antialiased, trained: Some((manifest, out.to_path_buf())) };
+    let model = Model { splats, antialiased, exposures, trained: Some((manifest, out.to_path_buf())) };
     finish(out, &model)?;
     Ok(model)
 }
@@ -180,6 +193,9 @@ pub(crate) fn write(
 fn finish(out: &Path, model: &Model) -> Result<u64, Failure> {
     let merged = model.to_ply();
     save(&out.join(MERGED_FILE), &merged)?;
+    if let Some(exposures) = &model.exposures {
+        save(&out.join("model").join(EXPOSURES_FILE), &exposures.to_frame())?;
+    }
     if let Some((manifest, _)) = &model.trained {
         save_json(&out.join("model/model.json"), manifest)?;
     }
@@ -217,18 +233,26 @@ pub(crate) fn read(path: &Path) -> Result<Model, BadInput> {
     let bytes = load(path)?;
     if is("spz") {
         let (splats, antialiased) = spz::read(&bytes).map_err(|error| damaged(path, &error))?;
-        return Ok(Model { splats, antialiased, trained: None });
+        return Ok(Model { splats, antialiased, exposures: None, trained: None });
     }
     let splats = ply::read(&bytes).map_err(|error| damaged(path, &error))?;
     let antialiased = ply::comments(&bytes).iter().any(|comment| comment.trim() == ANTIALIASED);
-    Ok(Model { splats, antialiased, trained: None })
+    Ok(Model { splats, antialiased, exposures: None, trained: None })
 }
 
 fn read_trained(folder: &Path) -> Result<Model, BadInput> {
     let (manifest, plan) = read_plan(folder)?;
     let splats = sew(&plan, |block| read_block(folder, block))?;
     let out = folder.parent().filter(|_| folder.ends_with("model")).unwrap_or(folder);
-    Ok(Model { splats, antialiased: manifest.antialiased, trained: Some((manifest, out.to_path_buf())) })
+    let exposures = match manifest.exposures {
+        Some(_) => {
+            let path = folder.join(EXPOSURES_FILE);
+            Some(Exposures::from_frame(&load(&path)?).map_err(|error| damaged(&path, &error))?)
+        }
+        None => None,
+    };
+    let antialiased = manifest.antialiased;
+    Ok(Model { splats, antialiased, exposures, trained: Some((manifest, out.to_path_buf())) })
 }
 
 /// A trained model block by block.

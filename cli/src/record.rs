@@ -21,6 +21,8 @@ pub(crate) struct Record {
     pub(crate) cpu_seconds: Option<f64>,
     /// dB over the held-out views.
     pub(crate) psnr: Option<f64>,
+    /// dB over the held-out views, colours corrected.
+    pub(crate) cc_psnr: Option<f64>,
     pub(crate) ssim: Option<f64>,
     pub(crate) lpips: Option<f64>,
     /// SSIMULACRA2.
@@ -46,7 +48,7 @@ impl Record {
     /// Takes over what an evaluation of the model measured.
     pub(crate) fn measured(&mut self, by: &Self) {
         (self.psnr, self.ssim, self.perceptual) = (by.psnr, by.ssim, by.perceptual);
-        (self.lpips, self.fps) = (by.lpips, by.fps);
+        (self.lpips, self.fps, self.cc_psnr) = (by.lpips, by.fps, by.cc_psnr);
     }
 
     /// As a line of bench/results.
@@ -63,6 +65,7 @@ impl Record {
             wall_seconds: self.wall_seconds,
             cpu_seconds: self.cpu_seconds.unwrap_or(f64::NAN),
             psnr: self.psnr.unwrap_or(f64::NAN),
+            cc_psnr: self.cc_psnr,
             ssim: self.ssim,
             lpips: self.lpips,
             perceptual: self.perceptual,

@@ -8,8 +8,10 @@ use std::time::Duration;
 
 use serde_json::Value;
 
-const JOB: [&str; 10] =
-    ["train", "city", "--steps", "240", "--budget", "900", "--levels", "1", "--checkpoint-every", "0"];
+#[rustfmt::skip]
+const JOB: [&str; 11] = [
+    "train", "city", "--steps", "240", "--budget", "900", "--levels", "1", "--checkpoint-every", "0", "--exposure",
+];
 
 /// The job, not yet begun.
 fn job(at: &Path, words: &[&str]) -> Command {
@@ -55,6 +57,7 @@ fn killed_five_times_the_bytes_are_the_same() {
     assert!(resumed["resumed"].as_u64() >= Some(1), "{resumed}");
     let bytes = |path: &str| std::fs::read(at.join(path)).unwrap();
     assert!(bytes("calm/merged.ply") == bytes("killed/merged.ply"), "a kill shows in the result");
+    assert!(bytes("calm/model/exposures.plat") == bytes("killed/model/exposures.plat"));
     assert_eq!(undisturbed["psnr"], resumed["psnr"]);
 
     // All is there already, unless it is asked for anew.

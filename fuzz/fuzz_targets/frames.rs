@@ -3,7 +3,8 @@
 
 use blocks::{Plan, plan::PLAN};
 use libfuzzer_sys::fuzz_target;
-use scene::Capture;
+use scene::exposures::EXPOSURES;
+use scene::{Capture, Exposures};
 use scene::frame::{self, Kind, SPLATS};
 
 /// As `dataset::ingest::CAPTURE`.
@@ -11,9 +12,13 @@ const CAPTURE: Kind = Kind(*b"capt", 1);
 
 fuzz_target!(|bytes: &[u8]| {
     let _ = frame::decode::<frame::SplatsHeader>(SPLATS, bytes);
-    // The header of splats takes two bytes or a few more.
-    for header in 0..bytes.len().min(11) {
+    // The header of splats takes three bytes or a few more, with the name of exposures 66 more.
+    for header in 0..bytes.len().min(80) {
         let _ = frame::decode_splats(&sealed(SPLATS, bytes, header));
+    }
+    let _ = Exposures::from_frame(bytes);
+    for header in 0..bytes.len().min(10) {
+        let _ = Exposures::from_frame(&sealed(EXPOSURES, bytes, header));
     }
     if let Ok(plan) = Plan::from_frame(&sealed(PLAN, bytes, bytes.len())) {
         plan.leaves();

@@ -7,6 +7,7 @@
 use serde::{Serialize, de::DeserializeOwned};
 
 use crate::error::CodecError;
+use crate::ids::ArtefactId;
 use crate::splats::Splats;
 
 const MAGIC: &[u8; 4] = b"plat";
@@ -19,7 +20,7 @@ pub const HEADER_LIMIT: usize = 1 << 30;
 pub struct Kind(pub [u8; 4], pub u32);
 
 /// Splat columns; the header is [`SplatsHeader`].
-pub const SPLATS: Kind = Kind(*b"spla", 1);
+pub const SPLATS: Kind = Kind(*b"spla", 2);
 
 /// Wraps a header and bulk bytes.
 pub fn encode<T: Serialize>(kind: Kind, header: &T, bulk: &[u8]) -> Vec<u8> {
@@ -101,19 +102,43 @@ pub struct SplatsHeader {
     pub sh_degree: u8,
     /// Number of splats.
     pub count: u64,
+    /// What else there is to know.
+    pub about: About,
+}
+
+/// What else there is to know of trained splats: what a block hands down with them.
+#[derive(Debug, Clone, Copy, Default, PartialEq, serde::Serialize, serde::Deserialize)]
+pub struct About {
+    /// The [`Exposures`](crate::Exposures) that they were trained with, where there are any.
+    pub exposures: Option<ArtefactId>,
+    /// How far the root of their tree was off in its photos: root mean square, 0 to 1.
+    pub residual: Option<f64>,
 }
 
 /// Splats as a frame: all columns one after the other, f32 little endian.
 pub fn encode_splats(splats: &Splats) -> Vec<u8> {
+    encode_result(splats, About::default())
+}
+
+/// Splats as a frame that says what else there is to know of them.
+pub fn encode_result(splats: &Splats, about: About) -> Vec<u8> {
     let bulk: Vec<u8> = splats.columns().iter().flat_map(|c| bytemuck::cast_slice::<f32, u8>(c)).copied().collect();
-    encode(SPLATS, &SplatsHeader { sh_degree: splats.sh_degree(), count: splats.len() as u64 }, &bulk)
+    encode(SPLATS, &SplatsHeader { sh_degree: splats.sh_degree(), count: splats.len() as u64, about }, &bulk)
 }
 
 /// Splats from a frame.
 ///
 /// # Errors
-/// As [`decode`], or a bulk whose length is not that of the columns.
+/// As [`decode_result`].
 pub fn decode_splats(bytes: &[u8]) -> Result<Splats, CodecError> {
+    decode_result(bytes).map(|(splats, _)| splats)
+}
+
+/// Splats from a frame, and what else there is to know of them.
+///
+/// # Errors
+/// As [`decode`], or a bulk whose length is not that of the columns.
+pub fn decode_result(bytes: &[u8]) -> Result<(Splats, About), CodecError> {
     let (header, bulk): (SplatsHeader, _) = decode(SPLATS, bytes)?;
     if header.sh_degree > 3 {
         return Err(CodecError::new(format!("SH degree {} is above 3", header.sh_degree)));
@@ -123,12 +148,13 @@ pub fn decode_splats(bytes: &[u8]) -> Result<Splats, CodecError> {
         return Err(CodecError::new("splat columns do not fit their header"));
     }
     if header.count == 0 {
-        return Ok(Splats::new(header.sh_degree));
+        return Ok((Splats::new(header.sh_degree), header.about));
     }
     let values =
         |chunk: &[u8]| chunk.chunks_exact(4).map(|b| f32::from_le_bytes(b.try_into().expect("four bytes"))).collect();
     let columns = bulk.chunks_exact(4 * header.count as usize).map(values).collect();
-    Splats::from_columns(columns).ok_or_else(|| CodecError::new("splat columns of unequal length"))
+    let splats = Splats::from_columns(columns);
+    Ok((splats.ok_or_else(|| CodecError::new("splat columns of unequal length"))?, header.about))
 }
 
 #[cfg(test)]
@@ -158,7 +184,10 @@ mod tests {
             splats.push(&Splat::round(Vec3::splat(i as f32), -1.0, Vec3::splat(0.4), 0.3));
         }
         let bytes = encode_splats(&splats);
-        assert_eq!(decode_splats(&bytes).unwrap(), splats);
+        assert_eq!(decode_result(&bytes).unwrap(), (splats.clone(), About::default()));
+        let about = About { exposures: Some(ArtefactId::of(b"exposures")), residual: Some(0.1) };
+        let exposed = encode_result(&splats, about);
+        assert_eq!(decode_result(&exposed).unwrap(), (splats, about));
         for at in 0..bytes.len() {
             let mut damaged = bytes.clone();
             damaged[at] ^= 0x40;

@@ -43,7 +43,13 @@ fn plan() -> Plan {
         capture: ArtefactId([1; 32]),
         settings: PlanSettings::default(),
         backend: BACKEND.into(),
-        ground: Ground { ground_from_world: DQuat::IDENTITY, min: DVec2::ZERO, edge_metres: 100.0 },
+        ground: Ground {
+            ground_from_world: DQuat::IDENTITY,
+            min: DVec2::ZERO,
+            edge_metres: 100.0,
+            height_metres: 0.0,
+            near_metres: 1e300,
+        },
         levels: 2,
         rho_metres: vec![4.0, 2.0, 1.0],
         tasks: vec![

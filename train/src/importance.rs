@@ -5,9 +5,10 @@
 
 use render::cpu::Renderer;
 use render::{Frame, Options};
-use scene::{Pixels, Splats, column};
+use scene::{Exposures, Pixels, Splats, column};
 use serde::{Deserialize, Serialize};
 
+use crate::exposure::{expose, square_gain};
 use crate::metrics::PSNR_OF_EQUALS;
 use crate::{TrainError, TrainView, WindowSource};
 
@@ -65,6 +66,8 @@ pub struct Views<'a> {
     pub context: Option<&'a Splats>,
     /// Opacity compensated for the pixel's blur.
     pub antialiased: bool,
+    /// Of the views, where they have any: pictures are compared as the photos show them.
+    pub exposures: Option<&'a Exposures>,
     /// The photos.
     pub source: &'a dyn WindowSource,
 }
@@ -76,6 +79,8 @@ struct Compared<'a> {
     /// Mean squared error over channels of what counts, and how many pixels that is.
     mse: f64,
     pixels: f64,
+    /// What the view's exposure makes of the square of a change.
+    square_gain: f64,
 }
 
 /// What each pixel of some views counts, 0 to 255, none where all count alike: fixed, so that cutting a splat does not hide the hole.
@@ -145,6 +150,7 @@ impl<'a> Views<'a> {
                 Order::Squared => (&said.squared, 1.0),
                 _ => (&said.energy, (3.0 * compared.pixels * compared.mse).max(1e-9)),
             };
+            let unit = unit / compared.square_gain.max(1e-9);
             total.iter_mut().zip(values).for_each(|(total, value)| *total += f64::from(*value) / unit);
         })?;
         Ok(total)
@@ -158,7 +164,7 @@ impl<'a> Views<'a> {
         mut see: impl FnMut(&mut Renderer, Compared),
     ) -> Result<(), TrainError> {
         let mut renderer = Renderer::default();
-        let mut weights = Vec::new();
+        let (mut weights, mut exposed) = (Vec::new(), Vec::new());
         for (n, view) in self.views.iter().enumerate() {
             let (mip, rect, camera) = view.at(0).expect("at(0) always is");
             let photo = self.source.window(view.view, mip, rect).map_err(TrainError::Source)?;
@@ -169,13 +175,19 @@ impl<'a> Views<'a> {
             pixel_weights(frame, &photo, shares.and_then(|shares| shares.0.get(n)), &mut weights);
             let area = photo.area();
             let weight = |i: usize| if weights.is_empty() { 1.0 } else { f64::from(weights[i % area]) };
+            let exposure = self.exposures.and_then(|exposures| exposures.of(view.view));
+            let shown = exposure.map_or(&frame.colour, |exposure| {
+                expose(exposure, &frame.colour, &mut exposed);
+                &exposed
+            });
             // Clamped to what can be shown.
-            let pairs = frame.colour.iter().map(|colour| colour.clamp(0.0, 1.0)).zip(&photo.rgb);
+            let pairs = shown.iter().map(|colour| colour.clamp(0.0, 1.0)).zip(&photo.rgb);
             let squares = pairs.map(|(colour, photo)| f64::from(colour - f32::from(*photo) / 255.0).powi(2));
             let error: f64 = squares.enumerate().map(|(i, square)| weight(i) * square).sum();
             let pixels = if weights.is_empty() { area as f64 } else { weights.iter().map(|w| f64::from(*w)).sum() };
             let mse = error / (3.0 * pixels).max(1e-9);
-            see(&mut renderer, Compared { weights: &weights, mse, pixels });
+            let square_gain = exposure.map_or(1.0, |exposure| f64::from(square_gain(exposure)));
+            see(&mut renderer, Compared { weights: &weights, mse, pixels, square_gain });
         }
         Ok(())
     }

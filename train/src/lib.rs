@@ -5,6 +5,7 @@
 
 pub mod blur;
 pub mod checkpoint;
+pub mod exposure;
 pub mod growth;
 pub mod importance;
 pub mod init;

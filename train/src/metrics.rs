@@ -3,6 +3,7 @@
 //! Images are planes of sRGB values in 0..1: all red, all green, all blue, each `width · height`, rows from the top.
 //! Sums are in f64 and in a fixed order, so a figure does not depend on the number of threads.
 
+use glam::{DMat3, DVec3};
 use rayon::prelude::*;
 use ssimulacra2::{ColorPrimaries, Rgb, TransferCharacteristic, compute_frame_ssimulacra2};
 
@@ -35,6 +36,44 @@ pub fn psnr(a: &[f32], b: &[f32], mask: Option<&[u8]>) -> Option<f64> {
         }
     }
     (count > 0).then(|| (-10.0 * (sum / count as f64).log10()).min(PSNR_OF_EQUALS))
+}
+
+/// Colour-corrected PSNR, dB: as [`psnr`], after the affine transform of the render's colours (three by three, and an offset)
+/// that comes nearest to the photo in squared error over the pixels that count, clamped to 0..1. It forgives what a view's
+/// exposure and white balance do to all of its pixels and nothing else, as papers with appearance models measure it.
+/// Where colours do not determine the transform, the smallest serves.
+///
+/// # Panics
+/// As [`psnr`].
+pub fn colour_corrected_psnr(render: &[f32], photo: &[f32], mask: Option<&[u8]>) -> Option<f64> {
+    assert_eq!(render.len(), photo.len(), "images of one size");
+    let area = render.len() / 3;
+    assert!(mask.is_none_or(|m| m.len() == area), "a mask of the image's size");
+    let pixels = || (0..area).filter(|&i| mask.is_none_or(|m| m[i] >= 128));
+    let at = |image: &[f32], i: usize| [0, 1, 2].map(|c| f64::from(image[c * area + i]));
+    let (mut count, mut means) = (0.0, [[0.0; 3]; 2]);
+    for i in pixels() {
+        count += 1.0;
+        for (mean, image) in means.iter_mut().zip([render, photo]) {
+            mean.iter_mut().zip(at(image, i)).for_each(|(mean, value)| *mean += value);
+        }
+    }
+    let [mean_render, mean_photo] = means.map(|sums| DVec3::from_array(sums) / f64::max(count, 1.0));
+    // About the means: photo = transform · render, (Σ r rᵀ) transformᵀ = Σ r pᵀ.
+    let (mut rr, mut rp) = (DMat3::ZERO, DMat3::ZERO);
+    for i in pixels() {
+        let (r, p) = (DVec3::from_array(at(render, i)) - mean_render, DVec3::from_array(at(photo, i)) - mean_photo);
+        rr += DMat3::from_cols(r * r.x, r * r.y, r * r.z);
+        rp += DMat3::from_cols(r * p.x, r * p.y, r * p.z);
+    }
+    let least = 1e-9 * (rr.col(0)[0] + rr.col(1)[1] + rr.col(2)[2]) + 1e-9;
+    let transform = ((rr + DMat3::from_diagonal(DVec3::splat(least))).inverse() * rp).transpose();
+    let mut corrected = render.to_vec();
+    for i in pixels() {
+        let shown = mean_photo + transform * (DVec3::from_array(at(render, i)) - mean_render);
+        (0..3).for_each(|c| corrected[c * area + i] = shown[c].clamp(0.0, 1.0) as f32);
+    }
+    psnr(&corrected, photo, mask)
 }
 
 /// Structural similarity (Wang et al. 2004): 11×11 Gaussian window with σ = 1.5, K1 = 0.01, K2 = 0.03, range 1, the mean
@@ -151,6 +190,35 @@ mod tests {
         let masked = psnr(&a, &b, Some(&[0, 255, 0, 0])).unwrap();
         assert!((masked - 20.0).abs() < 1e-5, "{masked}");
         assert_eq!(psnr(&a, &b, Some(&[0; 4])), None);
+    }
+
+    #[test]
+    fn correction_forgives_a_views_exposure_and_nothing_else() {
+        let render = picture(40, 30, 0.0);
+        let area = 40 * 30;
+        let exposed = |i: usize| {
+            let [r, g, b] = [0, 1, 2].map(|c| render[c * area + i % area]);
+            [0.7 * r + 0.1 * g, 0.9 * g - 0.05 * b + 0.1, 0.2 * r + 0.6 * b][i / area]
+        };
+        let mut photo: Vec<f32> = (0..3 * area).map(exposed).collect();
+        assert!(psnr(&render, &photo, None).unwrap() < 20.0);
+        assert!(colour_corrected_psnr(&render, &photo, None).unwrap() > 80.0);
+        // What the mask hides has no say in the transform.
+        let mask: Vec<u8> = (0..area).map(|i| if i % 40 < 35 { 255 } else { 0 }).collect();
+        (0..3 * area).filter(|i| i % 40 >= 35).for_each(|i| photo[i] = 1.0);
+        assert!(colour_corrected_psnr(&render, &photo, Some(&mask)).unwrap() > 80.0);
+        assert!(colour_corrected_psnr(&render, &photo, None).unwrap() < 30.0);
+        assert_eq!(colour_corrected_psnr(&render, &photo, Some(&vec![0; area])), None);
+        // An error that no transform of colours explains stays, and no view gets worse.
+        let noisy: Vec<f32> = (render.iter().enumerate())
+            .map(|(i, v)| v + 0.1 * (((i * 2_654_435_761) % 1009) as f32 / 504.5 - 1.0))
+            .collect();
+        let (plain, corrected) =
+            (psnr(&render, &noisy, None).unwrap(), colour_corrected_psnr(&render, &noisy, None).unwrap());
+        assert!(corrected >= plain && corrected < plain + 0.3, "{plain} {corrected}");
+        // One colour only: its nearest is the photo's mean.
+        let grey = colour_corrected_psnr(&vec![0.2; 3 * area], &vec![0.7; 3 * area], None).unwrap();
+        assert!(grey > 80.0, "{grey}");
     }
 
     /// The definition, pixel by pixel, with a two-dimensional window: O(n · 121).

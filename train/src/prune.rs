@@ -100,7 +100,7 @@ pub struct PruneProgress<'a> {
 pub type Report<'a> = &'a mut dyn FnMut(PruneProgress) -> Flow;
 
 /// Prunes the splats that a job has trained, given as its `initial`, among those that it `counts`; the others only heal. The
-/// job's steps are those that it was trained with, its recipe the one whose last rates healing takes.
+/// job's steps are those that it was trained with, its recipe the one whose last rates healing takes; exposures are given or none.
 ///
 /// # Errors
 /// See [`TrainError`].
@@ -220,7 +220,9 @@ impl<'a> Pruner<'a> {
         }
         let splats = mem::replace(&mut job.initial, Splats::new(0));
         job.steps = pruning.round_steps(job.steps);
-        let all = Views { views: job.views, context: job.context, antialiased: job.antialiased, source: job.source };
+        job.trains_exposures = false;
+        let Job { views, context, antialiased, exposures, source, .. } = job;
+        let all = Views { views, context, antialiased, exposures, source };
         let measured = Gauge::new(&all, MEASURED_VIEWS, &splats)?;
         let probed = Gauge::new(&all, PROBED_VIEWS, &splats)?;
         Ok((Self { recipe: healing(job.recipe), pruning: *pruning, all, measured, probed, job }, splats))

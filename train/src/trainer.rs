@@ -7,9 +7,10 @@
 use glam::Vec3;
 use render::cpu::{Isa, Renderer};
 use render::{Options, Upstream};
-use scene::{Camera, Pixels, Rect, Splats};
+use scene::{Camera, Exposures, Pixels, Rect, Splats};
 use serde::{Deserialize, Serialize};
 
+use crate::exposure::{ExposureTraining, expose, expose_backward};
 use crate::growth::{self, Evidence, Growth};
 use crate::loss::Photometric;
 use crate::need::{self, Need};
@@ -33,6 +34,9 @@ pub struct Recipe {
     pub sh_dc: [f32; 2],
     /// The other coefficients' step relative to that.
     pub sh_rest: f32,
+    /// How far the steps of a view's exposure may take it in all, at the first rate and at the last, where exposures are trained:
+    /// a view is drawn 7 times by a tree's root or 60 times by a job of one block, and has to get as far.
+    pub exposure: [f32; 2],
     /// Decay of Adam's second moment.
     pub beta2: f32,
     /// Pull on opacities and needles, see [`Rates`].
@@ -62,6 +66,7 @@ impl Default for Recipe {
             opacity: [0.05, 0.02],
             sh_dc: [0.01, 0.0025],
             sh_rest: 0.05,
+            exposure: [0.2, 0.02],
             beta2: 0.999,
             opacity_pull: 0.0,
             needle_pull: 0.01,
@@ -143,6 +148,10 @@ pub struct Job<'a> {
     pub seed: u64,
     /// Smallest and largest standard deviation, metres.
     pub size_bounds_metres: [f32; 2],
+    /// Exposures of the views, not moved; views without one are drawn as they are.
+    pub exposures: Option<&'a Exposures>,
+    /// Whether exposures are trained instead, from the identity on.
+    pub trains_exposures: bool,
     /// How.
     pub recipe: &'a Recipe,
     /// Pixels.
@@ -194,10 +203,11 @@ pub enum TrainError {
 /// # Errors
 /// See [`TrainError`].
 pub fn train(job: Job, report: &mut dyn FnMut(Progress) -> Flow) -> Result<Splats, TrainError> {
-    train_on(job, None, report)
+    train_on(job, None, report).map(|(splats, _)| splats)
 }
 
-/// Trains a block on from where an earlier run of the same job stood: the result is what that would have come to.
+/// Trains a block on from where an earlier run of the same job stood: the result is what that would have come to. With the
+/// splats come the exposures, where those are trained.
 ///
 /// # Errors
 /// See [`TrainError`].
@@ -205,7 +215,7 @@ pub fn train_on(
     mut job: Job,
     from: Option<State>,
     report: &mut dyn FnMut(Progress) -> Flow,
-) -> Result<Splats, TrainError> {
+) -> Result<(Splats, Option<Exposures>), TrainError> {
     let Job { context, views, counts, keeps, budget, steps, recipe, .. } = job;
     if views.is_empty() {
         return Err(TrainError::NoViews);
@@ -214,6 +224,7 @@ pub fn train_on(
     let mut renderer = Renderer::new(isa);
     let mut loss = Photometric::new(isa, recipe.lambda);
     let mut upstream = Upstream::default();
+    let mut exposed = Vec::new();
     let mut weights = Vec::new();
     let initial = std::mem::replace(&mut job.initial, Splats::new(0));
     let mut now = from.unwrap_or_else(|| State {
@@ -223,6 +234,7 @@ pub fn train_on(
         need: Need::default(),
         adam: Adam::new(isa, &initial),
         evidence: Evidence::default(),
+        exposures: job.trains_exposures.then(|| ExposureTraining::new(views)),
         splats: initial,
     });
     let log_scale_bounds = job.size_bounds_metres.map(f32::ln);
@@ -255,8 +267,21 @@ pub fn train_on(
         };
         let frame = renderer.forward(&now.splats, context, &camera, &options);
         pixel_weights(frame, &photo, &mut weights);
-        let value = loss.evaluate(&frame.colour, &photo, &weights, &mut upstream.colour);
+        let trained = now.exposures.as_ref().map(|exposures| exposures.of(view.view));
+        let exposure = trained.unwrap_or_else(|| job.exposures?.of(view.view).copied());
+        let shown = exposure.as_ref().map_or(&frame.colour, |exposure| {
+            expose(exposure, &frame.colour, &mut exposed);
+            &exposed
+        });
+        let value = loss.evaluate(shown, &photo, &weights, &mut upstream.colour);
         if value.total.is_finite() {
+            if let Some(exposure) = &exposure {
+                let by_exposure = expose_backward(exposure, &frame.colour, &mut upstream.colour);
+                if let Some(exposures) = &mut now.exposures {
+                    let visits = (steps as f32 / views.len() as f32).max(1.0);
+                    exposures.step(view.view, &by_exposure, between(recipe.exposure, progress) / visits);
+                }
+            }
             let gradients = renderer.backward(&now.splats, &upstream);
             now.evidence.add(gradients, photo.area() as f32);
             now.adam.step(&mut now.splats, gradients, options.sh_degree, &rates(recipe, progress, log_scale_bounds));
@@ -303,7 +328,8 @@ pub fn train_on(
             break;
         }
     }
-    Ok(now.splats)
+    let exposures = now.exposures.map(|exposures| exposures.exposures());
+    Ok((now.splats, exposures))
 }
 
 /// Every view once per epoch, each epoch in another order.
@@ -313,9 +339,14 @@ fn pick(views: &[TrainView], seed: u64, step: u32) -> &TrainView {
     &views[order[(step % n) as usize] as usize]
 }
 
-/// Step sizes at a share of the way: geometric between first and last.
+/// A step size at a share of the way: geometric between first and last.
+fn between([first, last]: [f32; 2], progress: f32) -> f32 {
+    first * (last / first).powf(progress)
+}
+
+/// Step sizes at a share of the way.
 fn rates(recipe: &Recipe, progress: f32, log_scale_bounds: [f32; 2]) -> Rates {
-    let at = |[first, last]: [f32; 2]| first * (last / first).powf(progress);
+    let at = |bounds| between(bounds, progress);
     Rates {
         mean: at(recipe.mean),
         log_scale: at(recipe.log_scale),

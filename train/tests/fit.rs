@@ -6,8 +6,8 @@ use glam::{DMat3, DQuat, DVec3, Vec3};
 use render::Options;
 use render::cpu::Renderer;
 use scene::splats::SH_C0;
-use scene::{Camera, Pinhole, Pixels, Rect, Rigid, Splat, Splats, column};
-use train::{Flow, Job, Recipe, TrainError, TrainView, WindowSource, metrics, random, train};
+use scene::{Camera, Exposure, Exposures, Pinhole, Pixels, Rect, Rigid, Splat, Splats, column};
+use train::{Flow, Job, Recipe, State, TrainError, TrainView, WindowSource, metrics, random, train, train_on};
 
 const WIDTH: u32 = 64;
 const HEIGHT: u32 = 48;
@@ -116,13 +116,17 @@ struct Setup<'a> {
     budget: usize,
     steps: u32,
     recipe: Recipe,
+    exposures: Option<&'a Exposures>,
+    trains_exposures: bool,
 }
 
 impl<'a> Setup<'a> {
     /// No growth, no context.
     fn new(initial: Splats, photos: &'a Photos) -> Self {
         let budget = initial.len();
-        Self { initial, photos, context: None, budget, steps: 240, recipe: Recipe::default() }
+        let (exposures, trains_exposures) = (None, false);
+        let recipe = Recipe::default();
+        Self { initial, photos, context: None, budget, steps: 240, recipe, exposures, trains_exposures }
     }
 
     fn run(self) -> Splats {
@@ -134,6 +138,15 @@ impl<'a> Setup<'a> {
         counts: &(dyn Fn(Vec3) -> bool + Sync),
         report: &mut dyn FnMut(train::Progress) -> Flow,
     ) -> Result<Splats, TrainError> {
+        self.try_run_on(None, counts, report).map(|(splats, _)| splats)
+    }
+
+    fn try_run_on(
+        self,
+        from: Option<State>,
+        counts: &(dyn Fn(Vec3) -> bool + Sync),
+        report: &mut dyn FnMut(train::Progress) -> Flow,
+    ) -> Result<(Splats, Option<Exposures>), TrainError> {
         let views = views();
         let job = Job {
             initial: self.initial,
@@ -146,10 +159,12 @@ impl<'a> Setup<'a> {
             antialiased: false,
             seed: 5,
             size_bounds_metres: [1e-3, 2.0],
+            exposures: self.exposures,
+            trains_exposures: self.trains_exposures,
             recipe: &self.recipe,
             source: self.photos,
         };
-        train(job, report)
+        train_on(job, from, report)
     }
 }
 
@@ -413,6 +428,88 @@ fn a_block_does_not_repair_its_neighbours_region() {
     assert!(provoked < 0.1 * unguarded, "{provoked} of the neighbour's pixels are the block's");
 }
 
+/// Each photo as much brighter or darker as said.
+fn exposed(photos: &Photos, gains: &[f32]) -> Photos {
+    let mut out = photos.clone();
+    for (photo, gain) in out.0.iter_mut().zip(gains) {
+        photo.rgb.iter_mut().for_each(|byte| *byte = (f32::from(*byte) * gain).round().min(255.0) as u8);
+    }
+    out
+}
+
+/// From 0.6 to 1; of the mean, which is where the gauge puts it.
+fn gains() -> Vec<f32> {
+    (0..12).map(|view| 0.6 + 0.4 * random::uniform(41, view)).collect()
+}
+
+#[test]
+fn exposures_are_found_and_the_mean_is_what_is_shown() {
+    let (truth, gains) = (cloud(10, 200, 0.8), gains());
+    let mean = gains.iter().sum::<f32>() / gains.len() as f32;
+    let given = photos(&truth);
+    let shown = exposed(&given, &gains);
+    let all_alike = exposed(&given, &[mean; 12]);
+    let run = |trains_exposures| {
+        let setup = Setup { trains_exposures, steps: 600, ..Setup::new(perturbed(&truth), &shown) };
+        setup.try_run_on(None, &|_| true, &mut |_| Flow::Continue).unwrap()
+    };
+    let ((without, none), (with, exposures)) = (run(false), run(true));
+    assert_eq!(none, None);
+    let exposures = exposures.unwrap();
+    let [without, with] = [without, with].map(|splats| psnr(&splats, &all_alike, |_| true));
+    println!("{without:.2} dB without exposures, {with:.2} dB with");
+    assert!(with > without + 2.0, "{without} {with}");
+    for (view, gain) in gains.iter().enumerate() {
+        let found = exposures.of(view as u32).unwrap().gain();
+        assert!((found - gain / mean).abs() < 0.1, "view {view}: {found} instead of {}", gain / mean);
+    }
+}
+
+#[test]
+fn given_exposures_are_used_and_stay() {
+    let (truth, gains) = (cloud(11, 150, 0.8), gains());
+    let shown = exposed(&photos(&truth), &gains);
+    let grey = |gain: f32| Exposure(Exposure::IDENTITY.0.map(|row| row.map(|value| gain * value)));
+    // View 11 has none, and so is shown as it is.
+    let given: Exposures = (0..11).map(|view| (view, grey(gains[view as usize]))).collect();
+    let of_most = |photos: &Photos| Photos(photos.0.iter().take(11).cloned().collect());
+    let run = |exposures| Setup { exposures, ..Setup::new(truth.clone(), &shown) }.run();
+    let [with, without] = [run(Some(&given)), run(None)].map(|splats| {
+        let photos = of_most(&photos(&truth));
+        let views = views();
+        let of = |(view, photo): (&TrainView, &Pixels)| {
+            let expected: Vec<f32> = photo.rgb.iter().map(|&b| f32::from(b) / 255.0).collect();
+            metrics::psnr(&self::photo(&splats, view), &expected, None).unwrap()
+        };
+        views.iter().zip(&photos.0).map(of).sum::<f64>() / 11.0
+    });
+    println!("{with:.2} dB with, {without:.2} without");
+    assert!(with > without + 4.0, "{with} {without}");
+}
+
+#[test]
+fn exposures_do_not_depend_on_threads_or_interruptions() {
+    let (truth, gains) = (cloud(12, 120, 0.8), gains());
+    let shown = exposed(&photos(&truth), &gains);
+    let setup = || Setup { trains_exposures: true, budget: 200, steps: 120, ..Setup::new(perturbed(&truth), &shown) };
+    let run = |threads: usize, from: Option<State>, until: u32| {
+        let mut left = None;
+        let mut report = |now: train::Progress| {
+            left = (now.step == until).then(|| now.state.to_frame());
+            if left.is_some() { Flow::Stop } else { Flow::Continue }
+        };
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        let done = pool.install(|| setup().try_run_on(from, &|_| true, &mut report)).unwrap();
+        (done, left)
+    };
+    let calm = run(1, None, u32::MAX).0;
+    assert!(calm.1.as_ref().unwrap().iter().any(|(_, exposure)| *exposure != Exposure::IDENTITY));
+    assert!(calm == run(2, None, u32::MAX).0, "two threads give another result");
+    // Within an epoch, after some growth.
+    let left = run(2, None, 67).1.unwrap();
+    assert!(calm == run(1, Some(State::from_frame(&left).unwrap()), u32::MAX).0, "an interruption shows");
+}
+
 #[test]
 fn a_report_can_stop_and_errors_say_why() {
     let truth = cloud(9, 60, 0.8);
@@ -445,6 +542,8 @@ fn a_report_can_stop_and_errors_say_why() {
         antialiased: false,
         seed: 0,
         size_bounds_metres: [1e-3, 1.0],
+        exposures: None,
+        trains_exposures: false,
         recipe: &Recipe::default(),
         source: &photos,
     };

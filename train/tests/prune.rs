@@ -104,6 +104,8 @@ fn with_job<R>(
         antialiased: false,
         seed: 3,
         size_bounds_metres: [1e-3, 2.0],
+        exposures: None,
+        trains_exposures: false,
         recipe: &recipe,
         source: photos,
     })

@@ -15,8 +15,10 @@ use dataset::windows::WindowReader;
 use glam::Vec3;
 use rayon::prelude::*;
 use render::cpu::Isa;
-use scene::{ArtefactId, BlockId, Capture, SparsePoints, Splats, frame};
+use scene::frame::{self, About};
+use scene::{ArtefactId, BlockId, Capture, Exposures, SparsePoints, Splats};
 use store::BlockingStore;
+use train::importance::Views;
 use train::prune::{self, Pruning};
 use train::{Recipe, TrainError, TrainView};
 
@@ -97,7 +99,7 @@ impl Execute for BlockTrainer {
         let task = plan.tasks.get(order.task as usize).ok_or_else(|| failed("the plan has no such task"))?;
         let capture = Arc::new(dataset::ingest::load_capture(&self.store, plan.capture).map_err(failed)?);
         let reader = WindowReader::new(capture.clone(), self.store.clone(), self.options.cache_bytes);
-        let results = self.results(&plan, task, order)?;
+        let (results, given) = self.results(&plan, task, order)?;
         let memory = self.options.resume.then(|| Memory::of(order)).filter(|_| self.shared.cap.is_none());
         if let Some((artefact, splats)) = memory.as_ref().and_then(|memory| memory.result(&self.store)) {
             self.shared.resumed.fetch_add(1, Ordering::Relaxed);
@@ -123,9 +125,30 @@ impl Execute for BlockTrainer {
             return Ok(artefact);
         }
         let memory = memory.as_ref();
-        let block = Block { trainer: self, order, plan: &plan, task, capture: &capture, reader: &reader, memory };
-        let splats = self.pool.install(|| block.train(results, &mut stopwatch, report))?;
-        let artefact = self.store.put(frame::encode_splats(&splats)).map_err(failed)?;
+        let exposures = match given.exposures {
+            Some(id) => Some(Exposures::from_frame(&self.store.get(id).map_err(failed)?).map_err(failed)?),
+            None => None,
+        };
+        let (exposures_given, residual_given) = (exposures.as_ref(), given.residual);
+        let block = Block {
+            trainer: self,
+            order,
+            plan: &plan,
+            task,
+            capture: &capture,
+            reader: &reader,
+            memory,
+            exposures_given,
+            residual_given,
+        };
+        let Trained { splats, exposures, residual } =
+            self.pool.install(|| block.train(results, &mut stopwatch, report))?;
+        let exposures = match exposures {
+            Some(trained) => Some(self.store.put(trained.to_frame()).map_err(failed)?),
+            None => given.exposures,
+        };
+        let about = About { exposures, residual: residual.or(given.residual) };
+        let artefact = self.store.put(frame::encode_result(&splats, about)).map_err(failed)?;
         self.shared.cap.iter().for_each(|cap| cap.finish(order.task));
         if let Some(memory) = memory {
             memory.keep_result(&self.store, artefact);
@@ -135,18 +158,32 @@ impl Execute for BlockTrainer {
 }
 
 impl BlockTrainer {
-    /// The splats of the blocks that the task needs.
-    fn results(&self, plan: &Plan, task: &Task, order: &TaskOrder) -> Result<BTreeMap<BlockId, Splats>, ExecuteError> {
-        let mut results = BTreeMap::new();
+    /// The splats of the blocks that the task needs, and what else its parent hands down.
+    fn results(&self, plan: &Plan, task: &Task, order: &TaskOrder) -> Result<Inputs, ExecuteError> {
+        let (mut results, mut given) = (BTreeMap::new(), About::default());
         for block in task.context_cut().blocks() {
             let index = plan.tasks.iter().position(|t| t.block == block);
             let id = index.and_then(|i| order.inputs.get(&(i as u32)));
             let id = id.ok_or_else(|| failed(format!("the result of block {block} was not handed over")))?;
             let bytes = self.store.get(*id).map_err(failed)?;
-            results.insert(block, frame::decode_splats(&bytes).map_err(failed)?);
+            let (splats, about) = frame::decode_result(&bytes).map_err(failed)?;
+            results.insert(block, splats);
+            given = if Some(block) == task.parent { about } else { given };
         }
-        Ok(results)
+        Ok((results, given))
     }
+}
+
+/// What other tasks made: splats by block, and what else the parent hands down.
+type Inputs = (BTreeMap<BlockId, Splats>, About);
+
+/// What a block comes to.
+struct Trained {
+    splats: Splats,
+    /// Where it is this block that trains them.
+    exposures: Option<Exposures>,
+    /// How far they are off, where the tree begins with this block.
+    residual: Option<f64>,
 }
 
 /// A block about to be trained.
@@ -158,6 +195,8 @@ struct Block<'a> {
     capture: &'a Arc<Capture>,
     reader: &'a WindowReader,
     memory: Option<&'a Memory>,
+    exposures_given: Option<&'a Exposures>,
+    residual_given: Option<f64>,
 }
 
 impl Block<'_> {
@@ -166,7 +205,7 @@ impl Block<'_> {
         results: BTreeMap<BlockId, Splats>,
         stopwatch: &mut Stopwatch,
         report: &mut (dyn FnMut(Report) -> Flow + Send),
-    ) -> Result<Splats, ExecuteError> {
+    ) -> Result<Trained, ExecuteError> {
         let Self { plan, task, .. } = *self;
         let Shared { finished, cap, .. } = &*self.trainer.shared;
         let eval_every = self.trainer.options.eval_every;
@@ -177,7 +216,7 @@ impl Block<'_> {
             }
             TrainError::Source(_) => failed(error),
         };
-        let counts = |p: Vec3| plan.ground.owns(task.block, p.as_dvec3());
+        let counts = |p: Vec3| self.owns(task, p.as_dvec3());
         let budget = self.budget(&results);
         let mut judge = Judge::new(plan, self.capture, &self.trainer.store);
         if judge.is_some() {
@@ -213,6 +252,8 @@ impl Block<'_> {
             antialiased: plan.settings.antialiased,
             seed: self.seed(),
             size_bounds_metres: self.size_bounds_metres(),
+            exposures: self.exposures_given,
+            trains_exposures: plan.settings.exposure && task.parent.is_none(),
             recipe: &recipe,
             source: self.reader,
         };
@@ -267,7 +308,7 @@ impl Block<'_> {
         }
         let clock = Stopwatch::start();
         let mut next_checkpoint = self.trainer.options.checkpoint_seconds;
-        let mut splats = train::train_on(job, from, &mut |now| {
+        let (mut splats, exposures) = train::train_on(job, from, &mut |now| {
             let (seconds, last) = (clock.wall_seconds(), now.step == now.steps);
             // The last one is what pruning begins with.
             if let Some(memory) = self.memory
@@ -283,7 +324,8 @@ impl Block<'_> {
         })
         .map_err(wrong)?;
         if let Some(pruning) = pruning.filter(|_| !stopped && !late) {
-            let (pruned, outcome) = prune::within_tolerance(job_of(splats, whole), &pruning, &mut |now| {
+            let job = train::Job { exposures: exposures.as_ref().or(self.exposures_given), ..job_of(splats, whole) };
+            let (pruned, outcome) = prune::within_tolerance(job, &pruning, &mut |now| {
                 late = over();
                 loss = now.loss;
                 // Once more at the end, with what pruning chose.
@@ -303,11 +345,28 @@ impl Block<'_> {
         if late {
             cap.iter().for_each(Cap::shorten);
         }
+        let exposed = exposures.as_ref().or(self.exposures_given);
+        let residual = self.residual(&splats, &views, exposed).map_err(wrong)?;
         let splats = self.handed_on(splats, &views);
         if judge.is_some() {
             finished.insert(self.order.plan, plan, task.block, &splats);
         }
-        Ok(splats)
+        Ok(Trained { splats, exposures, residual })
+    }
+
+    /// How far the splats of a root with children are off in what they were trained on.
+    fn residual(
+        &self,
+        splats: &Splats,
+        views: &[TrainView],
+        exposures: Option<&Exposures>,
+    ) -> Result<Option<f64>, TrainError> {
+        let settings = &self.plan.settings;
+        if self.task.parent.is_some() || settings.residual == 0.0 || self.plan.tasks.len() == 1 {
+            return Ok(None);
+        }
+        let all = Views { views, context: None, antialiased: settings.antialiased, exposures, source: self.reader };
+        refine::residual(all, splats)
     }
 
     /// The splats as other blocks, viewers and the merged model draw them: at full resolution. Compensated opacity does not
@@ -320,7 +379,8 @@ impl Block<'_> {
     }
 
     /// Splats to end with in the core. The plan shares the budget among the children of a block by what is known beforehand;
-    /// the parent's growth has since put splats where the error was, so the same sum is shared as they lie.
+    /// the parent's growth has since put splats where the error was, so the same sum is shared as they lie, less what the root
+    /// has of far splats, which no child replaces.
     fn budget(&self, results: &BTreeMap<BlockId, Splats>) -> usize {
         let (plan, task) = (self.plan, self.task);
         let Some(splats) = task.parent.and_then(|parent| results.get(&parent)) else { return task.budget as usize };
@@ -329,11 +389,16 @@ impl Block<'_> {
         let mut counts = vec![0u64; siblings.len()];
         for i in 0..splats.len() {
             let place = splats.mean(i).as_dvec3();
-            if let Some(of) = siblings.iter().position(|t| plan.ground.owns(t.block, place)) {
+            if let Some(of) = siblings.iter().position(|t| self.owns(t, place)) {
                 counts[of] += 1;
             }
         }
         let own = siblings.iter().position(|t| t.block == task.block).map_or(0, |i| counts[i]);
+        let of_level = plan.tasks.iter().filter(|t| t.block.level == task.block.level).map(|t| u64::from(t.budget));
+        let of_level = of_level.sum::<u64>().max(1);
+        let is_far = |root: &Splats| (0..root.len()).filter(|&i| plan.ground.is_far(root.mean(i).as_dvec3())).count();
+        let far = results.get(&BlockId::ROOT).map_or(0, is_far) as u64;
+        let total = total * (of_level - far.min(of_level / 2)) / of_level;
         (total * own / counts.iter().sum::<u64>().max(1)).max(1) as usize
     }
 
@@ -351,11 +416,13 @@ impl Block<'_> {
         views: &[TrainView],
         counts: &(dyn Fn(Vec3) -> bool + Sync),
     ) -> Result<bool, TrainError> {
-        let settings = &self.plan.settings;
-        if self.task.parent.is_none() || settings.residual == 0.0 {
-            return Ok(false);
-        }
-        refine::is_settled(start, settings.residual, views, counts, settings.antialiased, self.reader)
+        let Self { plan, reader, exposures_given: exposures, .. } = *self;
+        let Some(all) = self.residual_given.filter(|_| plan.settings.residual > 0.0) else { return Ok(false) };
+        let antialiased = plan.settings.antialiased;
+        let around = Views { views, context: start.1.as_ref(), antialiased, exposures, source: reader };
+        let found = refine::residual_of_core(around, &start.0, counts)?;
+        tracing::debug!(block = %self.task.block, found, all, "what its parent lacks, and what the root lacks");
+        Ok(found.is_some_and(|found| found <= plan.settings.residual * all))
     }
 
     /// The recipe of the block's level: a child starts from splats that fit already, one mip coarser.
@@ -429,12 +496,20 @@ impl Block<'_> {
         Ok((initial, context))
     }
 
-    /// Is this place the block's to train: in its halo, and not in the core of a neighbour that is final already?
+    /// Is this place a task's in the end? What is far is the root's.
+    fn owns(&self, task: &Task, place: glam::DVec3) -> bool {
+        let ground = &self.plan.ground;
+        ground.owns(task.block, place) && (task.parent.is_none() || !ground.is_far(place))
+    }
+
+    /// Is this place the block's to train: in its halo, not far, and not in the core of a neighbour that is final already?
     fn trains(&self, cut: &blocks::Cut, place: glam::DVec3) -> bool {
         let ground = &self.plan.ground;
         let owner = cut.owner_of(ground, place);
         self.task.parent.is_none()
-            || (ground.in_halo(self.task.block, place) && owner.is_none_or(|b| b.level < self.task.block.level))
+            || (ground.in_halo(self.task.block, place)
+                && !ground.is_far(place)
+                && owner.is_none_or(|b| b.level < self.task.block.level))
     }
 
     /// Where the backdrop stands: around the cameras, five times as far as all but the farthest points.

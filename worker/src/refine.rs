@@ -1,14 +1,14 @@
 //! Is a block worth looking at more closely than its parent did?
 //!
-//! A block begins with its parent's splats. Where these already are what its own, finer photos show, within the plan's
-//! tolerance, it is *settled*: it keeps them, and healing and pruning at the parent's resolution is all that is done to it. A
-//! meadow stays as coarse as it was beside the facade that is refined. A settled block's children ask again, with
-//! photos finer still, so that a monument in the meadow is found.
+//! A block begins with its parent's splats. Where these already are so near to what its own, finer photos show that the
+//! scene as a whole has hardly anything to gain there, it is *settled*: it keeps them, and healing and pruning at the
+//! parent's resolution is all that is done to it. A meadow stays as coarse as it was beside the facade that is refined. A settled
+//! block's children ask again, with photos finer still, so that a monument in the meadow is found.
 
 use glam::Vec3;
 use scene::Splats;
 use train::importance::Views;
-use train::{TrainError, TrainView, WindowSource, blur};
+use train::{TrainError, TrainView, blur};
 
 /// Windows looked at, at most.
 const WINDOWS: usize = 16;
@@ -16,32 +16,30 @@ const WINDOWS: usize = 16;
 /// Splats to train and what is drawn around them.
 pub(crate) type Start = (Splats, Option<Splats>);
 
-/// Are the parent's splats off by no more than `residual` (root mean square, 0 to 1) in what the windows show of the core?
-/// Where too little is seen of it to tell, they are not.
+/// How far splats are off in the photos: root mean square, 0 to 1; `None` where too little is seen to tell.
 ///
 /// # Errors
 /// A window that cannot be read.
-pub(crate) fn is_settled(
-    (splats, context): &Start,
-    residual: f64,
-    views: &[TrainView],
-    owns: &(dyn Fn(Vec3) -> bool + Sync),
-    antialiased: bool,
-    source: &dyn WindowSource,
-) -> Result<bool, TrainError> {
-    let inside: Vec<bool> = (0..splats.len()).map(|i| owns(splats.mean(i))).collect();
-    let core = splats.filter(|i| inside[i]);
-    if core.is_empty() {
-        return Ok(false);
-    }
-    let mut rest = splats.filter(|i| !inside[i]);
-    context.iter().for_each(|context| rest.append(context));
-    let all = Views { views, context: Some(&rest), antialiased, source };
+pub(crate) fn residual(all: Views, splats: &Splats) -> Result<Option<f64>, TrainError> {
     let some = all.some(WINDOWS);
     let judge = Views { views: &some, ..all };
-    let found = judge.residual(&core, &judge.shares(&core)?)?;
-    tracing::debug!(residual = found, "what the parent lacks");
-    Ok(found.is_some_and(|found| found <= residual))
+    judge.residual(splats, &judge.shares(splats)?)
+}
+
+/// As [`residual`], of those splats that the block owns, in what the windows show of them.
+///
+/// # Errors
+/// A window that cannot be read.
+pub(crate) fn residual_of_core(
+    around: Views,
+    splats: &Splats,
+    owns: &(dyn Fn(Vec3) -> bool + Sync),
+) -> Result<Option<f64>, TrainError> {
+    let inside: Vec<bool> = (0..splats.len()).map(|i| owns(splats.mean(i))).collect();
+    let core = splats.filter(|i| inside[i]);
+    let mut rest = splats.filter(|i| !inside[i]);
+    around.context.iter().for_each(|context| rest.append(context));
+    if core.is_empty() { Ok(None) } else { residual(Views { context: Some(&rest), ..around }, &core) }
 }
 
 /// The windows as the parent's resolution has them, where they have one.

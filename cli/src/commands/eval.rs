@@ -1,7 +1,8 @@
 //! `plat eval`: a model against the held-out photos of a capture.
 //!
 //! Renders are compared as floats clamped to 0..1, not rounded to 8 bits; PSNR counts unmasked pixels only, and where
-//! a mask leaves pixels out the other measures see the photo there. The contact sheet shows 8-bit pictures.
+//! a mask leaves pixels out the other measures see the photo there. Views are drawn without an exposure; cc-PSNR says what is left
+//! when the photo's own is forgiven. The contact sheet shows 8-bit pictures.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -54,6 +55,8 @@ pub(crate) struct Figures {
     pub(crate) view: String,
     /// dB; null where a mask leaves nothing.
     pub(crate) psnr: Option<f64>,
+    /// dB, after the affine transform of colours that comes nearest.
+    pub(crate) cc_psnr: Option<f64>,
     pub(crate) ssim: f64,
     /// SSIMULACRA2; null below 8 pixels a side.
     pub(crate) perceptual: Option<f64>,
@@ -128,17 +131,18 @@ impl Parts {
 /// The figures as text, a line a view.
 pub(crate) fn text(evaluated: &Evaluated) -> String {
     let record = &evaluated.record;
-    let line = |name: &str, [psnr, ssim, perceptual, lpips]: [Option<f64>; 4]| {
+    let line = |name: &str, [psnr, cc_psnr, ssim, perceptual, lpips]: [Option<f64>; 5]| {
         let figure = |value: Option<f64>, digits: usize| value.map_or("-".into(), |v| format!("{v:.digits$}"));
         let lpips = record.lpips.map_or(String::new(), |_| format!(" {:>8}", figure(lpips, 4)));
-        format!("{:>8} {:>8} {:>11}{lpips}  {name}\n", figure(psnr, 2), figure(ssim, 4), figure(perceptual, 2))
+        let [psnr, cc_psnr] = [psnr, cc_psnr].map(|value| figure(value, 2));
+        format!("{psnr:>8} {cc_psnr:>8} {:>8} {:>11}{lpips}  {name}\n", figure(ssim, 4), figure(perceptual, 2))
     };
     let lpips = if record.lpips.is_some() { "    LPIPS" } else { "" };
-    let mut text = format!("{:>8} {:>8} {:>11}{lpips}\n", "PSNR", "SSIM", "SSIMULACRA2");
+    let mut text = format!("{:>8} {:>8} {:>8} {:>11}{lpips}\n", "PSNR", "cc-PSNR", "SSIM", "SSIMULACRA2");
     for view in &evaluated.views {
-        text += &line(&view.view, [view.psnr, Some(view.ssim), view.perceptual, view.lpips]);
+        text += &line(&view.view, [view.psnr, view.cc_psnr, Some(view.ssim), view.perceptual, view.lpips]);
     }
-    text += &line("mean", [record.psnr, record.ssim, record.perceptual, record.lpips]);
+    text += &line("mean", [record.psnr, record.cc_psnr, record.ssim, record.perceptual, record.lpips]);
     if !evaluated.cuts.is_empty() {
         text += &format!("\n{}\n", cuts::text(&evaluated.cuts));
     }
@@ -204,6 +208,7 @@ pub(crate) fn evaluate(
         wall_seconds: Some(drawing.wall_seconds),
         cpu_seconds: Some(drawing.cpu_seconds),
         psnr: mean(views.iter().map(|view| view.psnr)),
+        cc_psnr: mean(views.iter().map(|view| view.cc_psnr)),
         ssim: mean(views.iter().map(|view| Some(view.ssim))),
         perceptual: mean(views.iter().map(|view| view.perceptual)),
         lpips: mean(views.iter().map(|view| view.lpips)),
@@ -233,6 +238,7 @@ pub(crate) fn measure(name: &str, colour: &[f32], photo: &Pixels, lpips: Option<
     let truth: Vec<f32> = photo.rgb.iter().map(|&value| f32::from(value) / 255.0).collect();
     let mut render: Vec<f32> = colour.iter().map(|value| value.clamp(0.0, 1.0)).collect();
     let psnr = metrics::psnr(&render, &truth, photo.mask.as_deref());
+    let cc_psnr = metrics::colour_corrected_psnr(&render, &truth, photo.mask.as_deref());
     if let Some(mask) = &photo.mask {
         for (i, value) in render.iter_mut().enumerate() {
             if mask[i % mask.len()] < 128 {
@@ -244,6 +250,7 @@ pub(crate) fn measure(name: &str, colour: &[f32], photo: &Pixels, lpips: Option<
     Ok(Figures {
         view: name.to_owned(),
         psnr,
+        cc_psnr,
         ssim: metrics::ssim(&render, &truth, width, height),
         perceptual: metrics::ssimulacra2(&truth, &render, width, height),
         lpips: lpips.map(|lpips| lpips.distance(&render, &truth, width, height)).transpose()?,

@@ -8,7 +8,7 @@ use ::bench::parts::Prune;
 use ::bench::{PartLine, append_part};
 use dataset::windows::WindowReader;
 use glam::Vec3;
-use scene::{BadInput, Capture, Splats, column};
+use scene::{BadInput, Capture, Exposures, Splats, column};
 use serde::Serialize;
 use store::BlockingStore;
 use tempfile::TempDir;
@@ -130,6 +130,8 @@ fn finish(
 /// A capture's photos at the size that a model was trained with.
 struct Photos {
     reader: WindowReader,
+    /// Whether the model's exposures are of these photos.
+    are_trained_on: bool,
     test_every: u32,
     downscale: u32,
     /// Gone with the command.
@@ -144,8 +146,15 @@ impl Photos {
         let store: BlockingStore = store.blocking();
         let (downscale, test_every) = (options.downscale.unwrap_or(downscale), options.test_every.unwrap_or(every));
         let ingested = ingest_photos(&source, &store, downscale, output)?;
+        let are_trained_on = match (&model.exposures, &model.trained) {
+            (Some(_), Some((_, out))) => model::read_tree(out)?.plan.capture == ingested.id,
+            _ => false,
+        };
+        if model.exposures.is_some() && !are_trained_on {
+            output.note("these are not the photos that the model was trained on: its exposures are left out");
+        }
         let reader = WindowReader::new(Arc::new(ingested.capture), store, CACHE_BYTES);
-        Ok(Self { reader, test_every, downscale, _temporary: temporary })
+        Ok(Self { reader, are_trained_on, test_every, downscale, _temporary: temporary })
     }
 
     fn views(&self, test: bool) -> Vec<TrainView> {
@@ -160,13 +169,18 @@ impl Photos {
         self.views(true)
     }
 
-    /// Mean PSNR over views, as `plat eval` measures it.
+    /// Mean PSNR over views, as `plat eval` measures it: held-out views have no exposure.
     fn psnr(&self, model: &Model, splats: &Splats, views: &[TrainView]) -> Result<f64, Failure> {
         self.judged(model, views).psnr(splats, &Shares::default()).map_err(failed)
     }
 
-    fn judged<'a>(&'a self, model: &Model, views: &'a [TrainView]) -> Views<'a> {
-        Views { views, context: None, antialiased: model.antialiased, source: &self.reader }
+    fn judged<'a>(&'a self, model: &'a Model, views: &'a [TrainView]) -> Views<'a> {
+        let (antialiased, exposures) = (model.antialiased, self.exposures(model));
+        Views { views, context: None, antialiased, exposures, source: &self.reader }
+    }
+
+    fn exposures<'a>(&self, model: &'a Model) -> Option<&'a Exposures> {
+        model.exposures.as_ref().filter(|_| self.are_trained_on)
     }
 
     /// Prunes to a share, or within the tolerance, by the views that are not held out.
@@ -195,6 +209,8 @@ impl Photos {
             antialiased: model.antialiased,
             seed: settings.as_ref().map_or(0, |settings| settings.seed),
             size_bounds_metres: sizes_metres(&model.splats),
+            exposures: self.exposures(model),
+            trains_exposures: false,
             recipe: &recipe,
             source: &self.reader,
         };

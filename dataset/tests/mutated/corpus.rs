@@ -11,7 +11,7 @@ use glam::Vec3;
 use image::{DynamicImage, ImageFormat, Rgb, RgbImage, Rgba, RgbaImage};
 use scene::frame;
 use scene::transforms::{Frame, Intrinsics, Transforms};
-use scene::{CameraModel, Pixels, Splat, Splats};
+use scene::{CameraModel, Exposure, Exposures, Pixels, Splat, Splats};
 use scene::{npy, ply, spz, transforms};
 
 use crate::readers::*;
@@ -226,6 +226,8 @@ impl Corpus {
             }
             self.put("splat columns", frame::encode_splats(&splats), &splats_codec(), Seal::Frame, PLAIN);
         }
+        let exposures: Exposures = (0..40).map(|view| (3 * view, Exposure::IDENTITY)).collect();
+        self.put("exposures", exposures.to_frame(), &exposures_codec(), Seal::Frame, PLAIN);
         self.plain("packed.compressed.ply", packed(), &ply_codec());
         self.plain("cloud.ply", CLOUD, &cloud_codec());
         let [shape, data] = [vec![7, 3], vec![]];

@@ -10,7 +10,7 @@ use glam::{DQuat, DVec3};
 use image::{ImageFormat, RgbImage};
 use scene::frame::{self, Kind};
 use scene::transforms::{Frame, Intrinsics, Transforms};
-use scene::{CameraModel, Capture, CodecError, Rect, Rigid};
+use scene::{CameraModel, Capture, CodecError, Exposures, Rect, Rigid};
 use scene::{colmap, kitti360, npy, opensfm, ply, spz, transforms};
 use store::Store;
 
@@ -135,6 +135,12 @@ pub(crate) fn spz_codec() -> Read {
 
 pub(crate) fn splats_codec() -> Read {
     codec("frames", frame::decode_splats, |splats| splats.columns().iter().all(|c| c.len() == splats.len()))
+}
+
+pub(crate) fn exposures_codec() -> Read {
+    codec("frames", Exposures::from_frame, |exposures| {
+        exposures.iter().all(|(_, exposure)| exposure.0.iter().flatten().all(|value| value.is_finite()))
+    })
 }
 
 pub(crate) fn npy_codec() -> Read {

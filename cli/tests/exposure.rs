@@ -1,0 +1,129 @@
+//! Exposures of views, and far content, through a whole job: what the root has, all blocks have, and no one else's.
+
+use std::collections::BTreeSet;
+use std::path::Path;
+use std::process::{Command, Output};
+
+use blocks::Plan;
+use dataset::synth::{CitySettings, write_city};
+use scene::{ArtefactId, BlockId, Capture, Exposures, Splats, frame, ply};
+use serde_json::Value;
+
+fn plat(folder: &Path, words: &[&str]) -> Output {
+    let program = env!("CARGO_BIN_EXE_plat");
+    Command::new(program).args(words).arg("--json").current_dir(folder).output().expect("plat runs")
+}
+
+fn done(folder: &Path, words: &[&str]) -> Value {
+    let output = plat(folder, words);
+    assert!(output.status.success(), "{words:?}: {}", String::from_utf8_lossy(&output.stderr));
+    let text = String::from_utf8(output.stdout).unwrap();
+    serde_json::from_str(text.lines().last().expect("an object on the last line")).unwrap()
+}
+
+/// Multiplies each photo that is trained on by a gain from 0.7 to 1.2; the held-out ones stay. Returns the gains by view, 1 for those.
+fn expose_photos(images: &Path) -> Vec<f64> {
+    let mut names: Vec<_> = std::fs::read_dir(images).unwrap().map(|entry| entry.unwrap().path()).collect();
+    names.sort();
+    let gain = |view: usize| {
+        if Capture::is_test(view, 8) { 1.0 } else { 0.7 + 0.5 * f64::from(train::random::uniform(5, view as u64)) }
+    };
+    for (view, name) in names.iter().enumerate() {
+        let mut photo = image::open(name).unwrap().to_rgb8();
+        photo.iter_mut().for_each(|byte| *byte = (f64::from(*byte) * gain(view)).round().min(255.0) as u8);
+        photo.save(name).unwrap();
+    }
+    (0..names.len()).map(gain).collect()
+}
+
+/// Of the splats that are far, their rows as bits.
+fn far(splats: &Splats, plan: &Plan) -> Vec<Vec<u32>> {
+    let is_far = |&i: &usize| plan.ground.is_far(splats.mean(i).as_dvec3());
+    let row = |i: usize| splats.columns().iter().map(|column| column[i].to_bits()).collect();
+    let mut rows: Vec<_> = (0..splats.len()).filter(is_far).map(row).collect();
+    rows.sort();
+    rows
+}
+
+#[test]
+fn exposures_and_the_sky_come_from_the_root_and_stay_as_they_are() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    let settings = CitySettings { seed: 3, extent_metres: 80.0, views: 32, width: 80, height: 60, plain: 0.0 };
+    write_city(&at.join("city"), &settings, |_, _| {}).unwrap();
+    let gains = expose_photos(&at.join("city/images"));
+    let train = |out: &str, more: &[&str]| {
+        let job = ["train", "city", "--out", out, "--steps", "1500", "--budget", "4000", "--tolerance-db", "0"];
+        done(at, &[&job[..], more].concat())
+    };
+    let on = train("on", &["--levels", "2", "--exposure", "--threads", "1"]);
+    train("again", &["--levels", "2", "--exposure", "--threads", "2"]);
+    let bytes = |path: &str| std::fs::read(at.join(path)).unwrap();
+    for file in ["merged.ply", "model/model.json", "model/exposures.plat"] {
+        assert!(bytes(&format!("on/{file}")) == bytes(&format!("again/{file}")), "{file} shows the number of threads");
+    }
+
+    // The exposures: of all training views and no other, their mean the identity, and in all blocks the same.
+    let file = bytes("on/model/exposures.plat");
+    let exposures = Exposures::from_frame(&file).unwrap();
+    let trained: Vec<u32> = (0..32).filter(|&view| !Capture::is_test(view as usize, 8)).collect();
+    assert_eq!(exposures.iter().map(|(view, _)| view).collect::<Vec<_>>(), trained);
+    let mean = |of: &dyn Fn(u32) -> f64| trained.iter().map(|&view| of(view)).sum::<f64>() / trained.len() as f64;
+    let found = |view: u32| f64::from(exposures.of(view).unwrap().gain());
+    assert!((mean(&found) - 1.0).abs() < 1e-4, "{}", mean(&found));
+    let given = |view: u32| gains[view as usize] / mean(&|view| gains[view as usize]);
+    let [a, b] = [mean(&|view| (found(view) - 1.0) * (given(view) - 1.0)), mean(&|view| (given(view) - 1.0).powi(2))];
+    assert!(a > 0.4 * b, "of the given deviations {a} of {b} was found");
+    let plan = Plan::from_frame(&bytes("on/model/plan.plat")).unwrap();
+    assert!(plan.levels == 2 && plan.tasks.len() > 5, "{}", plan.tasks.len());
+    let result = |block: BlockId| {
+        let BlockId { level, x, y } = block;
+        frame::decode_result(&bytes(&format!("on/model/blocks/{level}-{x}-{y}.plat"))).unwrap()
+    };
+    let named: BTreeSet<_> = plan.tasks.iter().map(|task| result(task.block).1.exposures).collect();
+    assert_eq!(named, BTreeSet::from([Some(ArtefactId::of(&file))]));
+
+    // The sky: the root's, to the bit, once; and no block has any of it.
+    let root = far(&result(BlockId::ROOT).0, &plan);
+    assert!(root.len() > 300, "a backdrop is there: {}", root.len());
+    assert!(
+        far(&ply::read(&bytes("on/merged.ply")).unwrap(), &plan) == root,
+        "far content was doubled, lost or changed"
+    );
+    for task in plan.tasks.iter().filter(|task| task.block != BlockId::ROOT) {
+        let (splats, _) = result(task.block);
+        let strayed = far(&splats, &plan).len();
+        assert!(strayed * 100 <= splats.len(), "block {} has {strayed} far splats", task.block);
+    }
+
+    // Photos that were not changed are nearer, in colour above all.
+    let off = train("off", &["--levels", "2"]);
+    assert!(!at.join("off/model/exposures.plat").exists());
+    let psnr = |report: &Value| report["psnr"].as_f64().unwrap();
+    let [on, off] = [("on", on), ("off", off)].map(|(out, report)| (psnr(&report), done(at, &["eval", out, "city"])));
+    println!("{:.2} dB with exposures, {:.2} without", on.0, off.0);
+    let corrected = |said: &Value| said["cc_psnr"].as_f64().unwrap();
+    assert!(corrected(&on.1) > psnr(&on.1) && corrected(&off.1) > psnr(&off.1));
+    assert!(corrected(&on.1) > corrected(&off.1), "{} {}", corrected(&on.1), corrected(&off.1));
+    assert!(on.1["views"][0]["cc_psnr"].is_f64());
+
+    // A model keeps them when it is pruned, and other photos are told from its own.
+    let prune = |capture: &str, out: &str| {
+        plat(at, &["prune", "on", "--capture", capture, "--downscale", "1", "--keep", "0.6", "--out", out])
+    };
+    let said = |output: &Output| String::from_utf8_lossy(&output.stderr).into_owned();
+    let pruned = prune("city", "pruned");
+    assert!(pruned.status.success() && !said(&pruned).contains("exposures"), "{}", said(&pruned));
+    assert_eq!(bytes("pruned/model/exposures.plat"), file);
+    write_city(&at.join("other"), &CitySettings { seed: 4, ..settings }, |_, _| {}).unwrap();
+    let pruned = prune("other", "by_others");
+    assert!(said(&pruned).contains("exposures are left out"), "{}", said(&pruned));
+
+    let refused = plat(at, &["train", "city", "--out", "flat", "--blocks", "flat", "--exposure"]);
+    assert_eq!(refused.status.code(), Some(2));
+    assert!(
+        said(&refused).contains("--exposure") && said(&refused).trim_end().lines().count() == 1,
+        "{}",
+        said(&refused)
+    );
+}
