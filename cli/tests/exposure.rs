@@ -56,7 +56,7 @@ fn exposures_and_the_sky_come_from_the_root_and_stay_as_they_are() {
         let job = ["train", "city", "--out", out, "--steps", "1500", "--budget", "4000", "--tolerance-db", "0"];
         done(at, &[&job[..], more].concat())
     };
-    let on = train("on", &["--levels", "2", "--exposure", "--threads", "1"]);
+    train("on", &["--levels", "2", "--exposure", "--threads", "1"]);
     train("again", &["--levels", "2", "--exposure", "--threads", "2"]);
     let bytes = |path: &str| std::fs::read(at.join(path)).unwrap();
     for file in ["merged.ply", "model/model.json", "model/exposures.plat"] {
@@ -96,15 +96,17 @@ fn exposures_and_the_sky_come_from_the_root_and_stay_as_they_are() {
         assert!(strayed * 100 <= splats.len(), "block {} has {strayed} far splats", task.block);
     }
 
-    // Photos that were not changed are nearer, in colour above all.
-    let off = train("off", &["--levels", "2"]);
+    // Photos that were not changed are nearer. (Of so small a city a tree's root sees too little to be exact.)
+    let on = train("whole", &["--blocks", "whole", "--exposure"]);
+    let off = train("off", &["--blocks", "whole"]);
     assert!(!at.join("off/model/exposures.plat").exists());
     let psnr = |report: &Value| report["psnr"].as_f64().unwrap();
-    let [on, off] = [("on", on), ("off", off)].map(|(out, report)| (psnr(&report), done(at, &["eval", out, "city"])));
+    let [on, off] =
+        [("whole", on), ("off", off)].map(|(out, report)| (psnr(&report), done(at, &["eval", out, "city"])));
     println!("{:.2} dB with exposures, {:.2} without", on.0, off.0);
     let corrected = |said: &Value| said["cc_psnr"].as_f64().unwrap();
     assert!(corrected(&on.1) > psnr(&on.1) && corrected(&off.1) > psnr(&off.1));
-    assert!(corrected(&on.1) > corrected(&off.1), "{} {}", corrected(&on.1), corrected(&off.1));
+    assert!(on.0 > psnr(&off.1) && corrected(&on.1) > corrected(&off.1), "{} {}", corrected(&on.1), corrected(&off.1));
     assert!(on.1["views"][0]["cc_psnr"].is_f64());
 
     // A model keeps them when it is pruned, and other photos are told from its own.

@@ -84,10 +84,15 @@ pub fn backdrop(
         t.iter_mut().zip(s).for_each(|(t, s)| *t += s);
         t
     });
+    // Neighbours on the lattice are 3.5 / sqrt(n) apart; what nobody sees, nor anything beside it, needs no splat.
+    let beside = (1.5 * 3.5 / (BACKDROP as f64).sqrt()).cos();
+    let cosine = |a: &[f64; 3], b: &[f64; 3]| a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+    let seen: Vec<&[f64; 3]> = directions.iter().zip(&sums).filter(|(_, sum)| sum[3] > 0.0).map(|(d, _)| d).collect();
+    let shown = |direction: &[f64; 3]| seen.iter().any(|other| cosine(direction, other) > beside);
     let size = radius_metres * (4.0 * std::f64::consts::PI / BACKDROP as f64).sqrt() * 0.6;
     let mut splats = Splats::new(sh_degree);
-    for (direction, sum) in directions.iter().zip(&sums) {
-        // A direction nobody looks in shows what all views show on average.
+    for (direction, sum) in directions.iter().zip(&sums).filter(|(direction, _)| shown(direction)) {
+        // At the rim: what all views show on average.
         let sum = if sum[3] > 0.0 { sum } else { &total };
         let colour = Vec3::from_array([0, 1, 2].map(|c| (sum[c] / sum[3].max(1.0)) as f32));
         let mean = centre + DVec3::from_array(*direction) * radius_metres;
