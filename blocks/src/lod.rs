@@ -258,13 +258,18 @@ mod tests {
         let ground = Ground { near_metres: 96.0, ..ground() };
         let cut: Cut = all(2).into_iter().collect();
         let middle = DVec3::new(32.0, 32.0, 0.0);
-        for direction in [DVec3::X, DVec3::NEG_Y, DVec3::Z, DVec3::NEG_Z, DVec3::new(0.6, 0.0, 0.8)] {
+        let rising = [DVec3::new(1.0, 0.0, 1e-3), DVec3::new(0.0, -1.0, 1e-3), DVec3::Z, DVec3::new(0.6, 0.0, 0.8)];
+        for direction in rising.map(DVec3::normalize) {
             let (near, far) = (middle + direction * 95.9, middle + direction * 96.1);
             assert_eq!(cut.owner_of(&ground, near).map(|b| b.level), Some(2));
             assert_eq!(cut.owner_of(&ground, far), Some(BlockId::ROOT));
             // Without a root, as in flat plans, whoever is below.
             let flat = Cut::nearest(&ground, all(2).into_iter().filter(|b| b.level == 2));
             assert_eq!(flat.owner_of(&ground, far), Some(ground.block_at(2, far)));
+        }
+        // What shows through the ground is its block's.
+        for direction in [DVec3::NEG_Z, DVec3::new(0.6, 0.0, -0.8)] {
+            assert_eq!(cut.owner_of(&ground, middle + direction * 200.0).map(|b| b.level), Some(2));
         }
         assert_eq!(cut.owner_of(&ground, DVec3::INFINITY), None);
     }

@@ -47,7 +47,7 @@ pub struct PlanSettings {
     /// What leaves may lose of their PSNR for fewer splats, dB; 0 prunes nothing.
     pub tolerance_db: f64,
     /// A block is refined where its parent's splats are off, in its own photos, by more than this many times what the root is
-    /// off by in all (root mean squares); 0 refines all.
+    /// off by in all (root mean squares); 0 refines all, and lets no schedule follow what training says.
     pub residual: f64,
     /// Every which view is held out; 0 holds out none.
     pub test_every: u32,

@@ -21,7 +21,7 @@ const MEAN_VIEWS: usize = 24;
 const MEAN_POINTS: usize = 500;
 /// ... and together this share of all of them.
 const MIN_COVERED: f64 = 0.9;
-/// A leaf is split once more where it holds this many times as many points as the others on average ...
+/// A leaf is split once more where it holds this many times the points of the median leaf ...
 const CROWDED: f64 = 4.0;
 /// ... at most so often.
 const MAX_SPLITS: u8 = 3;
@@ -145,13 +145,13 @@ impl Survey<'_> {
     /// Gives the most crowded leaves children that share their work, at the same resolution: those with several times
     /// the points of the others, and views enough for all.
     fn split_crowded(&self, base: u8, finest_metres: f64, tasks: &mut Vec<Task>) {
-        let points: Vec<f64> =
-            tasks.iter().filter(|task| task.block.level == base).map(|task| f64::from(task.points)).collect();
-        let mean = points.iter().sum::<f64>() / points.len().max(1) as f64;
+        let of_base = tasks.iter().filter(|task| task.block.level == base);
+        let mut points: Vec<f64> = of_base.map(|task| f64::from(task.points)).collect();
+        let usual = quantile(&mut points, 0.5).max(MEAN_POINTS as f64);
         for level in base + 1..=(base + MAX_SPLITS).min(MAX_LEVELS) {
             let crowded: BTreeSet<BlockId> = (tasks.iter())
                 .filter(|task| task.block.level == level - 1)
-                .filter(|task| f64::from(task.points) > CROWDED * mean.max(MEAN_POINTS as f64))
+                .filter(|task| f64::from(task.points) > CROWDED * usual)
                 .filter(|task| task.views.len() >= 2 * MEAN_VIEWS)
                 .map(|task| task.block)
                 .collect();
@@ -407,10 +407,18 @@ mod tests {
         let islands: Vec<Camera> = (0..40).map(|i| above(f64::from(i % 2) * 5e4 + f64::from(i), 0.0)).collect();
         let island_points = (0..2000)
             .map(|i| DVec3::new(f64::from(i % 2) * 5e4 + noise(i as u64) * 40.0, noise(i as u64 + 9) * 20.0, 0.0));
+        // Nothing in the middle: a ring of cameras, and of points.
+        let ring = |radius: f64, i: usize| {
+            let (sin, cos) = (f64::from(i as u32) * 0.618).sin_cos();
+            DVec3::new(radius * cos, radius * sin, noise(i as u64))
+        };
+        let around: Vec<Camera> = (0..60).map(|i| above(ring(200.0, i).x, ring(200.0, i).y)).collect();
+        let rim = |n: usize| (0..n).map(move |i| ring(190.0 + 20.0 * noise(3 * i as u64), i));
         let strange = [
             ("line", capture(&line, grid(900).collect(), true)),
             ("corner", capture(&corner, grid(900).collect(), true)),
             ("islands", capture(&islands, island_points.collect(), true)),
+            ("hole", capture(&around, rim(900).collect(), true)),
             ("one view", capture(&line[..1], grid(900).collect(), true)),
             ("two views", capture(&line[..2], grid(900).collect(), true)),
             ("one spot", capture(&line, vec![DVec3::new(3.0, 15.0, 1.0); 500], true)),
@@ -445,6 +453,67 @@ mod tests {
                 }
             }
         }
+    }
+
+    #[test]
+    fn crowded_leaves_are_split() {
+        let even = aerial(14, 300.0, 8000);
+        // A quarter of a quarter holds as much again as the other leaves together, and more.
+        let mut crowd = even.points.positions.clone();
+        let at = |i: u64, k: u64| noise(1_000_000 + 3 * i + k);
+        crowd.extend(
+            (0..24_000).map(|i| DVec3::new(-140.0 + 60.0 * at(i, 0), -140.0 + 60.0 * at(i, 1), 4.0 * at(i, 2))),
+        );
+        let cameras: Vec<Camera> = even.views.iter().map(|view| view.camera).collect();
+        let [even, crowded] = [even.points.positions, crowd].map(|points| {
+            let capture = capture(&cameras, points, true);
+            (plan_of(&capture, Mode::Tree, None), capture)
+        });
+        assert_eq!(even.0.levels, 1);
+        let (plan, capture) = crowded;
+        assert!(plan.levels > 1, "{}", plan.levels);
+        let split: BTreeSet<BlockId> =
+            plan.tasks.iter().filter(|t| t.block.level == 2).filter_map(|t| t.parent).collect();
+        assert_eq!(split, BTreeSet::from([plan.ground.block_at(1, DVec3::new(-110.0, -110.0, 0.0))]));
+        // At the same resolution: only the work is divided.
+        assert_eq!(plan.rho_metres[1], plan.rho_metres[2]);
+        assert!(!lint(&plan, &capture).iter().any(|f| f.what.contains("coarser")), "{:?}", lint(&plan, &capture));
+        let [low, high] = visits_of_leaves(&plan);
+        assert!(high < 1.1 * low, "{low} {high}");
+    }
+
+    #[test]
+    fn what_no_view_sees_finer_stays_with_its_parent() {
+        // Near the path pixels are small; the far side is seen by as many views, from eight times as far.
+        let cameras: Vec<Camera> = (0..60)
+            .map(|i| {
+                let eye = DVec3::new(f64::from(i) * 5.0 - 150.0, -150.0, 30.0);
+                look(eye, eye + DVec3::new(0.0, 100.0, -20.0), DVec3::Z)
+            })
+            .collect();
+        let at = |i: u64, k: u64| noise(3 * i + k) - 0.5;
+        let points: Vec<DVec3> =
+            (0..20_000).map(|i| DVec3::new(300.0 * at(i, 0), 300.0 * at(i, 1), 4.0 * at(i, 2))).collect();
+        let plan = plan_of(&capture(&cameras, points, true), Mode::Tree, Some(3));
+        let rows = |level: u8| -> BTreeSet<u32> {
+            plan.tasks.iter().filter(|t| t.block.level == level).map(|t| t.block.y).collect()
+        };
+        assert!(rows(1).len() == 2 && rows(3).contains(&1), "{:?} {:?}", rows(1), rows(3));
+        assert!(!rows(3).contains(&7), "{:?}", rows(3));
+        // They were not starved of views or points: of level 2, twice as coarse, there are blocks farther out.
+        assert!(rows(2).last() > rows(3).last().map(|row| row / 2).as_ref(), "{:?} {:?}", rows(2), rows(3));
+        // Leaves of any level are worked on alike.
+        let [low, high] = visits_of_leaves(&plan);
+        assert!(high < 1.1 * low, "{low} {high}");
+    }
+
+    /// Fewest and most steps for each view, of tasks without children.
+    fn visits_of_leaves(plan: &Plan) -> [f64; 2] {
+        let parents: BTreeSet<_> = plan.tasks.iter().filter_map(|t| t.parent).collect();
+        let leaves = plan.tasks.iter().filter(|t| !parents.contains(&t.block));
+        leaves
+            .map(|t| f64::from(t.steps) / t.views.len() as f64)
+            .fold([f64::MAX, 0.0], |[low, high], v| [low.min(v), high.max(v)])
     }
 
     #[test]

@@ -170,7 +170,7 @@ pub(crate) struct PlanOptions {
     #[arg(long, value_name = "X", value_parser = decibels, default_value_t = 0.1)]
     pub(crate) tolerance_db: f64,
     /// Refine a block only where its parent's splats are off, in the block's own photos, by more than R times what the root is
-    /// off by in all (root mean squares); 0 refines all
+    /// off by in all (root mean squares), and look at fine pixels and add splats only while that pays; 0 adapts nothing
     #[arg(long, value_name = "R", value_parser = residual, default_value_t = 0.25)]
     pub(crate) residual: f64,
     /// Seed of all random choices

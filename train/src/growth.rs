@@ -19,7 +19,7 @@ pub struct Growth {
     pub from: f32,
     /// See `from`.
     pub until: f32,
-    /// Growth ends when it brings less than this for each five percent of splats, dB.
+    /// Growth ends when it brings less than this for each five percent of splats, dB; with 0 not before its time.
     pub worth_db: f32,
     /// Most new splats in one refinement, as a share of those there.
     pub at_most: f32,

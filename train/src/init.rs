@@ -34,7 +34,7 @@ pub fn from_points(points: &SparsePoints, sh_degree: u8, opacity: f32, bounds: [
 /// Splats of a backdrop; 6° apart.
 const BACKDROP: usize = 1024;
 
-/// A sphere of opaque splats around everything, coloured by what the views show in each direction: the sky, and whatever
+/// A sphere of opaque splats around everything, wherever a view looks, coloured by what the views show in each direction: the sky, and whatever
 /// else no point was found on. It gives every ray something to end in, so that near splats are not stretched to fill
 /// the distance. `centre` and `radius_metres` should enclose cameras and points with room to spare.
 ///

@@ -104,3 +104,58 @@ impl Need {
         })
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use glam::DVec3;
+    use scene::{Camera, Pinhole, Pixels, Rect, Rigid};
+
+    use super::*;
+
+    /// A photo whose columns alternate between two greys at mip 0, which mip 1 shows as their mean.
+    struct Stripes;
+
+    impl WindowSource for Stripes {
+        fn window(&self, _: u32, mip: u8, rect: Rect) -> Result<Arc<Pixels>, String> {
+            let grey = |x: u32| if mip > 0 { 100 } else { 80 + 40 * ((rect.x + x) % 2) as u8 };
+            let row: Vec<u8> = (0..rect.width).map(grey).collect();
+            let rgb = row.repeat(3 * rect.height as usize);
+            Ok(Arc::new(Pixels { width: rect.width, height: rect.height, rgb, mask: None }))
+        }
+    }
+
+    #[test]
+    fn detail_is_what_the_coarser_mip_does_not_show() {
+        let pinhole = Pinhole { width: 64, height: 48, fx: 50.0, fy: 50.0, cx: 32.0, cy: 24.0 };
+        let camera = Camera { pinhole, camera_from_world: Rigid { translation: DVec3::ZERO, ..Rigid::IDENTITY } };
+        let rect = Rect { x: 7, y: 3, width: 40, height: 30 };
+        let view = TrainView { view: 0, mip: 0, rect, camera };
+        let found = detail(&[view; 40], &Stripes, 1).unwrap();
+        assert!((found - 20.0 / 255.0).abs() < 1e-9, "{found}");
+        assert_eq!(detail(&[view], &Stripes, 2), Ok(0.0));
+        // A window without a coarser one has nothing to wait for.
+        let small = TrainView { rect: Rect { width: 9, height: 9, ..rect }, ..view };
+        assert_eq!(detail(&[small], &Stripes, 1), Ok(f64::INFINITY));
+    }
+
+    #[test]
+    fn growth_is_judged_by_whole_epochs_of_one_stage() {
+        let mut need = Need::default();
+        let epoch = |need: &mut Need, error: f64, splats: usize| -> Option<f64> {
+            (0..4).filter_map(|i| need.note(Some(error), splats, 4, i == 3)).last()
+        };
+        assert_eq!(epoch(&mut need, 0.1, 1000), Some(0.1));
+        assert_eq!(epoch(&mut need, 0.0999, 1100), Some(0.0999));
+        assert!(!need.gains_less_than(0.02), "a tenth more is too little to tell");
+        // +30 % are 5.4 times five percent: 0.11 dB at least.
+        assert!(epoch(&mut need, 0.0995, 1300).is_some() && need.gains_less_than(0.02));
+        assert!(epoch(&mut need, 0.098, 1300).is_some() && !need.gains_less_than(0.02));
+        need.look_closer(40);
+        assert_eq!((need.stage, need.since), (1, 40));
+        assert!(epoch(&mut need, 0.2, 2000).is_some() && !need.gains_less_than(0.02));
+        // A step that was left out makes an epoch that says nothing.
+        assert_eq!((need.note(None, 9, 4, false), need.note(Some(1.0), 9, 4, true)), (None, None));
+    }
+}

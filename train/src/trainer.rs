@@ -96,6 +96,14 @@ impl Recipe {
             ..recipe
         }
     }
+
+    /// The same by the clock alone, whatever training says: the baseline that following the need is measured against.
+    /// Blocks that start from points begin at coarse mips, others do not.
+    #[must_use]
+    pub fn unmeasured(self, from_points: bool) -> Self {
+        let coarse = if from_points { vec![0.15, 0.3] } else { Vec::new() };
+        Self { coarse, closer_at: 0.0, growth: Growth { worth_db: 0.0, ..self.growth }, ..self }
+    }
 }
 
 /// A window of a view that a block trains on.
@@ -302,7 +310,8 @@ pub fn train_on(
                 now.need.look_closer(now.step);
             }
         }
-        if error.is_some() && now.step < until && now.need.gains_less_than(f64::from(growth.worth_db)) {
+        let worth_db = f64::from(growth.worth_db);
+        if worth_db > 0.0 && error.is_some() && now.step < until && now.need.gains_less_than(worth_db) {
             now.step = until;
         }
         let last_refinement = until + growth.every;

@@ -427,7 +427,8 @@ impl Block<'_> {
 
     /// The recipe of the block's level: a child starts from splats that fit already, one mip coarser.
     fn recipe(&self) -> Recipe {
-        if self.task.parent.is_some() { Recipe::refinement() } else { Recipe::default() }
+        let recipe = if self.task.parent.is_some() { Recipe::refinement() } else { Recipe::default() };
+        if self.plan.settings.residual > 0.0 { recipe } else { recipe.unmeasured(self.task.parent.is_none()) }
     }
 
     fn seed(&self) -> u64 {

@@ -74,6 +74,7 @@ pub(crate) fn adaptive(args: &AdaptiveArgs, output: &Output) -> Result<(), Failu
         let out = args.out.join("eval").join(label.replace(' ', "_"));
         let mut record = trained.report.record.clone();
         let evaluated = evaluate(&trained.model, trained.capture, store, every, None, &out, output)?;
+        save_json(&out.join("report.json"), &evaluated)?;
         record.scene = "half a bare plain".into();
         record.measured(&evaluated.record);
         let settled = format!(

@@ -1,0 +1,50 @@
+//! A tree as deep as the scene needs: a bare plain stays at its parent's resolution beside the houses that are refined.
+
+mod common;
+
+use blocks::Plan;
+use common::json_of;
+use dataset::synth::{CitySettings, write_city};
+use scene::{BlockId, Splats, frame};
+
+#[test]
+fn a_plain_stays_coarse_beside_houses() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    let city = CitySettings { seed: 3, extent_metres: 100.0, views: 48, width: 96, height: 64, plain: 0.5 };
+    write_city(&at.join("city"), &city, |_, _| {}).unwrap();
+    let train = |out: &str, words: &[&str]| {
+        let job =
+            ["train", "city", "--steps", "900", "--budget", "4000", "--levels", "2", "--tolerance-db", "0", "--out"];
+        json_of(&mut common::command(at, &[&job, &[out][..], words].concat()))
+    };
+    let adaptive = train("adaptive", &["--threads", "2"]);
+    let fixed = train("fixed", &["--residual", "0"]);
+    let bytes = |path: &str| std::fs::read(at.join(path)).unwrap();
+    let plan = Plan::from_frame(&bytes("adaptive/model/plan.plat")).unwrap();
+    assert_eq!(plan.levels, 2);
+    let result = |out: &str, BlockId { level, x, y }: BlockId| -> Splats {
+        frame::decode_splats(&bytes(&format!("{out}/model/blocks/{level}-{x}-{y}.plat"))).unwrap()
+    };
+    // A settled block has the splats that its parent had there: nothing was added.
+    let owned = |splats: &Splats, block: BlockId| {
+        (0..splats.len()).filter(|&i| plan.ground.owns(block, splats.mean(i).as_dvec3())).count()
+    };
+    let (mut settled, mut refined) = (Vec::new(), Vec::new());
+    for task in plan.tasks.iter().filter(|task| task.block.level == 2) {
+        let of_parent = owned(&result("adaptive", task.parent.unwrap()), task.block);
+        let grown = owned(&result("adaptive", task.block), task.block) > of_parent;
+        let west = plan.ground.core(task.block).centre().x < -10.0;
+        if grown { refined.push(west) } else { settled.push(west) }
+    }
+    assert!(settled.len() >= 2 && settled.iter().all(|west| *west), "settled {settled:?}, refined {refined:?}");
+    assert!(refined.iter().filter(|west| !*west).count() >= 6, "settled {settled:?}, refined {refined:?}");
+    let number = |of: &serde_json::Value, key: &str| of[key].as_f64().unwrap();
+    assert!(number(&adaptive, "settled") >= settled.len() as f64 && number(&fixed, "settled") == 0.0);
+    assert!(number(&adaptive, "splats") < 0.9 * number(&fixed, "splats"), "{adaptive} {fixed}");
+
+    // Whatever is settled and whenever the schedule looks closer: the same bytes, and a plain that is as good.
+    train("again", &["--threads", "1"]);
+    assert!(bytes("adaptive/merged.ply") == bytes("again/merged.ply"));
+    assert!(number(&adaptive, "psnr") > number(&fixed, "psnr") - 0.5, "{adaptive} {fixed}");
+}
