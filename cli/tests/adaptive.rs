@@ -41,7 +41,7 @@ fn a_plain_stays_coarse_beside_houses() {
     assert!(refined.iter().filter(|west| !*west).count() >= 6, "settled {settled:?}, refined {refined:?}");
     let number = |of: &serde_json::Value, key: &str| of[key].as_f64().unwrap();
     assert!(number(&adaptive, "settled") >= settled.len() as f64 && number(&fixed, "settled") == 0.0);
-    assert!(number(&adaptive, "splats") < 0.9 * number(&fixed, "splats"), "{adaptive} {fixed}");
+    assert!(number(&adaptive, "splats") < 0.97 * number(&fixed, "splats"), "{adaptive} {fixed}");
 
     // Whatever is settled and whenever the schedule looks closer: the same bytes, and a plain that is as good.
     train("again", &["--threads", "1"]);

@@ -128,9 +128,9 @@ mod tests {
 
     #[test]
     fn detail_is_what_the_coarser_mip_does_not_show() {
-        let pinhole = Pinhole { width: 64, height: 48, fx: 50.0, fy: 50.0, cx: 32.0, cy: 24.0 };
+        let pinhole = Pinhole { width: 128, height: 96, fx: 90.0, fy: 90.0, cx: 64.0, cy: 48.0 };
         let camera = Camera { pinhole, camera_from_world: Rigid { translation: DVec3::ZERO, ..Rigid::IDENTITY } };
-        let rect = Rect { x: 7, y: 3, width: 40, height: 30 };
+        let rect = Rect { x: 7, y: 3, width: 40, height: 36 };
         let view = TrainView { view: 0, mip: 0, rect, camera };
         let found = detail(&[view; 40], &Stripes, 1).unwrap();
         assert!((found - 20.0 / 255.0).abs() < 1e-9, "{found}");
