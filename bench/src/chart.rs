@@ -11,7 +11,7 @@ const LEFT: f64 = 56.0;
 const RIGHT: f64 = 18.0;
 const TOP: f64 = 40.0;
 const BOTTOM: f64 = 48.0;
-const HEADER: f64 = 40.0;
+const HEADER: f64 = 50.0;
 /// Colours of runs, told apart by most kinds of sight (Okabe and Ito 2008), as light and dark themes show them.
 const COLOURS: [(&str, &str); 6] = [
     ("#0072b2", "#56b4e9"),
@@ -35,8 +35,9 @@ pub fn chart(lines: &[ResultLine], reference: &[ResultLine]) -> String {
         }
     }
     let columns = scenes.len().clamp(1, 2);
-    let (width, height) =
-        (PANEL_WIDTH * columns as f64 + 16.0, HEADER + PANEL_HEIGHT * scenes.len().div_ceil(columns) as f64 + 8.0);
+    let width = PANEL_WIDTH * columns as f64 + 16.0;
+    let (names, header) = legend(&labels, &references, width - 26.0);
+    let height = header + PANEL_HEIGHT * scenes.len().div_ceil(columns) as f64 + 8.0;
     let mut svg = String::new();
     let mut out = |text: String| svg.push_str(&text);
     out(format!(
@@ -50,7 +51,7 @@ pub fn chart(lines: &[ResultLine], reference: &[ResultLine]) -> String {
         height - 1.0
     ));
     out("<text class=\"title\" x=\"20\" y=\"28\">Held-out PSNR over CPU time</text>\n".to_string());
-    out(legend(&labels, &references, width - 26.0));
+    out(names);
     for (i, scene) in scenes.iter().enumerate() {
         let of_scene = |lines: &[&ResultLine]| -> Vec<Series> {
             let wanted = lines.iter().filter(|line| line.scene == *scene);
@@ -58,7 +59,7 @@ pub fn chart(lines: &[ResultLine], reference: &[ResultLine]) -> String {
         };
         let mut series: Vec<Series> = of_scene(&references).into_iter().map(Series::dashed).collect();
         series.extend(of_scene(&runs));
-        let (x, y) = (8.0 + PANEL_WIDTH * (i % columns) as f64, HEADER + PANEL_HEIGHT * (i / columns) as f64);
+        let (x, y) = (8.0 + PANEL_WIDTH * (i % columns) as f64, header + PANEL_HEIGHT * (i / columns) as f64);
         out(format!("<g transform=\"translate({x} {y})\">\n{}</g>\n", panel(scene, &series)));
     }
     out("</svg>\n".to_string());
@@ -128,7 +129,9 @@ impl Axes {
     fn ticks(&self) -> Vec<f64> {
         let factors: &[f64] = if self.x.1 - self.x.0 > 2.5 { &[1.0, 3.0] } else { &[1.0, 2.0, 5.0] };
         let decades = self.x.0.floor() as i32..=self.x.1.ceil() as i32;
-        let ticks = decades.flat_map(|d| factors.iter().map(move |f| f * 10f64.powi(d)));
+        // Divided, as 3 / 10 is 0.3 and 3 * 0.1 is not.
+        let at = |f: f64, d: i32| if d < 0 { f / 10f64.powi(-d) } else { f * 10f64.powi(d) };
+        let ticks = decades.flat_map(|d| factors.iter().map(move |&f| at(f, d)));
         ticks.filter(|t| (self.x.0..=self.x.1).contains(&t.log10())).collect()
     }
 }
@@ -216,9 +219,11 @@ fn curve(svg: &mut String, axes: &Axes, series: &Series, values: &mut Vec<(f64, 
     }
 }
 
-/// Every run's name once, with a sample of its line, right-aligned in the header; the references come last.
-fn legend(runs: &[&str], references: &[&ResultLine], right: f64) -> String {
-    const LETTER: f64 = 7.0;
+/// Every run's name once, with a sample of its line, in rows under the title; the references come last. And where the panels
+/// begin.
+fn legend(runs: &[&str], references: &[&ResultLine], right: f64) -> (String, f64) {
+    const LETTER: f64 = 6.6;
+    const ROW: f64 = 18.0;
     let mut names: Vec<(&str, String)> =
         runs.iter().enumerate().map(|(i, label)| (*label, format!("c{}", i % COLOURS.len()))).collect();
     for line in references {
@@ -227,15 +232,17 @@ fn legend(runs: &[&str], references: &[&ResultLine], right: f64) -> String {
         }
     }
     let mut svg = String::new();
-    let mut x = right;
-    for (name, class) in names.iter().rev() {
-        x -= LETTER * name.chars().count() as f64;
-        let _ = writeln!(svg, "<text class=\"label\" x=\"{x:.1}\" y=\"28\">{}</text>", escape(name));
-        let (from, to) = (x - 32.0, x - 6.0);
-        let _ = writeln!(svg, "<path class=\"line {class}\" d=\"M{from:.1} 24H{to:.1}\"/>");
-        x = from - 14.0;
+    let (mut x, mut y) = (20.0, HEADER);
+    for (name, class) in &names {
+        let length = 32.0 + LETTER * name.chars().count() as f64;
+        if x + length > right && x > 20.0 {
+            (x, y) = (20.0, y + ROW);
+        }
+        let _ = writeln!(svg, "<path class=\"line {class}\" d=\"M{x:.1} {:.1}h26\"/>", y - 4.0);
+        let _ = writeln!(svg, "<text class=\"label\" x=\"{:.1}\" y=\"{y}\">{}</text>", x + 32.0, escape(name));
+        x += length + 20.0;
     }
-    svg
+    (svg, y + 10.0)
 }
 
 fn style() -> String {
@@ -305,5 +312,8 @@ mod tests {
         assert!(axes.px(1.0) >= LEFT && axes.py(28.0) >= TOP);
         let middle = 0.5 * (axes.px(1.0) + axes.px(100.0));
         assert!((axes.px(10.0) - middle).abs() < 1e-9, "the axis is logarithmic");
+        let wide = line("plat", "fox", &[(0.2, 15.0), (1000.0, 28.0)]);
+        let ticks = Axes::around(&[Series::new(&wide, None)]).ticks();
+        assert!(ticks.iter().all(|tick| tick.to_string().len() <= 4), "{ticks:?}");
     }
 }
