@@ -12,8 +12,8 @@ const CAPTURE: Kind = Kind(*b"capt", 1);
 
 fuzz_target!(|bytes: &[u8]| {
     let _ = frame::decode::<frame::SplatsHeader>(SPLATS, bytes);
-    // The header of splats takes three bytes or a few more, with the name of exposures 66 more.
-    for header in 0..bytes.len().min(80) {
+    // The header of splats takes three bytes or a few more, with the name of exposures 66 more, with a residual eight.
+    for header in 0..bytes.len().min(96) {
         let _ = frame::decode_splats(&sealed(SPLATS, bytes, header));
     }
     let _ = Exposures::from_frame(bytes);
