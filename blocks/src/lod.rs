@@ -134,21 +134,12 @@ pub fn finished_neighbours(block: BlockId, of_level: &BTreeSet<BlockId>) -> impl
 
 #[cfg(test)]
 mod tests {
-    use glam::{DQuat, DVec2, Vec3};
+    use glam::Vec3;
     use proptest::prelude::*;
     use scene::Splat;
 
     use super::*;
-
-    fn ground() -> Ground {
-        Ground {
-            ground_from_world: DQuat::IDENTITY,
-            min: DVec2::ZERO,
-            edge_metres: 64.0,
-            height_metres: 0.0,
-            near_metres: 1e300,
-        }
-    }
+    use crate::testing::ground;
 
     fn all(levels: u8) -> BTreeSet<BlockId> {
         let mut blocks = BTreeSet::from([BlockId::ROOT]);

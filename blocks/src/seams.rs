@@ -141,20 +141,10 @@ fn squares(cut: &Cut) -> Vec<(BlockId, BlockId)> {
 
 #[cfg(test)]
 mod tests {
-    use glam::DQuat;
     use proptest::prelude::*;
 
     use super::*;
-
-    fn ground() -> Ground {
-        Ground {
-            ground_from_world: DQuat::IDENTITY,
-            min: DVec2::ZERO,
-            edge_metres: 64.0,
-            height_metres: 0.0,
-            near_metres: 1e300,
-        }
-    }
+    use crate::testing::ground;
 
     fn block(level: u8, x: u32, y: u32) -> BlockId {
         BlockId { level, x, y }

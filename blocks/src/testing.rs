@@ -1,7 +1,20 @@
 //! Captures for the tests of this crate, made without randomness.
 
-use glam::{DMat3, DQuat, DVec3};
+use glam::{DMat3, DQuat, DVec2, DVec3};
 use scene::{Camera, Capture, Pinhole, Rigid, SparsePoints, View};
+
+use crate::ground::Ground;
+
+/// A root of 64 m with its corner at the origin, and nothing far.
+pub(crate) fn ground() -> Ground {
+    Ground {
+        ground_from_world: DQuat::IDENTITY,
+        min: DVec2::ZERO,
+        edge_metres: 64.0,
+        height_metres: 0.0,
+        near_metres: 1e300,
+    }
+}
 
 /// Counter-based numbers in [0, 1).
 pub(crate) fn noise(counter: u64) -> f64 {
