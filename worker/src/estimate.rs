@@ -10,7 +10,9 @@ use std::collections::BTreeSet;
 use blocks::{Plan, PlanSettings, Task};
 use scene::BlockId;
 use serde::Serialize;
-use train::{Recipe, prune};
+use train::prune;
+
+use crate::execute::recipe_of;
 
 /// CPU seconds of a pixel in a step.
 const PER_PIXEL: f64 = 0.092e-6;
@@ -66,7 +68,7 @@ pub(crate) fn parents(plan: &Plan) -> BTreeSet<BlockId> {
 /// What a task will take on the CPU backend, CPU seconds.
 pub(crate) fn cpu_seconds(settings: &PlanSettings, task: &Task, leaf: bool) -> f64 {
     let pixels = task.window_pixels() as f64 / task.views.len().max(1) as f64;
-    let recipe = if task.parent.is_some() { Recipe::refinement() } else { Recipe::default() };
+    let recipe = recipe_of(settings, task);
     let first = match task.parent {
         Some(_) => INHERITED,
         None => (f64::from(task.points) / f64::from(task.budget.max(1))).clamp(0.01, 1.0),

@@ -10,7 +10,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
 
-use blocks::{Mode, Plan, Task, ViewUse};
+use blocks::{Mode, Plan, PlanSettings, Task, ViewUse};
 use dataset::windows::WindowReader;
 use glam::Vec3;
 use rayon::prelude::*;
@@ -209,7 +209,7 @@ impl Block<'_> {
         let Self { plan, task, .. } = *self;
         let Shared { finished, cap, .. } = &*self.trainer.shared;
         let eval_every = self.trainer.options.eval_every;
-        let recipe = self.recipe();
+        let recipe = recipe_of(&plan.settings, task);
         let wrong = |error| match error {
             TrainError::NoViews | TrainError::Empty(_) => {
                 ExecuteError { message: format!("block {}: {error}", task.block), is_input: true }
@@ -425,12 +425,6 @@ impl Block<'_> {
         Ok(found.is_some_and(|found| found <= plan.settings.residual * all))
     }
 
-    /// The recipe of the block's level: a child starts from splats that fit already, one mip coarser.
-    fn recipe(&self) -> Recipe {
-        let recipe = if self.task.parent.is_some() { Recipe::refinement() } else { Recipe::default() };
-        if self.plan.settings.residual > 0.0 { recipe } else { recipe.unmeasured(self.task.parent.is_none()) }
-    }
-
     fn seed(&self) -> u64 {
         let BlockId { level, x, y } = self.task.block;
         let place = u64::from(level) << 58 | u64::from(x) << 29 | u64::from(y);
@@ -524,6 +518,13 @@ impl Block<'_> {
         let far = distances.get(distances.len() * 98 / 100).copied().unwrap_or(1.0);
         (centre, 5.0 * far.max(self.plan.ground.edge_metres * 0.5))
     }
+}
+
+/// The recipe of a block's level: a child starts from splats that fit already, one mip coarser.
+pub(crate) fn recipe_of(settings: &PlanSettings, task: &Task) -> Recipe {
+    let from_points = task.parent.is_none();
+    let recipe = if from_points { Recipe::default() } else { Recipe::refinement() };
+    if settings.residual > 0.0 { recipe } else { recipe.unmeasured(from_points) }
 }
 
 /// Does a point project into the window, grown by `margin` of its size on every side?
