@@ -16,6 +16,8 @@ pub enum PartLine {
     Ingest(Ingest),
     /// A model with fewer splats.
     Prune(Prune),
+    /// A tree's levels, and its faces between blocks.
+    Tree(Tree),
 }
 
 /// How long the renderer's passes take: medians.
@@ -109,6 +111,61 @@ pub struct Prune {
     pub command: String,
 }
 
+/// What the levels of a tree lose, and what shows of the faces between its blocks. Figures are means over the held-out views.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Tree {
+    /// The program's git commit.
+    pub commit: String,
+    /// See [`crate::machine`].
+    pub machine: String,
+    /// The capture's name.
+    pub scene: String,
+    /// Photos were used at one over this of their size.
+    pub downscale: u32,
+    /// Splats of the finest model.
+    pub splats: u64,
+    /// The cuts of the tree, coarsest first.
+    pub levels: Vec<TreeLevel>,
+    /// The faces; null where the finest model is one block.
+    pub faces: Option<TreeFaces>,
+    /// The command that made the line.
+    pub command: String,
+}
+
+/// A cut of a tree at one level, and at its viewing distance: where its pixels are as large as the picture's.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct TreeLevel {
+    /// Its level.
+    pub level: u8,
+    /// Splats in it.
+    pub splats: f64,
+    /// PSNR at full size, dB.
+    pub psnr: Option<f64>,
+    /// The viewing distance, as a mip of the photos.
+    pub away_mip: f64,
+    /// PSNR there, dB: the cut's, the finest model's, and that of the finest model's most important splats, as many.
+    pub away_psnr: [Option<f64>; 3],
+}
+
+/// The faces between the blocks of a finest model.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct TreeFaces {
+    /// What counts as near a face, metres.
+    pub seam_metres: f64,
+    /// Share of pixels near a face.
+    pub seam_share: f64,
+    /// PSNR near faces and elsewhere in the same views, dB.
+    pub psnr: [Option<f64>; 2],
+    /// SSIM likewise.
+    pub ssim: [Option<f64>; 2],
+    /// ꟻLIP likewise.
+    pub flip: [Option<f64>; 2],
+    /// Step of the mean error across a face, mean over faces, levels of 255.
+    pub step: Option<f64>,
+    /// PSNR at the same places of a model of the same capture that has no faces there, dB.
+    pub without_psnr: Option<[Option<f64>; 2]>,
+}
+
 impl PartLine {
     fn is_finite(&self) -> bool {
         match self {
@@ -121,6 +178,14 @@ impl PartLine {
                 .chain([&line.cpu_seconds])
                 .chain(line.keep.iter().chain(&line.tolerance_db))
                 .all(|value| value.is_finite()),
+            Self::Tree(line) => {
+                let of_levels = line.levels.iter().flat_map(|level| level.away_psnr.into_iter().chain([level.psnr]));
+                let of_faces = line.faces.iter().flat_map(|faces| {
+                    let without = faces.without_psnr.into_iter().flatten();
+                    without.chain(faces.psnr).chain(faces.ssim).chain(faces.flip).chain([faces.step])
+                });
+                of_levels.chain(of_faces).flatten().all(f64::is_finite)
+            }
             Self::Ingest(line) => line.wall_seconds.is_finite() && line.cpu_seconds.is_finite(),
         }
     }

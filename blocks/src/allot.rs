@@ -8,13 +8,16 @@ use scene::{BlockId, Camera, Capture};
 use crate::ground::{Ground, HALO_SCALE};
 use crate::plan::{PlanSettings, Task};
 use crate::select::Sightings;
+use crate::shown::Shown;
 
 /// Splats of a block, against those of its children.
 const INNER_BUDGET_RATIO: f64 = 1.0 / 2.5;
 /// Splats that a task gets at least, where the whole budget allows it.
 const MIN_BUDGET: u32 = 500;
-/// Work of all blocks of a height, against the height below it: leaves get 90 % of a deep tree.
-const INNER_WORK_RATIO: f64 = 0.1;
+/// What a height sees again counts this much of what it is the first to see.
+const SEEN_AGAIN: f64 = 0.05;
+/// What is seen above the leaves counts this many times: all below it starts from there.
+const INNER_COUNTS: f64 = 2.0;
 /// A block that keeps this share of its own need, because too few of its children have a task, is worked on as a leaf.
 const KEEPS_MUCH: f64 = 0.25;
 /// A step costs its pixels and, for the projection and the optimiser, this many pixels for each splat.
@@ -98,10 +101,16 @@ fn standings(tasks: &[Task], needs: &Needs) -> Vec<Standing> {
 }
 
 /// Shares out splats and steps. `mean_pixels`: of a full training image.
-pub(crate) fn set_means(tasks: &mut [Task], needs: &Needs, settings: &PlanSettings, mean_pixels: f64) {
+pub(crate) fn set_means(
+    tasks: &mut [Task],
+    needs: &Needs,
+    capture: &Capture,
+    settings: &PlanSettings,
+    mean_pixels: f64,
+) {
     let standings = standings(tasks, needs);
     set_budgets(tasks, &standings, settings);
-    set_steps(tasks, &standings, settings, mean_pixels);
+    set_steps(tasks, &standings, capture, settings, mean_pixels);
 }
 
 /// Splits `settings.budget` so that the merged model has that many splats, where there is most to model.
@@ -142,9 +151,9 @@ fn split(pool: f64, shares: &[f64], minimum: u32) -> Vec<u32> {
         .collect()
 }
 
-/// Shares out the work of `settings.steps` full images of the whole scene: over heights by [`INNER_WORK_RATIO`], within a
-/// height so that every window is seen equally often.
-fn set_steps(tasks: &mut [Task], standings: &[Standing], settings: &PlanSettings, mean_pixels: f64) {
+/// Shares out the work of `settings.steps` full images of the whole scene: over heights by what they are the first to see,
+/// within a height so that every window is seen equally often.
+fn set_steps(tasks: &mut [Task], standings: &[Standing], capture: &Capture, settings: &PlanSettings, mean_pixels: f64) {
     if let [task] = tasks
         && task.views.iter().all(|v| v.mip == 0)
     {
@@ -152,21 +161,38 @@ fn set_steps(tasks: &mut [Task], standings: &[Standing], settings: &PlanSettings
         return;
     }
     let work = f64::from(settings.steps) * (mean_pixels + PIXELS_PER_SPLAT * f64::from(settings.budget));
-    let heights: BTreeSet<u8> = standings.iter().map(|s| s.height).collect();
-    let weight = |height: u8| INNER_WORK_RATIO.powi(i32::from(height));
-    let weights: f64 = heights.iter().map(|&height| weight(height)).sum();
-    for &height in &heights {
+    let shown = first_shown(tasks, standings, capture);
+    let all: f64 = shown.values().sum();
+    for (height, shown) in shown {
         let rows: Vec<usize> = (0..tasks.len()).filter(|&i| standings[i].height == height).collect();
         // One visit to every window of the height.
         let visit: f64 = (rows.iter().map(|&i| &tasks[i]))
             .map(|t| t.window_pixels() as f64 + PIXELS_PER_SPLAT * f64::from(t.budget) * t.views.len() as f64)
             .sum();
-        let visits = work * weight(height) / weights / visit.max(1.0);
+        let visits = work * shown / all.max(1.0) / visit.max(1.0);
         for task in rows {
             let task = &mut tasks[task];
             task.steps = ((visits * task.views.len() as f64).round() as u32).max(MIN_STEPS.min(settings.steps));
         }
     }
+}
+
+/// Pixels that the windows of each height are the first to show, from the root downwards, weighted; what they show again
+/// counts [`SEEN_AGAIN`]. From the air every level shows four times the pixels of the one above, and leaves get three fifths of
+/// the work; what stands along a road is mostly seen from so far that the root shows it as finely as any leaf.
+fn first_shown(tasks: &[Task], standings: &[Standing], capture: &Capture) -> BTreeMap<u8, f64> {
+    let mut heights: BTreeMap<u8, Shown> = BTreeMap::new();
+    for (task, standing) in tasks.iter().zip(standings) {
+        heights.entry(standing.height).or_default().add(&task.views, capture);
+    }
+    let mut before = Shown::default();
+    let mut first = BTreeMap::new();
+    for (height, shown) in heights.into_iter().rev() {
+        let counts = if height > 0 { INNER_COUNTS } else { 1.0 };
+        first.insert(height, counts * shown.first(&before, SEEN_AGAIN));
+        before = shown.or(before);
+    }
+    first
 }
 
 /// Points and windows of a task that [`set_drawn`] looks at, at most.

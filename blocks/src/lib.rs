@@ -18,6 +18,7 @@ pub mod plan;
 pub mod planner;
 pub mod seams;
 pub mod select;
+mod shown;
 #[cfg(test)]
 mod testing;
 pub mod view_cut;

@@ -9,6 +9,7 @@ use crate::ground::{Ground, quantile};
 use crate::lod::{context_of, finished_neighbours, training_order};
 use crate::plan::{MAX_LEVELS, Mode, Plan, PlanError, PlanSettings, Task, VERSION};
 use crate::select::{Selection, Sightings, full_views, select_level, usable};
+use crate::shown::Shown;
 
 /// The finest resolution: this quantile of depth / focal over all sightings. The median would send half of the views
 /// of a street to their second mip.
@@ -21,6 +22,13 @@ const MEAN_VIEWS: usize = 24;
 const MEAN_POINTS: usize = 500;
 /// ... and together this share of all of them.
 const MIN_COVERED: f64 = 0.9;
+/// Leaves that could do with fewer levels are not for less than this share of pixels that nobody saw before: where every view
+/// looks at all of them, as along a road, they cost several times what they are worth ...
+const MIN_FIRST_SEEN: f64 = 1.0 / 3.0;
+/// ... unless there is too much for one block, of splats ...
+const BLOCK_SPLATS: u64 = 200_000;
+/// ... or of pixels.
+const BLOCK_PIXELS: u64 = 500_000_000;
 /// A leaf is split once more where it holds this many times the points of the median leaf ...
 const CROWDED: f64 = 4.0;
 /// ... at most so often.
@@ -64,7 +72,7 @@ pub fn plan(
     let levels = match (settings.mode, settings.levels) {
         (Mode::Whole, _) => 0,
         (_, Some(levels)) => levels,
-        (_, None) => survey.choose_levels(finest_metres),
+        (_, None) => survey.choose_levels(finest_metres, settings.budget),
     };
     let (base, mut tasks) = survey.lay_out(settings.mode, levels, finest_metres)?;
     if settings.mode == Mode::Tree && settings.levels.is_none() {
@@ -76,7 +84,7 @@ pub fn plan(
     let train_views = usable_views.iter().filter(|&&v| !test(v));
     let pixels: Vec<f64> = train_views.map(|&v| capture.views[v].camera.full().area() as f64).collect();
     let mean_pixels = pixels.iter().sum::<f64>() / pixels.len() as f64;
-    set_means(&mut tasks, &needs, settings, mean_pixels);
+    set_means(&mut tasks, &needs, capture, settings, mean_pixels);
     set_drawn(&mut tasks, capture, &ground);
     set_memory(&mut tasks, settings);
     Ok(Plan {
@@ -165,8 +173,8 @@ impl Survey<'_> {
         }
     }
 
-    /// The deepest level that resolution allows and whose blocks have enough views and points.
-    fn choose_levels(&self, finest_metres: f64) -> u8 {
+    /// The deepest level that resolution allows, whose blocks have enough views and points, and that is worth its work.
+    fn choose_levels(&self, finest_metres: f64, budget: u32) -> u8 {
         let points = self.capture.points.len();
         let by_resolution = (self.ground.edge_metres / (LEAF_EDGE_PIXELS * finest_metres)).log2().floor();
         let deepest = (by_resolution.max(0.0) as u8).min(MAX_LEVELS);
@@ -179,8 +187,24 @@ impl Survey<'_> {
                 covered as f64 >= MIN_COVERED * points as f64
                     && views >= MEAN_VIEWS * tasks.len()
                     && covered >= MEAN_POINTS * tasks.len()
+                    && self.is_worth_it(level, &tasks, finest_metres, budget)
             })
             .unwrap_or(0)
+    }
+
+    /// Do these leaves see enough that their parents would not, or is it too much for the parents alone?
+    fn is_worth_it(&self, level: u8, leaves: &BTreeMap<BlockId, Selection>, finest_metres: f64, budget: u32) -> bool {
+        let parents = self.tasks_of(level - 1, 2.0 * finest_metres);
+        let [shown, before] = [leaves, &parents].map(|selections| {
+            let mut shown = Shown::default();
+            selections.values().for_each(|s| shown.add(&s.views, self.capture));
+            shown
+        });
+        let blocks = parents.len().max(1) as u64;
+        let pixels: u64 = self.capture.views.iter().map(|view| view.camera.full().area()).sum();
+        shown.first(&before, 0.0) >= MIN_FIRST_SEEN * shown.in_windows() as f64
+            || u64::from(budget) > BLOCK_SPLATS * blocks
+            || pixels > BLOCK_PIXELS * blocks
     }
 
     /// The tasks, without budgets and steps, and the depth they really reach: a tree that asks for more levels than
@@ -297,6 +321,32 @@ mod tests {
         assert_eq!(plan_of(&aerial(12, 300.0, 1000), Mode::Tree, None).levels, 0, "too few points");
         assert_eq!(plan_of(&aerial(4, 300.0, 20_000), Mode::Tree, None).levels, 0, "too few views");
         assert_eq!(plan_of(&aerial(8, 60.0, 20_000), Mode::Tree, None).levels, 0, "too small");
+    }
+
+    #[test]
+    fn levels_are_worth_their_work_or_needed() {
+        // Views along a street look at all of what lies ahead.
+        let capture = street(120, 20_000);
+        let levels = |budget: u32| {
+            let settings = PlanSettings { budget, ..settings(Mode::Tree, None) };
+            plan(&capture, ArtefactId::of(b"capture"), &settings, "cpu").unwrap().levels
+        };
+        assert_eq!([50_000, 2_000_000].map(levels), [0, 1]);
+    }
+
+    /// The root of a scene seen from the air looks as often at its coarse photos as one block would at the fine ones.
+    #[test]
+    fn heights_get_work_for_what_they_are_the_first_to_see() {
+        let capture = aerial(12, 300.0, 20_000);
+        let plan = plan_of(&capture, Mode::Tree, Some(2));
+        let visits = |level: u8| {
+            let of_level = plan.tasks.iter().filter(|t| t.block.level == level);
+            let (steps, views) = of_level.fold((0, 0), |(s, v), t| (s + t.steps, v + t.views.len()));
+            f64::from(steps) / views as f64
+        };
+        let whole = 4000.0 / plan.tasks[0].views.len() as f64;
+        let ratios = [0, 1, 2].map(|level| visits(level) / whole);
+        assert!(ratios[0] > 0.7 && ratios[0] > ratios[1] && ratios[1] > ratios[2] && ratios[2] > 0.2, "{ratios:?}");
     }
 
     #[test]

@@ -65,6 +65,8 @@ pub(crate) enum BenchCommand {
     Ingest(IngestArgs),
     /// Compare the orders to prune a model by, and append the figures to the results
     Prune(BenchPruneArgs),
+    /// Measure a tree level by level and at the faces between its blocks, and append the figures to the results
+    Tree(BenchTreeArgs),
     /// Build the demo, and append what it took and how good it is to the results
     Demo(BenchDemoArgs),
     /// Train a city whose one half is a bare plain, as a tree of one depth and as one that follows the need; keep both
@@ -550,6 +552,26 @@ pub(crate) struct BenchPruneArgs {
 
 fn healing(text: &str) -> Result<f32, String> {
     share(text).map(|share| share as f32)
+}
+
+#[derive(Debug, Clone, Args)]
+pub(crate) struct BenchTreeArgs {
+    /// Folder that `plat train` wrote
+    pub(crate) model: PathBuf,
+    /// Folder of the capture
+    pub(crate) capture: PathBuf,
+    /// Also measure this model at the tree's faces: one block trained on the same capture
+    #[arg(long, value_name = "MODEL")]
+    pub(crate) whole: Option<PathBuf>,
+    /// What the line calls the capture; by default the name of its folder
+    #[arg(long)]
+    pub(crate) scene: Option<String>,
+    /// As of plat eval
+    #[arg(long, value_name = "M", value_parser = metres)]
+    pub(crate) seam_metres: Option<f64>,
+    /// Folder of the result lines; this one goes to tree.jsonl there
+    #[arg(long, value_name = "DIR", default_value = "bench/results")]
+    pub(crate) results: PathBuf,
 }
 
 #[derive(Debug, Clone, Args)]

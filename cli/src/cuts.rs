@@ -60,7 +60,7 @@ pub(crate) struct Drawn {
 
 impl Drawn {
     /// The way with the highest PSNR, and its name.
-    fn best(&self) -> (&'static str, &Means) {
+    pub(crate) fn best(&self) -> (&'static str, &Means) {
         let ways = [("classic", &self.classic), ("thinned", &self.thinned), ("antialiased", &self.antialiased)];
         let psnr = |means: &Means| means.psnr.unwrap_or(f64::NEG_INFINITY);
         let [first, rest @ ..] = ways;

@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::Path;
 
-use ::bench::parts::Ingest;
+use ::bench::parts::{Ingest, Tree, TreeFaces, TreeLevel};
 use ::bench::{CurvePoint, PartLine, append, append_part, read_folder, replace_table, table};
 use dataset::synth::{CitySettings, write_city};
 use serde::Serialize;
@@ -11,21 +11,25 @@ use store::Store;
 use store::file::save;
 
 use crate::args::{
-    AdaptiveArgs, Auto, BenchDemoArgs, ChartArgs, DemoArgs, IngestArgs, ParetoArgs, PlanOptions, TrainArgs,
+    AdaptiveArgs, Auto, BenchDemoArgs, BenchTreeArgs, ChartArgs, DemoArgs, EvalArgs, IngestArgs, Level, ParetoArgs,
+    PlanOptions, TrainArgs,
 };
 use crate::cameras;
 use crate::clock::{self, Stopwatch};
 use crate::commands::demo;
 use crate::commands::eval::{self, evaluate};
 use crate::commands::train::{ingest_photos, make_folder, train};
+use crate::cuts::CutFigures;
 use crate::failure::Failure;
 use crate::lpips::Lpips;
-use crate::model::save_json;
+use crate::model::{self, save_json};
 use crate::output::Output;
 use crate::record::{Record, commit};
 
 /// The file of our own runs.
 const RUNS: &str = "plat.jsonl";
+/// The file of what trees lose.
+const TREES: &str = "tree.jsonl";
 /// The file of ingests alone.
 const INGESTS: &str = "ingest.jsonl";
 
@@ -142,6 +146,65 @@ pub(crate) fn ingest(args: &IngestArgs, output: &Output) -> Result<(), Failure> 
     let line = PartLine::Ingest(line);
     append_part(&file, &line)?;
     output.result(&line, &text)
+}
+
+/// Measures a tree's levels and faces, and appends a line.
+pub(crate) fn tree(args: &BenchTreeArgs, output: &Output) -> Result<(), Failure> {
+    let ask = |model: &Path| EvalArgs {
+        model: model.to_path_buf(),
+        capture: args.capture.clone(),
+        test_every: None,
+        downscale: None,
+        out: None,
+        store: None,
+        lpips: None,
+        level: None,
+        budget: None,
+        seams: false,
+        seams_of: None,
+        seam_metres: args.seam_metres,
+    };
+    let has_faces = model::read_tree(&args.model)?.plan.leaves().blocks().len() > 1;
+    let of_tree = eval::look(&EvalArgs { level: Some(Level::All), seams: has_faces, ..ask(&args.model) }, output)?;
+    let of_whole = match &args.whole {
+        Some(whole) if has_faces => {
+            Some(eval::look(&EvalArgs { seams_of: Some(args.model.clone()), ..ask(whole) }, output)?)
+        }
+        _ => None,
+    };
+    let without = of_whole.as_ref().and_then(|whole| whole.seams.as_ref()).map(|seams| seams.figures);
+    let faces = of_tree.seams.as_ref().map(|report| {
+        let figures = report.figures;
+        TreeFaces {
+            seam_metres: report.seam_metres,
+            seam_share: report.seam_share,
+            psnr: [figures.seam_psnr, figures.interior_psnr],
+            ssim: [figures.seam_ssim, figures.interior_ssim],
+            flip: [figures.seam_flip, figures.interior_flip],
+            step: eval::mean(report.faces.iter().map(|face| face.step)),
+            without_psnr: without.map(|figures| [figures.seam_psnr, figures.interior_psnr]),
+        }
+    });
+    let level = |cut: &CutFigures| {
+        let away = [&cut.away, &cut.away_finest, &cut.away_pruned].map(|drawn| drawn.best().1.psnr);
+        let level = cut.level?;
+        Some(TreeLevel { level, splats: cut.splats, psnr: cut.full.psnr, away_mip: cut.away_mip, away_psnr: away })
+    };
+    let line = PartLine::Tree(Tree {
+        commit: commit().to_owned(),
+        machine: ::bench::machine(),
+        scene: args.scene.clone().unwrap_or_else(|| of_tree.record.scene.clone()),
+        downscale: of_tree.record.downscale,
+        splats: of_tree.record.splats,
+        levels: of_tree.cuts.iter().filter_map(level).collect(),
+        faces,
+        command: invoked(),
+    });
+    make_folder(&args.results)?;
+    let file = args.results.join(TREES);
+    append_part(&file, &line)?;
+    let of_whole = of_whole.as_ref().map_or(String::new(), |whole| format!("{}\n", eval::text(whole)));
+    output.result(&line, &format!("{}\n{of_whole}appended to {}", eval::text(&of_tree), file.display()))
 }
 
 /// The command line, with the program by its plain name.

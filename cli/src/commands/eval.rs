@@ -65,6 +65,12 @@ pub(crate) struct Figures {
 }
 
 pub(crate) fn run(args: &EvalArgs, output: &Output) -> Result<(), Failure> {
+    let evaluated = look(args, output)?;
+    output.result(&evaluated, &text(&evaluated))
+}
+
+/// Measures all that is asked for.
+pub(crate) fn look(args: &EvalArgs, output: &Output) -> Result<Evaluated, Failure> {
     let lpips = args.lpips.as_deref().map(Lpips::load).transpose()?;
     let model = model::read(&args.model)?;
     let parts = Parts::read(args)?;
@@ -90,7 +96,7 @@ pub(crate) fn run(args: &EvalArgs, output: &Output) -> Result<(), Failure> {
     evaluated.record.scene = cameras::name_of(&args.capture);
     evaluated.record.downscale = downscale;
     save_json(&out.join("report.json"), &evaluated)?;
-    output.result(&evaluated, &text(&evaluated))
+    Ok(evaluated)
 }
 
 /// What of models is looked at block by block.
