@@ -22,7 +22,7 @@ PLAT_FUZZ_CASES=0 PLAT_FUZZ_SEEDS="$PWD/fuzz/seeds" cargo test --locked -q -p da
 export RUSTC_BOOTSTRAP=1
 for target in "${targets[@]}"; do
     echo "== fuzz $target, $seconds s"
-    mkdir -p "fuzz/corpus/$target"
+    mkdir -p "fuzz/corpus/$target" "fuzz/seeds/$target"
     # A gigabyte is four times what a file of 10 MB may take. 10 s for one input is a hang.
     cargo fuzz run "$target" "fuzz/corpus/$target" "fuzz/seeds/$target" -- \
         -max_total_time="$seconds" -rss_limit_mb=1024 -malloc_limit_mb=256 -timeout=10 -max_len=65536 -print_final_stats=1
