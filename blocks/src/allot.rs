@@ -11,7 +11,7 @@ use crate::select::Sightings;
 use crate::shown::Shown;
 
 /// Splats of a block, against those of its children.
-const INNER_BUDGET_RATIO: f64 = 1.0 / 2.5;
+pub(crate) const INNER_BUDGET_RATIO: f64 = 1.0 / 2.5;
 /// Splats that a task gets at least, where the whole budget allows it.
 const MIN_BUDGET: u32 = 500;
 /// What a height sees again counts this much of what it is the first to see.
@@ -20,8 +20,10 @@ const SEEN_AGAIN: f64 = 0.05;
 const INNER_COUNTS: f64 = 2.0;
 /// A block that keeps this share of its own need, because too few of its children have a task, is worked on as a leaf.
 const KEEPS_MUCH: f64 = 0.25;
-/// A step costs its pixels and, for the projection and the optimiser, this many pixels for each splat.
-pub(crate) const PIXELS_PER_SPLAT: f64 = 0.25;
+/// A step costs its pixels and this many for each splat that its window shows (as `worker`'s estimate was fitted) ...
+const PIXELS_PER_SHOWN: f64 = 10.0;
+/// ... and for each splat at all.
+const PIXELS_PER_SPLAT: f64 = 2.3;
 /// Steps of a task at least.
 const MIN_STEPS: u32 = 50;
 /// Levels below the leaves of the cells in which ground is counted as seen: 16 a side (see [`Needs`]).
@@ -100,23 +102,28 @@ fn standings(tasks: &[Task], needs: &Needs) -> Vec<Standing> {
     tasks.iter().filter_map(|task| known.remove(&task.block)).collect()
 }
 
-/// Shares out splats and steps. `mean_pixels`: of a full training image.
+/// Shares out splats, steps and memory. `whole` stands for the whole scene as one task, whose steps are `settings.steps`.
 pub(crate) fn set_means(
     tasks: &mut [Task],
+    whole: Task,
     needs: &Needs,
     capture: &Capture,
+    ground: &Ground,
     settings: &PlanSettings,
-    mean_pixels: f64,
 ) {
     let standings = standings(tasks, needs);
     set_budgets(tasks, &standings, settings);
-    set_steps(tasks, &standings, capture, settings, mean_pixels);
+    set_drawn(tasks, capture, ground);
+    let mut whole = [Task { budget: settings.budget, ..whole }];
+    set_drawn(&mut whole, capture, ground);
+    set_steps(tasks, &whole[0], &standings, capture, settings);
+    set_memory(tasks, settings);
 }
 
 /// Splits `settings.budget` so that the merged model has that many splats, where there is most to model.
 fn set_budgets(tasks: &mut [Task], standings: &[Standing], settings: &PlanSettings) {
     let total = f64::from(settings.budget);
-    let parents: BTreeSet<BlockId> = tasks.iter().filter_map(|task| task.parent).collect();
+    let parents = parents(tasks);
     // Leaves together, and inner blocks level by level; what these keep is not the leaves' to have.
     let group = |task: &Task| parents.contains(&task.block).then_some(task.block.level);
     let kept: f64 = tasks.iter().zip(standings).filter(|(task, _)| group(task).is_some()).map(|(_, s)| s.kept).sum();
@@ -153,28 +160,40 @@ fn split(pool: f64, shares: &[f64], minimum: u32) -> Vec<u32> {
 
 /// Shares out the work of `settings.steps` full images of the whole scene: over heights by what they are the first to see,
 /// within a height so that every window is seen equally often.
-fn set_steps(tasks: &mut [Task], standings: &[Standing], capture: &Capture, settings: &PlanSettings, mean_pixels: f64) {
+fn set_steps(tasks: &mut [Task], whole: &Task, standings: &[Standing], capture: &Capture, settings: &PlanSettings) {
     if let [task] = tasks
         && task.views.iter().all(|v| v.mip == 0)
     {
         task.steps = settings.steps;
         return;
     }
-    let work = f64::from(settings.steps) * (mean_pixels + PIXELS_PER_SPLAT * f64::from(settings.budget));
+    let work = f64::from(settings.steps) * cost_of_visits(whole, false) / whole.views.len().max(1) as f64;
+    // Where splats and pixels are few a visit costs next to nothing, but needs no end of them.
+    let most = INNER_COUNTS * f64::from(settings.steps) / whole.views.len().max(1) as f64;
+    let parents = parents(tasks);
     let shown = first_shown(tasks, standings, capture);
     let all: f64 = shown.values().sum();
     for (height, shown) in shown {
         let rows: Vec<usize> = (0..tasks.len()).filter(|&i| standings[i].height == height).collect();
         // One visit to every window of the height.
-        let visit: f64 = (rows.iter().map(|&i| &tasks[i]))
-            .map(|t| t.window_pixels() as f64 + PIXELS_PER_SPLAT * f64::from(t.budget) * t.views.len() as f64)
-            .sum();
-        let visits = work * shown / all.max(1.0) / visit.max(1.0);
+        let visit: f64 = rows.iter().map(|&i| cost_of_visits(&tasks[i], parents.contains(&tasks[i].block))).sum();
+        let visits = (work * shown / all.max(1.0) / visit.max(1.0)).min(most);
         for task in rows {
             let task = &mut tasks[task];
             task.steps = ((visits * task.views.len() as f64).round() as u32).max(MIN_STEPS.min(settings.steps));
         }
     }
+}
+
+/// What a step on each of its windows costs a task, in pixels.
+pub(crate) fn cost_of_visits(task: &Task, has_children: bool) -> f64 {
+    let splats = PIXELS_PER_SHOWN * f64::from(task.drawn) + PIXELS_PER_SPLAT * trained_splats(task, has_children);
+    task.window_pixels() as f64 + splats * task.views.len() as f64
+}
+
+/// Blocks below which there are others.
+fn parents(tasks: &[Task]) -> BTreeSet<BlockId> {
+    tasks.iter().filter_map(|task| task.parent).collect()
 }
 
 /// Pixels that the windows of each height are the first to show, from the root downwards, weighted; what they show again
@@ -200,7 +219,7 @@ const DRAWN_POINTS: usize = 20_000;
 const DRAWN_WINDOWS: usize = 8;
 
 /// Estimates how many splats of core and halo each task's windows show: as large a share as of the sparse points there.
-pub(crate) fn set_drawn(tasks: &mut [Task], capture: &Capture, ground: &Ground) {
+fn set_drawn(tasks: &mut [Task], capture: &Capture, ground: &Ground) {
     let points = &capture.points.positions;
     let sample: Vec<_> =
         points.iter().step_by(points.len().div_ceil(DRAWN_POINTS).max(1)).filter(|p| p.is_finite()).collect();
@@ -225,15 +244,24 @@ pub(crate) fn set_drawn(tasks: &mut [Task], capture: &Capture, ground: &Ground) 
             shown[*task][1] += windows[*task].len() as u64;
         }
     }
+    let parents = parents(tasks);
     for (task, [inside, all]) in tasks.iter_mut().zip(shown) {
         let share = inside as f64 / all.max(1) as f64;
-        task.drawn = (trained_splats(task) * share).round() as u32;
+        task.drawn = (trained_splats(task, parents.contains(&task.block)) * share).round() as u32;
     }
 }
 
-/// Splats under training in core and halo at the end.
-fn trained_splats(task: &Task) -> f64 {
-    f64::from(task.budget) * if task.block.level == 0 { 1.0 } else { HALO_AREA }
+/// Splats at most that a task starts with where it starts from points. What children will be made of may have as many as they
+/// will: points cost little, and know where surfaces are.
+pub(crate) fn first_splats(task: &Task, has_children: bool) -> u32 {
+    if has_children { (f64::from(task.budget) / INNER_BUDGET_RATIO) as u32 } else { task.budget }
+}
+
+/// Splats under training, in core and halo, at the end or, if there are more, at first.
+fn trained_splats(task: &Task, has_children: bool) -> f64 {
+    let last = f64::from(task.budget) * if task.block.level == 0 { 1.0 } else { HALO_AREA };
+    let first = if task.parent.is_none() { first_splats(task, has_children).min(task.points) } else { 0 };
+    last.max(f64::from(first))
 }
 
 /// Columns of a splat of SH degree 3.
@@ -258,11 +286,12 @@ const BASE_BYTES: u64 = 17 << 20;
 
 /// Estimates each task's peak memory: splats in core and halo under training, context frozen, one window's buffers,
 /// and the image cache.
-pub(crate) fn set_memory(tasks: &mut [Task], settings: &PlanSettings) {
+fn set_memory(tasks: &mut [Task], settings: &PlanSettings) {
     let columns = COLUMNS[usize::from(settings.sh_degree.min(3))];
     let budgets: BTreeMap<BlockId, u64> = tasks.iter().map(|t| (t.block, u64::from(t.budget))).collect();
+    let parents = parents(tasks);
     for task in tasks {
-        let trained = trained_splats(task) as u64;
+        let trained = trained_splats(task, parents.contains(&task.block)) as u64;
         let frozen: u64 = task.context.iter().chain(&task.parent).filter_map(|b| budgets.get(b)).sum();
         let window = task.views.iter().map(|v| v.window.area()).max().unwrap_or(0);
         task.memory_bytes = BASE_BYTES

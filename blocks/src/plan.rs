@@ -4,6 +4,7 @@ use scene::frame::{self, Kind};
 use scene::{ArtefactId, BlockId, CodecError, Rect};
 use serde::{Deserialize, Serialize};
 
+use crate::allot::first_splats;
 use crate::ground::Ground;
 use crate::lod::{Cut, training_order};
 
@@ -208,6 +209,11 @@ impl Plan {
             return bad("without tasks or with tasks out of order".into());
         }
         Ok(())
+    }
+
+    /// Splats at most that a task starts with where it starts from points.
+    pub fn first_splats(&self, task: &Task) -> u32 {
+        first_splats(task, self.tasks.iter().any(|t| t.parent == Some(task.block)))
     }
 
     /// The task of a block.

@@ -10,10 +10,12 @@ use render::Gradients;
 use scene::{Splats, column};
 use serde::{Deserialize, Serialize};
 
+use crate::morton;
+
 /// When and how splats are added and removed.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Growth {
-    /// Steps between two refinements.
+    /// Steps between two refinements, at most.
     pub every: u32,
     /// Share of the steps at which growth begins and ends.
     pub from: f32,
@@ -49,7 +51,17 @@ impl Default for Growth {
     }
 }
 
+/// Refinements, at least, in a job of a few hundred steps: each may add only so many splats.
+const REFINEMENTS: u32 = 16;
+/// Steps between two refinements, at least: fewer see too little of the splats.
+const MIN_STEPS: u32 = 10;
+
 impl Growth {
+    /// Steps between two refinements of a job of so many steps.
+    pub fn interval(&self, steps: u32) -> u32 {
+        (steps / REFINEMENTS).clamp(MIN_STEPS.min(self.every), self.every).max(1)
+    }
+
     /// How many splats there should be at `step` on the way from `start` to `budget`: geometric, as the error per splat
     /// falls with their number.
     pub fn target(&self, step: u32, steps: u32, start: usize, budget: usize) -> usize {
@@ -171,7 +183,7 @@ pub fn refine(
         rows.push(None);
     }
     evidence.clear();
-    let order = morton_order(&grown);
+    let order = morton::order([0, 1, 2].map(|axis| grown.col(column::MEAN + axis)));
     let rows = order.iter().map(|&i| rows[i as usize]).collect();
     (grown.select(&order), rows, refined)
 }
@@ -191,37 +203,6 @@ fn halve(splats: &Splats, i: usize, growth: &Growth) -> (scene::Splat, scene::Sp
     splat.mean += offset;
     other.mean -= offset;
     (splat, other)
-}
-
-/// Rows along a Morton curve through the means: 10 bits an axis of their bounding box.
-fn morton_order(splats: &Splats) -> Vec<u32> {
-    let n = splats.len();
-    let spread = |v: u32| {
-        // Two zero bits between the bits of a ten-bit number.
-        let v = (v | v << 16) & 0x0300_00ff;
-        let v = (v | v << 8) & 0x0300_f00f;
-        let v = (v | v << 4) & 0x030c_30c3;
-        (v | v << 2) & 0x0924_9249
-    };
-    let mut keys: Vec<(u32, u32)> = (0..n as u32).map(|i| (0, i)).collect();
-    for axis in 0..3 {
-        let column = splats.col(column::MEAN + axis);
-        let mut sorted: Vec<f32> = column.to_vec();
-        if sorted.is_empty() {
-            return Vec::new();
-        }
-        // The middle 98 %: a few far splats must not squeeze the rest into one cell.
-        let (low, high) = (n / 100, n - 1 - n / 100);
-        let low = *sorted.select_nth_unstable_by(low, f32::total_cmp).1;
-        let high = *sorted.select_nth_unstable_by(high, f32::total_cmp).1;
-        let to_cells = 1023.0 / (high - low).max(1e-9);
-        for (key, i) in &mut keys {
-            let cell = ((column[*i as usize] - low) * to_cells).clamp(0.0, 1023.0) as u32;
-            *key |= spread(cell) << axis;
-        }
-    }
-    keys.sort_unstable();
-    keys.into_iter().map(|(_, i)| i).collect()
 }
 
 #[cfg(test)]

@@ -4,7 +4,7 @@ use glam::{DVec3, Vec3};
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
 use scene::{SparsePoints, Splat, Splats};
 
-use crate::{TrainView, WindowSource};
+use crate::{TrainView, WindowSource, morton};
 
 /// Neighbours whose mean distance gives a splat its size, as in 3DGS.
 const NEIGHBOURS: usize = 3;
@@ -29,6 +29,20 @@ pub fn from_points(points: &SparsePoints, sh_degree: u8, opacity: f32, bounds: [
         splats.push(&Splat::round(mean, size.ln(), colour, opacity));
     }
     splats
+}
+
+/// Rows of at most `most` of some places, in growing order: evenly along a Morton curve, so that dense places stay denser.
+pub fn thinned(places: &[DVec3], most: usize) -> Vec<usize> {
+    let n = places.len();
+    if n <= most {
+        return (0..n).collect();
+    }
+    let axis = |k: usize| -> Vec<f32> { places.iter().map(|p| p[k] as f32).collect() };
+    let [x, y, z] = [0, 1, 2].map(axis);
+    let order = morton::order([&x, &y, &z]);
+    let mut rows: Vec<usize> = (0..most).map(|i| order[i * n / most] as usize).collect();
+    rows.sort_unstable();
+    rows
 }
 
 /// Splats of a backdrop; 6° apart.
@@ -99,4 +113,24 @@ pub fn backdrop(
         splats.push(&Splat::round(mean.as_vec3(), (size as f32).ln(), colour, 0.95));
     }
     Ok(splats)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn thinning_keeps_shares_of_places() {
+        // Three quarters of the points stand at x = 0 .. 1, one quarter at 100 .. 101.
+        let at = |i: usize| {
+            DVec3::new(if i.is_multiple_of(4) { 100.0 } else { 0.0 }, 0.0, 0.0) + DVec3::splat(i as f64 / 4e3)
+        };
+        let places: Vec<DVec3> = (0..4000).map(at).collect();
+        let rows = thinned(&places, 400);
+        assert!(rows.len() == 400 && rows.windows(2).all(|w| w[0] < w[1]));
+        let far = rows.iter().filter(|&&i| places[i].x > 50.0).count();
+        assert!((99..=101).contains(&far), "{far}");
+        assert_eq!(thinned(&places, 5000).len(), 4000);
+        assert_eq!(thinned(&[], 3), Vec::<usize>::new());
+    }
 }

@@ -11,6 +11,7 @@ pub mod importance;
 pub mod init;
 pub mod loss;
 pub mod metrics;
+mod morton;
 pub mod need;
 pub mod optimiser;
 pub mod prune;

@@ -314,12 +314,8 @@ pub fn train_on(
         if worth_db > 0.0 && error.is_some() && now.step < until && now.need.gains_less_than(worth_db) {
             now.step = until;
         }
-        let last_refinement = until + growth.every;
-        if now.step.is_multiple_of(growth.every)
-            && progress >= growth.from
-            && now.step <= last_refinement
-            && now.step < steps
-        {
+        let every = growth.interval(steps);
+        if now.step.is_multiple_of(every) && progress >= growth.from && now.step <= until + every && now.step < steps {
             let target = growth.target(now.step, steps, now.start_count, budget);
             let (grown, rows, _) = growth::refine(&now.splats, &mut now.evidence, growth, target, counts, keeps);
             now.splats = grown;

@@ -84,7 +84,7 @@ fn share(plan: &Plan, task: u32, done: &BTreeSet<u32>, workers: u32) -> f64 {
         let needed = of.parent.iter().chain(&of.context).filter_map(|block| depths.get(block));
         let depth = needed.max().map_or(0, |depth| depth + 1);
         depths.insert(of.block, depth);
-        let seconds = cpu_seconds(&plan.settings, of, !parents.contains(&of.block)).max(f64::MIN_POSITIVE);
+        let seconds = cpu_seconds(plan, of, !parents.contains(&of.block)).max(f64::MIN_POSITIVE);
         if i == task {
             own = seconds;
         }
@@ -266,7 +266,7 @@ mod tests {
         let near = |a: f64, b: f64| assert!((a - b).abs() < 1e-9, "{a} {b}");
         let done = |tasks: &[u32]| tasks.iter().copied().collect::<BTreeSet<u32>>();
         let leaves = [false, true, true, true];
-        let work = [0, 1, 2, 3].map(|i| cpu_seconds(&plan.settings, &plan.tasks[i], leaves[i]));
+        let work = [0, 1, 2, 3].map(|i| cpu_seconds(&plan, &plan.tasks[i], leaves[i]));
         assert!((work[3] / work[1] - 2.5).abs() < 1e-9, "children cost as much as their steps");
         near(share(&plan, 0, &done(&[]), 1), work[0] / work.iter().sum::<f64>());
         near(share(&plan, 1, &done(&[0]), 1), 20.0 / 90.0);

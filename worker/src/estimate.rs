@@ -7,7 +7,7 @@
 
 use std::collections::BTreeSet;
 
-use blocks::{Plan, PlanSettings, Task};
+use blocks::{Plan, Task};
 use scene::BlockId;
 use serde::Serialize;
 use train::prune;
@@ -53,7 +53,7 @@ impl Estimate {
         let leaf = |task: &&Task| !parents.contains(&task.block);
         let splats: u64 = plan.tasks.iter().filter(leaf).map(|task| u64::from(task.budget)).sum();
         Self {
-            cpu_seconds: plan.tasks.iter().map(|task| cpu_seconds(&plan.settings, task, leaf(&task))).sum(),
+            cpu_seconds: plan.tasks.iter().map(|task| cpu_seconds(plan, task, leaf(&task))).sum(),
             memory_bytes: plan.tasks.iter().map(|task| task.memory_bytes).max().unwrap_or(0),
             bytes: splats * 4 * PLY_FLOATS[usize::from(plan.settings.sh_degree.min(3))],
         }
@@ -66,17 +66,18 @@ pub(crate) fn parents(plan: &Plan) -> BTreeSet<BlockId> {
 }
 
 /// What a task will take on the CPU backend, CPU seconds.
-pub(crate) fn cpu_seconds(settings: &PlanSettings, task: &Task, leaf: bool) -> f64 {
+pub(crate) fn cpu_seconds(plan: &Plan, task: &Task, leaf: bool) -> f64 {
+    let settings = &plan.settings;
     let pixels = task.window_pixels() as f64 / task.views.len().max(1) as f64;
     let recipe = recipe_of(settings, task);
     let first = match task.parent {
         Some(_) => INHERITED,
-        None => (f64::from(task.points) / f64::from(task.budget.max(1))).clamp(0.01, 1.0),
+        None => (f64::from(task.points.min(plan.first_splats(task))) / f64::from(task.budget.max(1))).max(0.01),
     };
-    // Geometric growth from `first` to 1 until its end.
+    // Geometric growth from `first` to 1 until its end; an inner block may begin with more than it asks for.
     let until = f64::from(recipe.growth.until);
-    let growing = if first < 0.999 { (1.0 - first) / -first.ln() } else { 1.0 };
-    let mean_splats = until * growing + (1.0 - until);
+    let growing = if first < 0.999 { (1.0 - first) / -first.ln() } else { first };
+    let mean_splats = until * growing + (1.0 - until) * first.max(1.0);
     let (mut mean_pixels, mut left) = (0.0, 1.0);
     for (n, share) in recipe.coarse.iter().enumerate() {
         mean_pixels += f64::from(*share) * 0.25f64.powi((recipe.coarse.len() - n) as i32);

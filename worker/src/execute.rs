@@ -457,17 +457,23 @@ impl Block<'_> {
         if results.is_empty() {
             let all = plan.settings.mode != Mode::Flat;
             let keep = |p: glam::DVec3| all || views.iter().any(|view| sees(view, p, 0.0));
+            let (centre, radius) = self.surroundings(views);
+            let backdrop = train::init::backdrop(views, self.reader, sh_degree, centre, radius).map_err(failed)?;
             let points = &capture.points;
             let rows: Vec<usize> = (0..points.len()).filter(|&i| keep(points.positions[i])).collect();
+            let places: Vec<glam::DVec3> = rows.iter().map(|&i| points.positions[i]).collect();
+            // There may be more points than splats are wanted.
+            let budget = plan.first_splats(task) as usize;
+            let most = budget.saturating_sub(backdrop.len()).max(budget / 2).max(1);
+            let chosen = train::init::thinned(&places, most);
             let points = SparsePoints {
-                positions: rows.iter().map(|&i| points.positions[i]).collect(),
-                colours: rows.iter().map(|&i| points.colours[i]).collect(),
+                positions: chosen.iter().map(|&i| places[i]).collect(),
+                colours: chosen.iter().map(|&i| points.colours[rows[i]]).collect(),
                 ..SparsePoints::default()
             };
             let sizes = self.size_bounds_metres();
             let mut initial = train::init::from_points(&points, sh_degree, recipe.initial_opacity, sizes);
-            let (centre, radius) = self.surroundings(views);
-            initial.append(&train::init::backdrop(views, self.reader, sh_degree, centre, radius).map_err(failed)?);
+            initial.append(&backdrop);
             return Ok((initial, None));
         }
         let cut = task.context_cut();
