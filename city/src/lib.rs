@@ -10,7 +10,11 @@
 //! Architecture invariant: no files, no clock; randomness comes from the seed (see [`random`]). World metres, z up, the
 //! city centred on the origin.
 
+pub mod faults;
 pub mod random;
+pub mod sense;
+pub mod stage;
+pub mod trace;
 pub mod words;
 
 pub use words::{Actor, Asset, City, Class, Material, Mesh, Pattern, Trajectory, Waypoint};
