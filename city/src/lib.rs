@@ -11,6 +11,7 @@
 //! city centred on the origin.
 
 pub mod faults;
+pub mod occupancy;
 pub mod random;
 pub mod sense;
 pub mod stage;

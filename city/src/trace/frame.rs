@@ -25,8 +25,8 @@ pub const MOST_PIXELS: u64 = 1 << 26;
 pub const NOTHING: u8 = 255;
 /// [`Layer::material`] of the sky and of nothing.
 pub const NO_MATERIAL: u16 = u16::MAX;
-/// Times for which what moves is placed anew while a shutter is open.
-const TICKS: usize = 16;
+/// Times for which what moves is placed anew while a picture is taken: an odd number, so that one is its middle.
+const TICKS: usize = 15;
 /// How near something must be to take light from around away, metres.
 const CORNER: f32 = 4.0;
 

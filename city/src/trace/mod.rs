@@ -11,6 +11,8 @@ pub mod frame;
 pub mod motion;
 pub(crate) mod pattern;
 pub mod shade;
+#[cfg(test)]
+mod tests;
 pub mod world;
 
 pub use frame::{Frame, FrameError, Layer, Options, frame};

@@ -89,8 +89,8 @@ fn written(text: &str, uv: Vec2, size: Vec2) -> f32 {
 
 /// Noise in about -1..1 whose features reach from `coarsest` down to `finest` metres or the pixel, finer ones weaker.
 fn octaves(uv: Vec2, finest: f32, coarsest: f32, seed: u32, size: Vec2) -> f32 {
-    // between the two extents of a pixel seen at an angle, as textures are filtered
-    let footprint = 0.6 * size.max_element() + 0.4 * size.min_element();
+    // between the two extents of a pixel seen at an angle: finer would shimmer, coarser would be a smear
+    let footprint = (size.x * size.y).sqrt();
     let (mut feature, mut weight) = (coarsest.max(1e-3), 1.0);
     let (mut sum, mut power) = (0.0, 0.0);
     for octave in 0..OCTAVES {
