@@ -7,7 +7,7 @@
 //! | pose noise | shots | reported poses are off by 0.5 m and 2° (1σ) |
 //! | sparse views | shots | nine of ten shots are missing |
 //! | sensor dropout | shots, sweeps | each sensor is silent for half the time, some seconds at once |
-//! | night | light, picture | moonlight, lit windows, grain |
+//! | night | light, picture | moonlight, lamps and lit rooms, grain |
 //! | rain | light, picture | overcast, wet, streaked |
 //! | fog | light | 100 m of sight |
 //! | textureless road | light | roads of one colour |
@@ -134,7 +134,7 @@ pub(crate) fn spoil_light(light: &Light, faults: &[Fault]) -> Light {
                 for part in [&mut light.zenith, &mut light.horizon, &mut light.ground] {
                     *part *= vec3(0.016, 0.019, 0.026).lerp(Vec3::ONE, down);
                 }
-                light.windows += s * vec3(0.55, 0.36, 0.17);
+                light.lamps = light.lamps.max(s);
             }
             Kind::Rain => {
                 overcast(&mut light, 0.95 * s);

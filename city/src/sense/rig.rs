@@ -45,7 +45,7 @@ pub struct Rig {
     pub spacing_metres: f64,
     /// Metres per second.
     pub speed: f64,
-    /// Metres to the right of a street's centre line.
+    /// Metres to the right of the lines of [`City::streets`].
     pub lane_metres: f64,
     /// The city's clock where it starts.
     pub start_seconds: f64,
@@ -75,7 +75,7 @@ impl Default for Rig {
             field_degrees: 103.7,
             spacing_metres: 2.0,
             speed: 10.0,
-            lane_metres: 1.6,
+            lane_metres: 0.0,
             start_seconds: 0.0,
             fleet: false,
             rolling_shutter_seconds: 0.0,
@@ -207,7 +207,7 @@ mod tests {
     use crate::stage;
 
     #[test]
-    fn six_cameras_look_around_from_a_car_on_the_right() {
+    fn six_cameras_look_around_from_a_car() {
         let city = stage::city();
         let shots = drive(&city, &Rig::default()).unwrap();
         assert_eq!(shots.len(), 6 * 61);
@@ -217,7 +217,7 @@ mod tests {
             assert!((*seen - expected).length() < 1e-9, "{seen}");
         }
         let centre = round[0].camera.centre();
-        assert!((centre - DVec3::new(-60.0 + 20.0 + 0.8, -1.6 + 0.3, 1.65)).length() < 1e-9, "{centre}");
+        assert!((centre - DVec3::new(-60.0 + 20.0 + 0.8, 0.3, 1.65)).length() < 1e-9, "{centre}");
         assert!((round[3].motion.velocity - DVec3::X * 10.0).length() < 1e-9);
         assert!((shots[60].seconds - 2.0).abs() < 1e-9);
         let field = 2.0 * (704.0 / round[0].camera.pinhole.fx).atan().to_degrees();

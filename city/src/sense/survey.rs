@@ -131,7 +131,7 @@ pub struct Fixed {
     pub cameras: u32,
     /// Metres over the street.
     pub height_metres: f64,
-    /// Metres to the side of the street's centre line.
+    /// Metres to the side of a line of [`City::streets`].
     pub side_metres: f64,
     /// Degrees below the horizon.
     pub tilt_degrees: f64,

@@ -5,7 +5,7 @@ use glam::{Vec2, Vec3, vec3};
 use serde::{Deserialize, Serialize};
 
 use super::{
-    pattern::{self, hash, unit},
+    pattern,
     world::{Hit, Meets, Moment, Ray},
 };
 use crate::{Class, Material};
@@ -29,8 +29,8 @@ pub struct Light {
     pub horizon: Vec3,
     /// Light that the ground throws up.
     pub ground: Vec3,
-    /// Light behind windows at night.
-    pub windows: Vec3,
+    /// How far lamps are turned on, 0 to 1: those of streets, cars and rooms.
+    pub lamps: f32,
     /// Extinction by the air, 1/m: 0 for clear air, 0.03 for thick fog.
     pub fog: f32,
     /// How wet what faces up is, 0 to 1: darker, and a mirror at a grazing angle.
@@ -48,7 +48,7 @@ impl Default for Light {
             zenith: vec3(0.19, 0.3, 0.52),
             horizon: vec3(0.56, 0.66, 0.78),
             ground: vec3(0.15, 0.14, 0.12),
-            windows: Vec3::ZERO,
+            lamps: 0.0,
             fog: 0.0,
             wet: 0.0,
             road_pattern: 1.0,
@@ -59,8 +59,8 @@ impl Default for Light {
 impl Light {
     /// Every number finite and not negative, the sun's direction one.
     pub fn is_sane(&self) -> bool {
-        let lights = [self.sun, self.zenith, self.horizon, self.ground, self.windows];
-        let numbers = [self.fog, self.wet, self.road_pattern];
+        let lights = [self.sun, self.zenith, self.horizon, self.ground];
+        let numbers = [self.lamps, self.fog, self.wet, self.road_pattern];
         (self.towards_sun.length() - 1.0).abs() < 1e-2
             && lights.iter().all(|l| l.is_finite() && l.min_element() >= 0.0)
             && numbers.iter().all(|n| n.is_finite() && *n >= 0.0)
@@ -141,17 +141,7 @@ impl Shader<'_> {
         // a pane tints what comes through it
         let tint = Vec3::ONE.lerp(material.base_colour, 0.5) * clear;
         let through = behind.scale(tint).plus(own).scale(Vec3::splat(1.0 - mirrored));
-        through.add(mirrored * self.mirror(ray, hit, 0.0)).add(self.lamp(hit))
-    }
-
-    /// Light from behind a window at night: some are lit.
-    fn lamp(&self, hit: &Hit) -> Vec3 {
-        if self.light.windows == Vec3::ZERO || self.moment.class(hit) != Class::Building {
-            return Vec3::ZERO;
-        }
-        // a pane is two triangles
-        let window = unit(hash(hit.actor, (hit.triangle / 2) as i32, 0));
-        if window < 0.35 { self.light.windows * (0.4 + 2.0 * window) } else { Vec3::ZERO }
+        through.add(mirrored * self.mirror(ray, hit, 0.0))
     }
 
     fn opaque(&self, ray: &Ray, hit: &Hit, mirrors: bool) -> Glow {
@@ -167,6 +157,9 @@ impl Shader<'_> {
         if mirrors && (gloss > 0.1 || material.metallic > 0.1) {
             glow = self.gloss(ray, hit, material, gloss, paint, sun, glow);
         }
+        if self.light.lamps > 0.0 {
+            glow = glow.add(self.light.lamps * (paint * self.moment.lamps().glow(row) + matt * self.lamps(point, hit)));
+        }
         self.air(ray, hit, point, glow)
     }
 
@@ -181,6 +174,15 @@ impl Shader<'_> {
         let side = if facing > 0.0 { hit.normal } else { -hit.normal };
         let shadow = Ray::new(point + (OFF + 1e-5 * hit.distance) * side, self.light.towards_sun);
         if self.moment.is_blocked(&shadow) { Vec3::ZERO } else { share * self.light.sun }
+    }
+
+    /// Light of street lamps at a point.
+    fn lamps(&self, point: Vec3, hit: &Hit) -> Vec3 {
+        let start = point + (OFF + 1e-5 * hit.distance) * hit.normal;
+        self.moment.lamps().shine(start, hit.normal, |from, to| {
+            let way = to - from;
+            !self.moment.is_blocked(&Ray { to: way.length(), ..Ray::new(from, way.normalize_or(Vec3::Z)) })
+        })
     }
 
     /// What paint, metal and wet ground add: a soft mirror of sky or walls, and the sun's blurred image.

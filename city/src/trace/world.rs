@@ -14,13 +14,16 @@ use obvhs::{
 use rayon::prelude::*;
 use scene::Rigid;
 
-use super::motion;
+use super::{lamps::Lamps, motion};
 use crate::{Actor, City, Class, Material, Mesh};
 
 /// Marks a triangle that light goes through, in [`Triangle::row`].
 const CLEAR: u32 = 1 << 31;
 /// Coordinates beyond this are a mistake, metres.
 const FARTHEST: f32 = 1e7;
+
+/// How trees are made that are made once: with care.
+const ONCE: BvhBuildParams = BvhBuildParams { pre_split: false, ..BvhBuildParams::very_slow_build() };
 
 /// A city that rays cannot be cast into.
 #[derive(Debug, thiserror::Error, Clone, PartialEq, Eq)]
@@ -97,6 +100,7 @@ pub struct World<'a> {
     standing: Level,
     /// Rows of the actors that have a trajectory.
     movers: Vec<u32>,
+    lamps: Lamps,
 }
 
 /// The city at a moment: what stands, and what moves where it then is.
@@ -120,8 +124,8 @@ impl<'a> World<'a> {
             city.actors.iter().enumerate().filter(|(_, a)| a.trajectory.is_some()).map(row).collect();
         let still = city.actors.iter().enumerate().filter(|(_, a)| a.trajectory.is_none());
         let places = still.filter_map(|(i, a)| Place::new(&solids, i as u32, a.asset, &a.world_from_asset)).collect();
-        let standing = Level::new(places, BvhBuildParams::medium_build());
-        Ok(Self { city, solids, standing, movers })
+        let standing = Level::new(places, ONCE);
+        Ok(Self { city, solids, standing, movers, lamps: Lamps::new(city) })
     }
 
     /// The city this is of.
@@ -160,6 +164,11 @@ impl<'a> Moment<'a> {
     pub fn is_blocked(&self, ray: &Ray) -> bool {
         let solids = &self.world.solids;
         self.world.standing.blocks(solids, ray) || (!self.moving.places.is_empty() && self.moving.blocks(solids, ray))
+    }
+
+    /// What shines at night.
+    pub(crate) fn lamps(&self) -> &'a Lamps {
+        &self.world.lamps
     }
 
     /// The actor that was hit.
@@ -215,7 +224,7 @@ impl Solid {
             })
             .collect();
         let boxes: Vec<Aabb> = all.iter().map(Triangle::bounds).collect();
-        let bvh = tree(&boxes, BvhBuildParams::medium_build());
+        let bvh = tree(&boxes, ONCE);
         let triangles = bvh.primitive_indices.iter().map(|&i| all[i as usize]).collect();
         let (low, high) = (bvh.total_aabb.min.to_array().into(), bvh.total_aabb.max.to_array().into());
         Self { bvh, triangles, low, high }
