@@ -10,7 +10,14 @@
 //! Architecture invariant: no files, no clock; randomness comes from the seed (see [`random`]). World metres, z up, the
 //! city centred on the origin.
 
+mod build;
+mod generate;
+mod materials;
 pub mod random;
+mod roads;
+pub mod settings;
+mod terrain;
 pub mod words;
 
+pub use settings::{CitySettings, Layout, Traffic};
 pub use words::{Actor, Asset, City, Class, Material, Mesh, Pattern, Trajectory, Waypoint};
