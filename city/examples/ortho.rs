@@ -6,7 +6,7 @@
 use std::path::Path;
 
 use city::{Actor, City, CitySettings, Mesh, Pattern, Traffic};
-use glam::{DVec2, DVec3, Mat4, Vec3};
+use glam::Vec3;
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
@@ -21,27 +21,52 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     };
     let city = City::generate(&settings)?;
     let half = 0.5 * city.extent_metres as f32;
-    let up = Mat4::look_at_rh(Vec3::new(0.0, 0.0, 500.0), Vec3::ZERO, Vec3::Y);
-    let reach = half + 20.0;
-    let above = Mat4::orthographic_rh(-reach, reach, -reach, reach, 1.0, 1000.0) * up;
-    draw(&city, above, [1100, 1100], &Path::new(folder).join(format!("{layout}-above.png")))?;
-    let eye = Vec3::new(-0.35 * half, -0.9 * half, 75.0);
-    let oblique = Mat4::perspective_rh(0.9, 1.6, 1.0, 3000.0) * Mat4::look_at_rh(eye, Vec3::new(0.0, -0.2 * half, 5.0), Vec3::Z);
-    draw(&city, oblique, [1280, 800], &Path::new(folder).join(format!("{layout}-oblique.png")))?;
+    let file = |what: String| Path::new(folder).join(format!("{layout}-{what}.png"));
+    let above = View::new(Vec3::Z * 500.0, Vec3::Y * 1e-3, None, half + 20.0);
+    draw(&city, &above, [1100, 1100], &file("above".to_owned()))?;
+    let oblique =
+        View::new(Vec3::new(-0.35 * half, -0.9 * half, 75.0), Vec3::new(0.0, -0.2 * half, 5.0), Some(0.9), 1.0);
+    draw(&city, &oblique, [1280, 800], &file("oblique".to_owned()))?;
     let count = city.streets.len();
     for k in 0..count.min(4) {
         let street = &city.streets[k * count / count.min(4)];
         let at = street.len() * (1 + k) / 6;
-        let (here, ahead) = (street[at] + DVec3::Z * 1.8, street[(at + 4).min(street.len() - 1)] + DVec3::Z * 1.8);
-        let view = Mat4::look_at_rh(here.as_vec3(), ahead.as_vec3(), Vec3::Z);
-        let street = Mat4::perspective_rh(1.0, 1.6, 0.3, 3000.0) * view;
-        draw(&city, street, [1280, 800], &Path::new(folder).join(format!("{layout}-street-{k}.png")))?;
+        let [here, ahead] = [at, (at + 4).min(street.len() - 1)].map(|k| street[k].as_vec3() + 1.8 * Vec3::Z);
+        draw(&city, &View::new(here, ahead, Some(1.1), 1.0), [1280, 800], &file(format!("street-{k}")))?;
     }
     Ok(())
 }
 
+/// An eye: perspective with half a picture's width at unit distance, or from above with half its height in metres.
+struct View {
+    eye: Vec3,
+    axes: [Vec3; 3],
+    lens: Option<f32>,
+    reach: f32,
+}
+
+impl View {
+    fn new(eye: Vec3, target: Vec3, lens: Option<f32>, reach: f32) -> Self {
+        let ahead = (target - eye).normalize();
+        let right = ahead.cross(Vec3::Z).normalize();
+        Self { eye, axes: [right, right.cross(ahead), ahead], lens, reach }
+    }
+
+    /// Pixel and depth (growing away from the eye and linear on the screen).
+    fn project(&self, p: Vec3, [width, height]: [usize; 2]) -> Option<Vec3> {
+        let [x, y, z] = self.axes.map(|axis| axis.dot(p - self.eye));
+        let (half_width, half_height) = (0.5 * width as f32, 0.5 * height as f32);
+        let (scale, depth) = match self.lens {
+            Some(lens) => (half_width / (lens * z), -1.0 / z),
+            None => (half_height / self.reach, z),
+        };
+        (z > 0.2).then(|| Vec3::new(half_width + x * scale, half_height - y * scale, depth))
+    }
+}
+
 /// Draws the city through a projection.
-fn draw(city: &City, projection: Mat4, [width, height]: [usize; 2], file: &Path) -> image::ImageResult<()> {
+fn draw(city: &City, view: &View, size: [usize; 2], file: &Path) -> image::ImageResult<()> {
+    let [width, height] = size;
     let mut colours = vec![Vec3::new(0.55, 0.7, 0.9); width * height];
     let mut depths = vec![f32::INFINITY; width * height];
     for actor in &city.actors {
@@ -49,17 +74,10 @@ fn draw(city: &City, projection: Mat4, [width, height]: [usize; 2], file: &Path)
         let world: Vec<Vec3> = mesh.positions.iter().map(|p| place(actor, *p)).collect();
         for k in 0..mesh.triangles.len() {
             let corners = mesh.triangles[k].map(|i| world[i as usize]);
-            let clip = corners.map(|p| projection * p.extend(1.0));
             // what reaches behind the eye is left out: good enough for a look
-            if clip.iter().any(|c| c.w < 0.2) {
-                continue;
-            }
+            let [Some(a), Some(b), Some(c)] = corners.map(|p| view.project(p, size)) else { continue };
             let colour = shade(city, mesh, k, corners);
-            let screen = clip.map(|c| {
-                let p = c.truncate() / c.w;
-                Vec3::new((0.5 + 0.5 * p.x) * width as f32, (0.5 - 0.5 * p.y) * height as f32, p.z)
-            });
-            fill(&mut colours, &mut depths, width, height, screen, colour);
+            fill(&mut colours, &mut depths, width, height, [a, b, c], colour);
         }
     }
     let mut picture = image::RgbImage::new(width as u32, height as u32);
@@ -82,7 +100,7 @@ fn shade(city: &City, mesh: &Mesh, k: usize, [a, b, c]: [Vec3; 3]) -> Vec3 {
     let stripes = match material.pattern {
         Pattern::Plain => 1.0,
         // some variation, for one colour by triangle
-        _ => 0.94 + 0.12 * ((DVec2::from(mesh.uvs[mesh.triangles[k][0] as usize].as_dvec2()).element_sum() * 7.3).fract().abs() as f32),
+        _ => 0.94 + 0.12 * (mesh.uvs[mesh.triangles[k][0] as usize].element_sum() * 7.3).fract().abs(),
     };
     material.base_colour * light * stripes
 }

@@ -89,6 +89,28 @@ impl Builder {
         self.two_faces(corners);
     }
 
+    /// An upright rectangle that faces -y, with x and z as its uv, so that courses of bricks go on across neighbours.
+    pub(crate) fn panel(&mut self, [x0, x1]: [f32; 2], [z0, z1]: [f32; 2], y: f32) {
+        if x1 - x0 < 1e-3 || z1 - z0 < 1e-3 {
+            return;
+        }
+        let corners = [[x0, z0], [x1, z0], [x1, z1], [x0, z1]];
+        let corners = corners.map(|[x, z]| self.corner(Vec3::new(x, y, z), Vec2::new(x, z)));
+        self.two_faces(corners);
+    }
+
+    /// A plank: a face with a thickness behind it, closed on all sides.
+    pub(crate) fn plank(&mut self, top: [Vec3; 4], thickness: f32) {
+        let down = -(top[1] - top[0]).cross(top[3] - top[0]).normalize_or(Vec3::Z) * thickness;
+        self.quad(top);
+        let [a, b, c, d] = top.map(|p| p + down);
+        self.quad([d, c, b, a]);
+        for k in 0..4 {
+            let next = (k + 1) % 4;
+            self.quad([top[k] + down, top[next] + down, top[next], top[k]]);
+        }
+    }
+
     /// A four-sided face whose uv run from 0 to 1: for texts.
     pub(crate) fn plate(&mut self, corners: [Vec3; 4]) {
         let uvs = [Vec2::ZERO, Vec2::X, Vec2::ONE, Vec2::Y];
@@ -164,7 +186,12 @@ impl Builder {
         for ring in 0..rings {
             for sector in 0..sectors {
                 let at = |r: usize, s: usize| corners[r * (sectors + 1) + s];
-                self.two_faces([at(ring + 1, sector), at(ring + 1, sector + 1), at(ring, sector + 1), at(ring, sector)]);
+                self.two_faces([
+                    at(ring + 1, sector),
+                    at(ring + 1, sector + 1),
+                    at(ring, sector + 1),
+                    at(ring, sector),
+                ]);
             }
         }
     }

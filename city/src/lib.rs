@@ -13,6 +13,8 @@
 mod build;
 mod generate;
 mod materials;
+mod parcels;
+mod props;
 pub mod random;
 mod roads;
 pub mod settings;

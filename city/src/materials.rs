@@ -203,12 +203,8 @@ const ORDERS: [Words; 6] = [
     ("TAXI", BLACK, GOLD),
 ];
 /// Number plates.
-const PLATES: [Words; 4] = [
-    ("PL 4711", BLACK, WHITE),
-    ("AT 2026", BLACK, WHITE),
-    ("GS 3141", BLACK, WHITE),
-    ("KX 1618", BLACK, WHITE),
-];
+const PLATES: [Words; 4] =
+    [("PL 4711", BLACK, WHITE), ("AT 2026", BLACK, WHITE), ("GS 3141", BLACK, WHITE), ("KX 1618", BLACK, WHITE)];
 /// Routes and advertisements.
 const POSTERS: [Words; 6] = [
     ("12 CENTRAL", GOLD, BLACK),
@@ -287,7 +283,10 @@ mod tests {
             }
         }
         let named = |s: Surface| materials[usize::from(s.0)].name.clone();
-        assert_eq!([named(order(0)), named(poster(5)), named(GLASS)], ["sign, STOP", "sign, JAZZ FRIDAY", "window glass"]);
+        assert_eq!(
+            [named(order(0)), named(poster(5)), named(GLASS)],
+            ["sign, STOP", "sign, JAZZ FRIDAY", "window glass"]
+        );
         assert_eq!(street_names().map(named).next().unwrap(), "sign, LIME STREET");
         assert_eq!(materials.iter().filter(|m| m.transparency > 0.0).count(), 1);
         assert!(materials.iter().filter(|m| m.pattern == Pattern::Plain).count() > 10);

@@ -203,7 +203,8 @@ impl Roads {
     /// What road an edge is, if it is one: none inside a block.
     fn kind_of(&self, index: usize) -> Option<RoadKind> {
         let horizontals = self.cells[0] * (self.cells[1] + 1);
-        let line = if index < horizontals { index / self.cells[0] } else { (index - horizontals) % (self.cells[0] + 1) };
+        let line =
+            if index < horizontals { index / self.cells[0] } else { (index - horizontals) % (self.cells[0] + 1) };
         let sides = self.beside(index);
         if sides[0] == sides[1] {
             return None;
@@ -386,7 +387,8 @@ impl Lattice {
         let (columns, rows) = (cells[0] / fine, cells[1] / fine);
         let decked = matches!(self.layout, Layout::Deck | Layout::Mixed);
         let deck = (decked && rows > 1).then_some((rows / 2) * fine);
-        let mut roads = Roads { cells, fine, edges: Vec::new(), nodes: Vec::new(), quarters: Vec::new(), blocks: Vec::new(), deck };
+        let mut roads =
+            Roads { cells, fine, edges: Vec::new(), nodes: Vec::new(), quarters: Vec::new(), blocks: Vec::new(), deck };
         roads.edges = vec![None; cells[0] * (cells[1] + 1) + (cells[0] + 1) * cells[1]];
         for row in 0..rows {
             let mut i = 0;

@@ -66,8 +66,7 @@ impl<'a> Layer<'a> {
 
 /// A crossing with the roads that go out of it to the east and north.
 pub(crate) fn crossing(roads: &Roads, terrain: &Terrain, node: usize, random: &Random) -> Option<Piece> {
-    let arms: Vec<(usize, Profile)> =
-        (0..4).filter_map(|arm| Some((arm, roads.mouth(node, arm)?.2))).collect();
+    let arms: Vec<(usize, Profile)> = (0..4).filter_map(|arm| Some((arm, roads.mouth(node, arm)?.2))).collect();
     if arms.is_empty() {
         return None;
     }
@@ -135,7 +134,8 @@ fn road(layer: &mut Layer, edge: &Edge, random: &mut Random) {
     let line = Line::new(&edge.path);
     if paved == m::ASPHALT {
         for _ in 0..random.below(4) {
-            let (s, side) = (random.range(0.1, 0.9) as f64 * line.length, random.range(-0.7, 0.5) as f64 * profile.half);
+            let (s, side) =
+                (random.range(0.1, 0.9) as f64 * line.length, random.range(-0.7, 0.5) as f64 * profile.half);
             let (long, wide) = (random.range(1.0, 4.0) as f64, random.range(0.6, 1.6) as f64);
             layer.builder.paint(m::ASPHALT_PATCH);
             layer.stripe(&line, [s, (s + long).min(line.length)], [side, side + wide], 0.4 * PAINT);
@@ -349,7 +349,8 @@ pub(crate) fn country(roads: &Roads, terrain: &Terrain, half: f64, west_gap: f64
             let sheet: Vec<Vec<u32>> = (from..=to)
                 .map(|k| {
                     let near = rings.front[k % count];
-                    let at = |t: &f64| (near.at.lerp(far[k % count], *t), near.profile.curb * (1.0 - (20.0 * t).min(1.0)));
+                    let at =
+                        |t: &f64| (near.at.lerp(far[k % count], *t), near.profile.curb * (1.0 - (20.0 * t).min(1.0)));
                     shares.iter().map(at).map(|(p, above)| layer.corner(p, above)).collect()
                 })
                 .collect();
