@@ -130,9 +130,9 @@ pub(crate) fn spoil_light(light: &Light, faults: &[Fault]) -> Light {
         match fault.kind {
             Kind::Night => {
                 let down = (1.0 - s) * (1.0 - s);
-                light.sun *= vec3(0.012, 0.014, 0.018).lerp(Vec3::ONE, down);
+                light.sun *= vec3(0.022, 0.027, 0.036).lerp(Vec3::ONE, down);
                 for part in [&mut light.zenith, &mut light.horizon, &mut light.ground] {
-                    *part *= vec3(0.016, 0.019, 0.026).lerp(Vec3::ONE, down);
+                    *part *= vec3(0.03, 0.036, 0.05).lerp(Vec3::ONE, down);
                 }
                 light.lamps = light.lamps.max(s);
             }

@@ -10,12 +10,21 @@
 //! Architecture invariant: no files, no clock; randomness comes from the seed (see [`random`]). World metres, z up, the
 //! city centred on the origin.
 
+mod build;
 pub mod faults;
+mod generate;
+mod materials;
 pub mod occupancy;
+mod parcels;
+mod props;
 pub mod random;
+mod roads;
 pub mod sense;
+pub mod settings;
 pub mod stage;
+mod terrain;
 pub mod trace;
 pub mod words;
 
+pub use settings::{CitySettings, Layout, Traffic};
 pub use words::{Actor, Asset, City, Class, Material, Mesh, Pattern, Trajectory, Waypoint};

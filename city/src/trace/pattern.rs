@@ -102,7 +102,7 @@ fn octaves(uv: Vec2, finest: f32, coarsest: f32, seed: u32, size: Vec2) -> f32 {
             sum += weight * seen * noise(uv / feature, seed.wrapping_add(octave));
         }
         power += weight * weight;
-        (feature, weight) = (0.5 * feature, 0.87 * weight);
+        (feature, weight) = (0.5 * feature, 0.97 * weight);
     }
     // a lattice's values spread over 0.37 of their range
     if power > 0.0 { sum / (0.8 * power).sqrt() } else { 0.0 }
