@@ -77,6 +77,11 @@ fn draw(city: &City, view: &View, size: [usize; 2], file: &Path) -> image::Image
             // what reaches behind the eye is left out: good enough for a look
             let [Some(a), Some(b), Some(c)] = corners.map(|p| view.project(p, size)) else { continue };
             let colour = shade(city, mesh, k, corners);
+            // seen from behind: magenta, because only panes and leaves should be
+            let behind = (b - a).truncate().perp_dot((c - a).truncate()) > 0.0;
+            let name = &city.materials[usize::from(mesh.materials[k])].name;
+            let leaf = ["glass", "leaves", "needles", "hedge"].iter().any(|thin| name.contains(thin));
+            let colour = if behind && !leaf { Vec3::new(1.0, 0.0, 1.0) } else { colour };
             fill(&mut colours, &mut depths, width, height, [a, b, c], colour);
         }
     }
@@ -92,7 +97,7 @@ fn place(actor: &Actor, p: Vec3) -> Vec3 {
     pose.apply(p.as_dvec3()).as_vec3()
 }
 
-/// A triangle's colour under a sun; magenta where it is seen from behind would show wrong winding, so it is darkened.
+/// A triangle's colour under a sun.
 fn shade(city: &City, mesh: &Mesh, k: usize, [a, b, c]: [Vec3; 3]) -> Vec3 {
     let material = &city.materials[usize::from(mesh.materials[k])];
     let normal = (b - a).cross(c - a).normalize_or_zero();
@@ -113,8 +118,6 @@ fn fill(colours: &mut [Vec3], depths: &mut [f32], width: usize, height: usize, [
     if area.abs() < 1e-9 {
         return;
     }
-    // seen from behind: shown in magenta, because it should not be
-    let colour = if area > 0.0 { Vec3::new(1.0, 0.0, 1.0) } else { colour };
     for y in range(low.y, high.y, height) {
         for x in range(low.x, high.x, width) {
             let (px, py) = (x as f32 + 0.5, y as f32 + 0.5);

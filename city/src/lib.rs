@@ -11,6 +11,7 @@
 //! city centred on the origin.
 
 mod build;
+mod deck;
 mod generate;
 mod materials;
 mod parcels;
@@ -18,7 +19,9 @@ mod props;
 pub mod random;
 mod roads;
 pub mod settings;
+mod streetside;
 mod terrain;
+mod traffic;
 pub mod words;
 
 pub use settings::{CitySettings, Layout, Traffic};

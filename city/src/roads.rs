@@ -346,11 +346,13 @@ impl Lattice {
         let layout = settings.layout;
         let extent = settings.extent_metres();
         let half = 0.5 * extent;
-        let bends = bends(layout, extent, &mut random);
+        // a strip beside a wide plain has no room for bends and alleys
+        let narrow = (1.0 - settings.plain) * extent < 130.0;
+        let bends = if narrow { Vec::new() } else { bends(layout, extent, &mut random) };
         let reach = |shift_y: bool| bends.iter().filter(|b| b.shift_y == shift_y).map(|b| b.amplitude).sum::<f64>();
         let border = RoadKind::Street.profile().front() + 0.5;
         let (reach_x, reach_y) = (reach(false) + border, reach(true) + border);
-        let fine = if matches!(layout, Layout::Alley | Layout::Mixed) { 3 } else { 1 };
+        let fine = if !narrow && matches!(layout, Layout::Alley | Layout::Mixed) { 3 } else { 1 };
         let [wide, tall] = match layout {
             Layout::CurvedCorridor => [84.0, 72.0],
             Layout::Winding => [100.0, 84.0],
