@@ -52,15 +52,31 @@ impl View {
         Self { eye, axes: [right, right.cross(ahead), ahead], lens, reach }
     }
 
-    /// Pixel and depth (growing away from the eye and linear on the screen).
-    fn project(&self, p: Vec3, [width, height]: [usize; 2]) -> Option<Vec3> {
-        let [x, y, z] = self.axes.map(|axis| axis.dot(p - self.eye));
+    /// A triangle in the eye's axes, cut off in front of it: as a fan.
+    fn seen(&self, corners: [Vec3; 3]) -> Vec<Vec3> {
+        const NEAR: f32 = 0.2;
+        let inner = corners.map(|p| Vec3::from(self.axes.map(|axis| axis.dot(p - self.eye))));
+        let mut fan = Vec::with_capacity(4);
+        for k in 0..3 {
+            let (a, b) = (inner[k], inner[(k + 1) % 3]);
+            if a.z > NEAR {
+                fan.push(a);
+            }
+            if (a.z > NEAR) != (b.z > NEAR) {
+                fan.push(a.lerp(b, (NEAR - a.z) / (b.z - a.z)));
+            }
+        }
+        fan
+    }
+
+    /// Pixel and depth (growing away from the eye and linear on the screen) of a place in the eye's axes.
+    fn project(&self, p: Vec3, [width, height]: [usize; 2]) -> Vec3 {
         let (half_width, half_height) = (0.5 * width as f32, 0.5 * height as f32);
         let (scale, depth) = match self.lens {
-            Some(lens) => (half_width / (lens * z), -1.0 / z),
-            None => (half_height / self.reach, z),
+            Some(lens) => (half_width / (lens * p.z), -1.0 / p.z),
+            None => (half_height / self.reach, p.z),
         };
-        (z > 0.2).then(|| Vec3::new(half_width + x * scale, half_height - y * scale, depth))
+        Vec3::new(half_width + p.x * scale, half_height - p.y * scale, depth)
     }
 }
 
@@ -74,10 +90,16 @@ fn draw(city: &City, view: &View, size: [usize; 2], file: &Path) -> image::Image
         let world: Vec<Vec3> = mesh.positions.iter().map(|p| place(actor, *p)).collect();
         for k in 0..mesh.triangles.len() {
             let corners = mesh.triangles[k].map(|i| world[i as usize]);
-            // what reaches behind the eye is left out: good enough for a look
-            let [Some(a), Some(b), Some(c)] = corners.map(|p| view.project(p, size)) else { continue };
-            let colour = shade(city, mesh, k, corners);
-            fill(&mut colours, &mut depths, width, height, [a, b, c], colour);
+            let fan: Vec<Vec3> = view.seen(corners).into_iter().map(|p| view.project(p, size)).collect();
+            let name = &city.materials[usize::from(mesh.materials[k])].name;
+            let thin = ["glass", "leaves", "needles", "hedge"].iter().any(|thin| name.contains(thin));
+            for pair in fan.windows(2).skip(1) {
+                let [a, b, c] = [fan[0], pair[0], pair[1]];
+                // seen from behind: magenta, because only panes and leaves should be
+                let behind = (b - a).truncate().perp_dot((c - a).truncate()) > 0.0;
+                let colour = if behind && !thin { Vec3::new(1.0, 0.0, 1.0) } else { shade(city, mesh, k, corners) };
+                fill(&mut colours, &mut depths, width, height, [a, b, c], colour);
+            }
         }
     }
     let mut picture = image::RgbImage::new(width as u32, height as u32);
@@ -92,7 +114,7 @@ fn place(actor: &Actor, p: Vec3) -> Vec3 {
     pose.apply(p.as_dvec3()).as_vec3()
 }
 
-/// A triangle's colour under a sun; magenta where it is seen from behind would show wrong winding, so it is darkened.
+/// A triangle's colour under a sun.
 fn shade(city: &City, mesh: &Mesh, k: usize, [a, b, c]: [Vec3; 3]) -> Vec3 {
     let material = &city.materials[usize::from(mesh.materials[k])];
     let normal = (b - a).cross(c - a).normalize_or_zero();
@@ -113,8 +135,6 @@ fn fill(colours: &mut [Vec3], depths: &mut [f32], width: usize, height: usize, [
     if area.abs() < 1e-9 {
         return;
     }
-    // seen from behind: shown in magenta, because it should not be
-    let colour = if area > 0.0 { Vec3::new(1.0, 0.0, 1.0) } else { colour };
     for y in range(low.y, high.y, height) {
         for x in range(low.x, high.x, width) {
             let (px, py) = (x as f32 + 0.5, y as f32 + 0.5);

@@ -11,6 +11,7 @@
 //! city centred on the origin.
 
 mod build;
+mod deck;
 pub mod faults;
 mod generate;
 mod materials;
@@ -22,8 +23,10 @@ mod roads;
 pub mod sense;
 pub mod settings;
 pub mod stage;
+mod streetside;
 mod terrain;
 pub mod trace;
+mod traffic;
 pub mod words;
 
 pub use settings::{CitySettings, Layout, Traffic};

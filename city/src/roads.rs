@@ -346,11 +346,13 @@ impl Lattice {
         let layout = settings.layout;
         let extent = settings.extent_metres();
         let half = 0.5 * extent;
-        let bends = bends(layout, extent, &mut random);
+        // a strip beside a wide plain has no room for bends and alleys
+        let narrow = (1.0 - settings.plain) * extent < 130.0;
+        let bends = if narrow { Vec::new() } else { bends(layout, extent, &mut random) };
         let reach = |shift_y: bool| bends.iter().filter(|b| b.shift_y == shift_y).map(|b| b.amplitude).sum::<f64>();
         let border = RoadKind::Street.profile().front() + 0.5;
         let (reach_x, reach_y) = (reach(false) + border, reach(true) + border);
-        let fine = if matches!(layout, Layout::Alley | Layout::Mixed) { 3 } else { 1 };
+        let fine = if !narrow && matches!(layout, Layout::Alley | Layout::Mixed) { 3 } else { 1 };
         let [wide, tall] = match layout {
             Layout::CurvedCorridor => [84.0, 72.0],
             Layout::Winding => [100.0, 84.0],
@@ -409,14 +411,17 @@ impl Lattice {
         roads
     }
 
-    fn split(&self, roads: &mut Roads, quarter: Quarter) {
+    fn split(&mut self, roads: &mut Roads, quarter: Quarter) {
         let [west, east, south, north] = quarter.lines;
         let index = roads.quarters.len();
         roads.quarters.push(quarter);
         if quarter.layout == Layout::Alley {
             for j in south..north {
-                for i in west..east {
-                    roads.blocks.push(Block { lines: [i, i + 1, j, j + 1], quarter: index });
+                let mut i = west;
+                while i < east {
+                    let next = (i + 1 + usize::from(self.random.chance(0.3))).min(east);
+                    roads.blocks.push(Block { lines: [i, next, j, j + 1], quarter: index });
+                    i = next;
                 }
             }
         } else {
@@ -517,7 +522,13 @@ fn bends(layout: Layout, extent: f64, random: &mut Random) -> Vec<Bend> {
     };
     use Layout::{CurvedCorridor, Winding};
     match layout {
-        Layout::Grid | Layout::Alley | Layout::Deck => Vec::new(),
+        Layout::Grid | Layout::Deck => Vec::new(),
+        // crooked
+        Layout::Alley => vec![
+            bend(Layout::Alley, true, 87.0, 0.2),
+            bend(Layout::Alley, false, 71.0, 0.2),
+            bend(Layout::Alley, true, 310.0, 0.2),
+        ],
         CurvedCorridor => {
             let length = (0.9 * extent).clamp(200.0, 380.0);
             vec![bend(CurvedCorridor, true, length, 0.6), bend(CurvedCorridor, false, 600.0, 0.08)]
@@ -534,6 +545,8 @@ fn bends(layout: Layout, extent: f64, random: &mut Random) -> Vec<Bend> {
             bend(Winding, false, 180.0, 0.25),
             bend(Winding, true, 110.0, 0.12),
             bend(Winding, false, 97.0, 0.12),
+            bend(Layout::Alley, true, 87.0, 0.15),
+            bend(Layout::Alley, false, 71.0, 0.15),
         ],
     }
 }
@@ -546,7 +559,9 @@ fn lines(from: f64, to: f64, pitch: f64, fine: usize, jitter: f64, random: &mut 
     let mut lines = vec![from];
     let mut at = from;
     for share in shares {
-        lines.extend((1..=fine).map(|k| at + share * scale * k as f64 / fine as f64));
+        let uneven =
+            |k: usize, random: &mut Random| if k < fine { 0.2 * f64::from(random.range(-1.0, 1.0)) } else { 0.0 };
+        lines.extend((1..=fine).map(|k| at + share * scale * (k as f64 + uneven(k, random)) / fine as f64));
         at += share * scale;
     }
     lines

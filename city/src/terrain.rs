@@ -55,7 +55,7 @@ impl Terrain {
         let flat = ((self.plain_edge + 30.0 - p.x) / 150.0).clamp(0.0, 1.0);
         let hills = hills * (1.0 - flat * flat * (3.0 - 2.0 * flat));
         let beyond = (p.abs() - self.half_extent).max(DVec2::ZERO).length();
-        hills + 0.0005 * beyond * beyond
+        hills + 40.0 * beyond * beyond / (beyond * beyond + 1e5)
     }
 
     /// The place with its height.

@@ -75,10 +75,18 @@ pub(crate) fn crossing(roads: &Roads, terrain: &Terrain, node: usize, random: &R
     for arm in [0, 1] {
         let Some((index, true)) = roads.arm(node, arm) else { continue };
         if let Some(edge) = &roads.edges[index] {
-            road(&mut layer, edge, &mut random.fork(index as u64));
+            let far = if arm == 0 { node + 1 } else { node + roads.cells[0] + 1 };
+            let crossed = [node, far].map(|node| is_crossing(roads, node));
+            road(&mut layer, edge, crossed, &mut random.fork(index as u64));
         }
     }
     Some(layer.finish(format!("road {node}")))
+}
+
+/// Whether streets meet in a node: where only alleys join, a street goes on.
+fn is_crossing(roads: &Roads, node: usize) -> bool {
+    let street = |arm| roads.mouth(node, arm).is_some_and(|m| m.2.kind != RoadKind::Alley);
+    (0..4).filter(|&arm| street(arm)).count() > 2
 }
 
 /// Number of strips across a carriageway.
@@ -116,7 +124,7 @@ fn junction(layer: &mut Layer, roads: &Roads, node: usize, arms: &[(usize, Profi
     }
 }
 
-fn road(layer: &mut Layer, edge: &Edge, random: &mut Random) {
+fn road(layer: &mut Layer, edge: &Edge, crossed: [bool; 2], random: &mut Random) {
     let profile = edge.profile;
     let paved = match profile.kind {
         RoadKind::Alley => m::COBBLES,
@@ -142,11 +150,14 @@ fn road(layer: &mut Layer, edge: &Edge, random: &mut Random) {
         }
     }
     layer.builder.class(Class::RoadMarking).paint(m::PAINT_WHITE);
-    markings(layer, &line, &profile);
+    markings(layer, &line, &profile, crossed);
 }
 
-fn markings(layer: &mut Layer, line: &Line, profile: &Profile) {
+fn markings(layer: &mut Layer, line: &Line, profile: &Profile, crossed: [bool; 2]) {
     let (half, length) = (profile.half, line.length);
+    // lines keep clear of zebra crossings
+    let clear = crossed.map(|c| if c { 7.0 } else { 0.0 });
+    let (start, end) = (clear[0], length - clear[1]);
     let solid = |layer: &mut Layer, side: f64, from: f64, to: f64| {
         layer.stripe(line, [from, to], [side - 0.06, side + 0.06], PAINT);
     };
@@ -154,29 +165,30 @@ fn markings(layer: &mut Layer, line: &Line, profile: &Profile) {
         RoadKind::Alley | RoadKind::Lane => return,
         RoadKind::Winding => {
             for side in [-0.12, 0.12] {
-                solid(layer, side, 2.0, length - 2.0);
+                solid(layer, side, 0.3 * start, length - 0.3 * clear[1]);
             }
             return;
         }
         RoadKind::Boulevard => {
             for side in [-6.7, 6.7] {
-                solid(layer, side, 6.0, length - 6.0);
+                solid(layer, side, start, end);
             }
         }
         RoadKind::Street | RoadKind::Corridor => {
-            let mut at = 8.0;
-            while at + 3.0 < length - 8.0 {
+            let mut at = start + 1.0;
+            while at + 3.0 < end {
                 solid(layer, 0.0, at, at + 3.0);
                 at += 6.0;
             }
         }
     }
     for side in [-1.0, 1.0] {
-        solid(layer, side * (half - 2.15), 7.0, length - 7.0);
+        solid(layer, side * (half - 2.15), start, end);
     }
     // zebra crossings and stop lines at both ends; those who come in keep right
     let bars = ((2.0 * half - 0.6) / 1.0) as usize;
-    for [zebra, stop, way] in [[1.0, 5.2, -1.0], [length - 4.0, length - 5.6, 1.0]] {
+    let ends = [[1.0, 5.2, -1.0], [length - 4.0, length - 5.6, 1.0]];
+    for ([zebra, stop, way], _) in ends.into_iter().zip(crossed).filter(|end| end.1) {
         for k in 0..bars {
             let side = -0.5 * bars as f64 + 0.25 + k as f64;
             layer.stripe(line, [zebra, zebra + 3.0], [side, side + 0.5], PAINT);
