@@ -10,7 +10,7 @@ use crate::{Asset, City, Class, Material};
 /// Metres beyond which a street lamp counts for nothing.
 const REACH: f32 = 24.0;
 /// Light of a street lamp straight below, at a metre.
-const STREET: Vec3 = vec3(11.0, 8.6, 5.6);
+const STREET: Vec3 = vec3(26.0, 20.0, 13.0);
 
 /// What shines in a city.
 pub(crate) struct Lamps {

@@ -15,6 +15,9 @@ const OFF: f32 = 2e-3;
 /// What glass mirrors of light that meets it squarely.
 const GLASS: f32 = 0.04;
 
+/// Share of what a pane swallows that its dust sends back.
+const DUST: f32 = 0.15;
+
 /// Sun, sky and air. Light is linear RGB; 1 is what a white wall sends back in full sun.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -45,8 +48,8 @@ impl Default for Light {
         Self {
             towards_sun: vec3(0.435_194_5, -0.340_587, 0.833_475_6),
             sun: vec3(0.98, 0.91, 0.8),
-            zenith: vec3(0.19, 0.3, 0.52),
-            horizon: vec3(0.56, 0.66, 0.78),
+            zenith: vec3(0.22, 0.32, 0.48),
+            horizon: vec3(0.6, 0.67, 0.76),
             ground: vec3(0.15, 0.14, 0.12),
             lamps: 0.0,
             fog: 0.0,
@@ -137,8 +140,8 @@ impl Shader<'_> {
             Some(behind) => self.opaque(&beyond, &behind, false),
             None => self.sky(ray),
         };
-        let own = self.opaque(ray, hit, false).scale(Vec3::splat(1.0 - clear));
-        // a pane tints what comes through it
+        // what does not go through is lost in the pane, but for the dust on it
+        let own = self.opaque(ray, hit, false).scale(Vec3::splat(DUST * (1.0 - clear)));
         let tint = Vec3::ONE.lerp(material.base_colour, 0.5) * clear;
         let through = behind.scale(tint).plus(own).scale(Vec3::splat(1.0 - mirrored));
         through.add(mirrored * self.mirror(ray, hit, 0.0))

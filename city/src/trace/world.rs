@@ -22,8 +22,8 @@ const CLEAR: u32 = 1 << 31;
 /// Coordinates beyond this are a mistake, metres.
 const FARTHEST: f32 = 1e7;
 
-/// How trees are made that are made once: with care.
-const ONCE: BvhBuildParams = BvhBuildParams { pre_split: false, ..BvhBuildParams::very_slow_build() };
+/// How trees are made that many actors share: with care. Those of single pieces are made quickly.
+const SHARED: BvhBuildParams = BvhBuildParams { pre_split: false, ..BvhBuildParams::very_slow_build() };
 
 /// A city that rays cannot be cast into.
 #[derive(Debug, thiserror::Error, Clone, PartialEq, Eq)]
@@ -118,13 +118,18 @@ impl<'a> World<'a> {
     /// [`WorldError`] where the city's lists do not fit together.
     pub fn new(city: &'a City) -> Result<Self, WorldError> {
         check(city)?;
-        let solids: Vec<Solid> = city.assets.par_iter().map(|asset| Solid::new(&asset.mesh, &city.materials)).collect();
+        let mut worn = vec![0u32; city.assets.len()];
+        city.actors.iter().for_each(|actor| worn[actor.asset as usize] += 1);
+        let quality = |worn: u32| if worn > 1 { SHARED } else { BvhBuildParams::medium_build() };
+        let assets = city.assets.par_iter().zip(worn);
+        let solids: Vec<Solid> =
+            assets.map(|(asset, worn)| Solid::new(&asset.mesh, &city.materials, quality(worn))).collect();
         let row = |(i, _): (usize, &Actor)| i as u32;
         let movers: Vec<u32> =
             city.actors.iter().enumerate().filter(|(_, a)| a.trajectory.is_some()).map(row).collect();
         let still = city.actors.iter().enumerate().filter(|(_, a)| a.trajectory.is_none());
         let places = still.filter_map(|(i, a)| Place::new(&solids, i as u32, a.asset, &a.world_from_asset)).collect();
-        let standing = Level::new(places, ONCE);
+        let standing = Level::new(places, BvhBuildParams::slow_build());
         Ok(Self { city, solids, standing, movers, lamps: Lamps::new(city) })
     }
 
@@ -212,7 +217,7 @@ struct Triangle {
 }
 
 impl Solid {
-    fn new(mesh: &Mesh, materials: &[Material]) -> Self {
+    fn new(mesh: &Mesh, materials: &[Material], quality: BvhBuildParams) -> Self {
         let all: Vec<Triangle> = mesh
             .triangles
             .iter()
@@ -224,7 +229,7 @@ impl Solid {
             })
             .collect();
         let boxes: Vec<Aabb> = all.iter().map(Triangle::bounds).collect();
-        let bvh = tree(&boxes, ONCE);
+        let bvh = tree(&boxes, quality);
         let triangles = bvh.primitive_indices.iter().map(|&i| all[i as usize]).collect();
         let (low, high) = (bvh.total_aabb.min.to_array().into(), bvh.total_aabb.max.to_array().into());
         Self { bvh, triangles, low, high }
