@@ -32,7 +32,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let moment = world.at(1.0);
     println!("a moment in {:.1} ms", start.elapsed().as_secs_f64() * 1e3);
     let lens = pinhole(960, 540, 90.0)?;
-    let street = city.streets.iter().find(|street| street[0].truncate().length() < 0.3 * city.extent_metres);
+    let street = city.streets.iter().find(|street| street[0].truncate().length() < 0.4 * city.extent_metres);
     let (corner, ahead) = street.map_or((DVec3::ZERO, DVec3::X), |s| (s[0], s[s.len() - 1] - s[0]));
     let places = [
         ("street", corner + DVec3::Z * 1.7, ahead.with_z(0.0)),

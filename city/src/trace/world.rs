@@ -15,14 +15,14 @@ use rayon::prelude::*;
 use scene::Rigid;
 
 use super::{lamps::Lamps, motion};
-use crate::{Actor, City, Class, Material, Mesh};
+use crate::{Actor, Asset, City, Class, Material, Mesh};
 
 /// Marks a triangle that light goes through, in [`Triangle::row`].
 const CLEAR: u32 = 1 << 31;
 /// Coordinates beyond this are a mistake, metres.
 const FARTHEST: f32 = 1e7;
 
-/// How trees are made that many actors share: with care. Those of single pieces are made quickly.
+/// How trees are made that many actors share: with care. The ground's is made quickly.
 const SHARED: BvhBuildParams = BvhBuildParams { pre_split: false, ..BvhBuildParams::very_slow_build() };
 
 /// A city that rays cannot be cast into.
@@ -96,8 +96,14 @@ pub struct Hit {
 /// What stands in a city, indexed for rays.
 pub struct World<'a> {
     city: &'a City,
+    /// One for each asset; empty for those that one actor has for itself.
     solids: Vec<Solid>,
     standing: Level,
+    /// All standing actors that share their asset with nobody, ground above all, as one mesh in the world: their bounds
+    /// are wide and lie over each other, and a ray would have to enter most of them.
+    ground: Solid,
+    /// Of the ground's triangles by their row: the actor's row and the row in its mesh.
+    owners: Vec<(u32, u32)>,
     /// Rows of the actors that have a trajectory.
     movers: Vec<u32>,
     lamps: Lamps,
@@ -118,24 +124,34 @@ impl<'a> World<'a> {
     /// [`WorldError`] where the city's lists do not fit together.
     pub fn new(city: &'a City) -> Result<Self, WorldError> {
         check(city)?;
-        let mut worn = vec![0u32; city.assets.len()];
-        city.actors.iter().for_each(|actor| worn[actor.asset as usize] += 1);
-        let quality = |worn: u32| if worn > 1 { SHARED } else { BvhBuildParams::medium_build() };
-        let assets = city.assets.par_iter().zip(worn);
-        let solids: Vec<Solid> =
-            assets.map(|(asset, worn)| Solid::new(&asset.mesh, &city.materials, quality(worn))).collect();
         let row = |(i, _): (usize, &Actor)| i as u32;
         let movers: Vec<u32> =
             city.actors.iter().enumerate().filter(|(_, a)| a.trajectory.is_some()).map(row).collect();
-        let still = city.actors.iter().enumerate().filter(|(_, a)| a.trajectory.is_none());
-        let places = still.filter_map(|(i, a)| Place::new(&solids, i as u32, a.asset, &a.world_from_asset)).collect();
+        let shared = shared(city);
+        let solid = |(asset, &shared): (&Asset, &bool)| {
+            if shared { Solid::new(local(&asset.mesh, &city.materials), SHARED) } else { Solid::default() }
+        };
+        let solids: Vec<Solid> = city.assets.par_iter().zip(&shared).map(solid).collect();
+        let still = || city.actors.iter().enumerate().filter(|(_, a)| a.trajectory.is_none());
+        let places = still().filter_map(|(i, a)| Place::new(&solids, i as u32, a.asset, &a.world_from_asset)).collect();
         let standing = Level::new(places, BvhBuildParams::slow_build());
-        Ok(Self { city, solids, standing, movers, lamps: Lamps::new(city) })
+        let alone = still().filter(|(_, a)| !shared[a.asset as usize]);
+        let (ground, owners) = flat(city, alone.map(|(i, _)| i as u32).collect());
+        Ok(Self { city, solids, standing, ground, owners, movers, lamps: Lamps::new(city) })
     }
 
     /// The city this is of.
     pub fn city(&self) -> &'a City {
         self.city
+    }
+
+    fn ground_hit(&self, ray: &Ray, meets: Meets) -> Option<Hit> {
+        let (distance, i, corners) = self.ground.cast(ray.origin, ray.direction, ray, ray.to, meets)?;
+        let met = &self.ground.triangles[i];
+        let (actor, triangle) = self.owners[(met.row & !CLEAR) as usize];
+        let normal = turned(met.second.cross(met.third).normalize_or_zero(), ray.direction);
+        let asset = self.city.actors[actor as usize].asset;
+        Some(Hit { distance, actor, asset, triangle, corners, normal })
     }
 
     /// The city at a moment.
@@ -157,18 +173,22 @@ impl<'a> Moment<'a> {
 
     /// The first surface along a ray.
     pub fn cast(&self, ray: &Ray, meets: Meets) -> Option<Hit> {
-        let still = self.world.standing.cast(&self.world.solids, ray, meets);
+        let world = self.world;
+        let ground = world.ground_hit(ray, meets);
+        let shorter = |hit: Option<Hit>| Ray { to: hit.map_or(ray.to, |hit| hit.distance), ..*ray };
+        let still = world.standing.cast(&world.solids, &shorter(ground), meets).or(ground);
         if self.moving.places.is_empty() {
             return still;
         }
-        let shorter = Ray { to: still.map_or(ray.to, |hit| hit.distance), ..*ray };
-        self.moving.cast(&self.world.solids, &shorter, meets).or(still)
+        self.moving.cast(&world.solids, &shorter(still), meets).or(still)
     }
 
     /// True where something opaque lies on the ray: its light does not arrive.
     pub fn is_blocked(&self, ray: &Ray) -> bool {
-        let solids = &self.world.solids;
-        self.world.standing.blocks(solids, ray) || (!self.moving.places.is_empty() && self.moving.blocks(solids, ray))
+        let World { solids, ground, standing, .. } = self.world;
+        standing.blocks(solids, ray)
+            || (!self.moving.places.is_empty() && self.moving.blocks(solids, ray))
+            || ground.blocks(ray.origin, ray.direction, ray)
     }
 
     /// What shines at night.
@@ -198,7 +218,55 @@ impl<'a> Moment<'a> {
     }
 }
 
-/// An asset's triangles in the order of the tree over them.
+/// Which assets more than one actor has, or one that moves.
+fn shared(city: &City) -> Vec<bool> {
+    let mut worn = vec![0u32; city.assets.len()];
+    for actor in &city.actors {
+        let moves = actor.trajectory.is_some();
+        worn[actor.asset as usize] += if moves { 2 } else { 1 };
+        actor.trajectory.iter().flat_map(|t| &t.gait).for_each(|&asset| worn[asset as usize] += 2);
+    }
+    worn.into_iter().map(|worn| worn > 1).collect()
+}
+
+/// Some standing actors as one mesh in the world, and whose each triangle is.
+fn flat(city: &City, actors: Vec<u32>) -> (Solid, Vec<(u32, u32)>) {
+    let (mut triangles, mut owners) = (Vec::new(), Vec::new());
+    for row in actors {
+        let actor = &city.actors[row as usize];
+        let pose = &actor.world_from_asset;
+        let (turn, origin) = (rotation(pose), pose.translation.as_vec3());
+        for triangle in local(&city.assets[actor.asset as usize].mesh, &city.materials) {
+            let name = owners.len() as u32 | (triangle.row & CLEAR);
+            owners.push((row, triangle.row & !CLEAR));
+            let (second, third) = (turn * triangle.second, turn * triangle.third);
+            triangles.push(Triangle { corner: turn * triangle.corner + origin, second, third, row: name });
+        }
+    }
+    (Solid::new(triangles, BvhBuildParams::medium_build()), owners)
+}
+
+/// A mesh's triangles in its own frame.
+fn local(mesh: &Mesh, materials: &[Material]) -> Vec<Triangle> {
+    let one = |(i, corners): (usize, &[u32; 3])| {
+        let [a, b, c] = corners.map(|corner| mesh.positions[corner as usize]);
+        let clear = materials[usize::from(mesh.materials[i])].transparency > 0.0;
+        Triangle { corner: a, second: b - a, third: c - a, row: i as u32 | if clear { CLEAR } else { 0 } }
+    };
+    mesh.triangles.iter().enumerate().map(one).collect()
+}
+
+fn rotation(pose: &Rigid) -> Mat3 {
+    Mat3::from_quat(Quat::from_array(pose.rotation.as_quat().to_array()).normalize())
+}
+
+/// A normal to the side that a ray came from.
+fn turned(normal: Vec3, direction: Vec3) -> Vec3 {
+    if normal.dot(direction) > 0.0 { -normal } else { normal }
+}
+
+/// Triangles in the order of the tree over them.
+#[derive(Default)]
 struct Solid {
     bvh: CwBvh,
     triangles: Vec<Triangle>,
@@ -212,27 +280,51 @@ struct Triangle {
     corner: Vec3,
     second: Vec3,
     third: Vec3,
-    /// Row of the mesh's triangles; the highest bit marks glass.
+    /// Its number; the highest bit marks glass.
     row: u32,
 }
 
 impl Solid {
-    fn new(mesh: &Mesh, materials: &[Material], quality: BvhBuildParams) -> Self {
-        let all: Vec<Triangle> = mesh
-            .triangles
-            .iter()
-            .enumerate()
-            .map(|(i, t)| {
-                let [a, b, c] = t.map(|corner| mesh.positions[corner as usize]);
-                let clear = materials[usize::from(mesh.materials[i])].transparency > 0.0;
-                Triangle { corner: a, second: b - a, third: c - a, row: i as u32 | if clear { CLEAR } else { 0 } }
-            })
-            .collect();
+    fn new(all: Vec<Triangle>, quality: BvhBuildParams) -> Self {
         let boxes: Vec<Aabb> = all.iter().map(Triangle::bounds).collect();
         let bvh = tree(&boxes, quality);
         let triangles = bvh.primitive_indices.iter().map(|&i| all[i as usize]).collect();
         let (low, high) = (bvh.total_aabb.min.to_array().into(), bvh.total_aabb.max.to_array().into());
         Self { bvh, triangles, low, high }
+    }
+
+    /// The nearest triangle along a ray given in the mesh's own frame: its distance, its place in the order and the
+    /// shares of its corners.
+    #[inline(always)]
+    fn cast(&self, origin: Vec3, direction: Vec3, ray: &Ray, to: f32, meets: Meets) -> Option<(f32, usize, Vec2)> {
+        let (mut nearest, mut found) = (to, None);
+        let unused = &mut RayHit::none();
+        self.bvh.ray_traverse(outer(origin, direction, to), unused, |_, i| {
+            let triangle = &self.triangles[i];
+            match triangle.meet(origin, direction) {
+                Some((t, u, v))
+                    if t > ray.from && t < nearest && !(meets == Meets::Opaque && triangle.row & CLEAR != 0) =>
+                {
+                    nearest = t;
+                    found = Some((t, i, Vec2::new(u, v)));
+                    t
+                }
+                _ => f32::INFINITY,
+            }
+        });
+        found
+    }
+
+    /// Whether an opaque triangle lies on a ray given in the mesh's own frame.
+    #[inline(always)]
+    fn blocks(&self, origin: Vec3, direction: Vec3, ray: &Ray) -> bool {
+        !self.bvh.ray_traverse_miss(outer(origin, direction, ray.to), |_, i| {
+            let triangle = &self.triangles[i];
+            match triangle.meet(origin, direction) {
+                Some((t, ..)) if t > ray.from && t < ray.to && triangle.row & CLEAR == 0 => t,
+                _ => f32::INFINITY,
+            }
+        })
     }
 }
 
@@ -275,7 +367,7 @@ impl Place {
         if triangles.is_empty() {
             return None;
         }
-        let world_from_asset = Mat3::from_quat(Quat::from_array(pose.rotation.as_quat().to_array()).normalize());
+        let world_from_asset = rotation(pose);
         let origin = pose.translation.as_vec3();
         let (centre, half) = (0.5 * (*low + *high), 0.5 * (*high - *low));
         let reach = world_from_asset.x_axis.abs() * half.x
@@ -310,51 +402,40 @@ impl Level {
     }
 
     fn cast(&self, solids: &[Solid], ray: &Ray, meets: Meets) -> Option<Hit> {
-        let mut found: Option<(u32, u32, Vec2)> = None;
+        let mut found: Option<(usize, usize, Vec2)> = None;
         let mut nearest = ray.to;
         let unused = &mut RayHit::none();
-        self.bvh.ray_traverse(outer(ray.origin, ray.direction, nearest), unused, |_, place| {
-            let here = &self.places[place];
-            let solid = &solids[here.solid as usize];
-            let (origin, direction) = here.inside(ray);
-            let unused = &mut RayHit::none();
-            solid.bvh.ray_traverse(outer(origin, direction, nearest), unused, |_, i| {
-                let triangle = &solid.triangles[i];
-                match triangle.meet(origin, direction) {
-                    Some((t, u, v))
-                        if t > ray.from && t < nearest && !(meets == Meets::Opaque && triangle.row & CLEAR != 0) =>
-                    {
-                        nearest = t;
-                        found = Some((place as u32, i as u32, Vec2::new(u, v)));
-                        t
-                    }
-                    _ => f32::INFINITY,
-                }
-            });
+        self.bvh.ray_traverse(outer(ray.origin, ray.direction, nearest), unused, |_, i| {
+            let place = &self.places[i];
+            let (origin, direction) = place.inside(ray);
+            if let Some((t, triangle, corners)) =
+                solids[place.solid as usize].cast(origin, direction, ray, nearest, meets)
+            {
+                nearest = t;
+                found = Some((i, triangle, corners));
+            }
             nearest
         });
-        let (place, i, corners) = found?;
-        let place = &self.places[place as usize];
-        let triangle = &solids[place.solid as usize].triangles[i as usize];
-        let normal = place.asset_from_world.transpose() * triangle.second.cross(triangle.third).normalize_or_zero();
-        let normal = if normal.dot(ray.direction) > 0.0 { -normal } else { normal };
-        let (asset, triangle) = (place.solid, triangle.row & !CLEAR);
-        Some(Hit { distance: nearest, actor: place.actor, asset, triangle, corners, normal })
+        let (place, triangle, corners) = found?;
+        let place = &self.places[place];
+        let met = &solids[place.solid as usize].triangles[triangle];
+        let normal = place.asset_from_world.transpose() * met.second.cross(met.third).normalize_or_zero();
+        let (asset, triangle) = (place.solid, met.row & !CLEAR);
+        Some(Hit {
+            distance: nearest,
+            actor: place.actor,
+            asset,
+            triangle,
+            corners,
+            normal: turned(normal, ray.direction),
+        })
     }
 
     fn blocks(&self, solids: &[Solid], ray: &Ray) -> bool {
-        !self.bvh.ray_traverse_miss(outer(ray.origin, ray.direction, ray.to), |_, place| {
-            let here = &self.places[place];
-            let solid = &solids[here.solid as usize];
-            let (origin, direction) = here.inside(ray);
-            let missed = solid.bvh.ray_traverse_miss(outer(origin, direction, ray.to), |_, i| {
-                let triangle = &solid.triangles[i];
-                match triangle.meet(origin, direction) {
-                    Some((t, ..)) if t > ray.from && t < ray.to && triangle.row & CLEAR == 0 => t,
-                    _ => f32::INFINITY,
-                }
-            });
-            if missed { f32::INFINITY } else { ray.from }
+        !self.bvh.ray_traverse_miss(outer(ray.origin, ray.direction, ray.to), |_, i| {
+            let place = &self.places[i];
+            let (origin, direction) = place.inside(ray);
+            if solids[place.solid as usize].blocks(origin, direction, ray) { ray.from } else { f32::INFINITY }
         })
     }
 }
