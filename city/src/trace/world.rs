@@ -37,8 +37,8 @@ pub enum WorldError {
     /// An actor's asset is not there, or its pose or trajectory is not one.
     #[error("actor {0}: its asset or its pose is not there")]
     Actor(usize),
-    /// More than can be counted in 31 bits.
-    #[error("too many triangles in asset {0}")]
+    /// More triangles than can be counted in 31 bits, with this asset's.
+    #[error("too many triangles with those of asset {0}")]
     TooLarge(usize),
 }
 
@@ -456,9 +456,6 @@ fn check(city: &City) -> Result<(), WorldError> {
     for (i, asset) in city.assets.iter().enumerate() {
         let mesh = &asset.mesh;
         let count = mesh.triangles.len();
-        if count >= CLEAR as usize {
-            return Err(WorldError::TooLarge(i));
-        }
         let corners = mesh.positions.len();
         let fits = mesh.uvs.len() == corners && mesh.materials.len() == count && mesh.classes.len() == count;
         let named = mesh.triangles.iter().flatten().all(|&c| (c as usize) < corners);
@@ -468,6 +465,13 @@ fn check(city: &City) -> Result<(), WorldError> {
         let real = |p: &Vec3| p.abs().max_element() < FARTHEST && p.is_finite();
         if !mesh.positions.iter().all(real) || !mesh.uvs.iter().all(|uv| uv.is_finite()) {
             return Err(WorldError::Coordinate(i));
+        }
+    }
+    let mut triangles = 0;
+    for (i, asset) in city.assets.iter().enumerate() {
+        triangles += asset.mesh.triangles.len();
+        if triangles >= CLEAR as usize {
+            return Err(WorldError::TooLarge(i));
         }
     }
     let sane = |pose: &Rigid| pose.is_sane() && pose.translation.abs().max_element() < f64::from(FARTHEST);
