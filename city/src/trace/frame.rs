@@ -27,6 +27,9 @@ pub const NOTHING: u8 = 255;
 pub const NO_MATERIAL: u16 = u16::MAX;
 /// Times for which what moves is placed anew while a picture is taken: an odd number, so that one is its middle.
 const TICKS: usize = 15;
+/// Side of the square of pixels that share their tries for light from around: one direction each. With fewer, what stands
+/// near shows as so many faint shadows of itself.
+const SQUARE: u32 = 8;
 /// How near something must be to take light from around away, metres.
 const CORNER: f32 = 4.0;
 
@@ -269,12 +272,12 @@ impl<'a> Take<'a> {
         }
     }
 
-    /// Whether one of sixteen directions, another one for each pixel of a square of four by four, is free.
+    /// Whether a direction, another one for each pixel of a square, is free.
     fn is_open(&self, moment: &Moment, ray: &Ray, hit: Option<&Hit>, x: u32, y: u32) -> bool {
         let Some(hit) = hit.filter(|_| self.options.corners) else { return true };
-        let which = (x % 4) * 4 + (y % 4);
+        let which = (x % SQUARE) * SQUARE + y % SQUARE;
         // Fibonacci's spiral on the disc, lifted onto the hemisphere: directions as frequent as their light counts
-        let radius = ((which as f32 + 0.5) / 16.0).sqrt();
+        let radius = ((which as f32 + 0.5) / (SQUARE * SQUARE) as f32).sqrt();
         let angle = which as f32 * 2.399_963_2;
         let disc = Vec2::new(angle.cos(), angle.sin()) * radius;
         let local = disc.extend((1.0 - radius * radius).max(0.0).sqrt());
@@ -317,15 +320,16 @@ impl Frame {
     }
 }
 
-/// One light of two: that from around is less where, of the sixteen directions that a pixel and its neighbours on the
-/// same surface tried, some were taken. What takes the light away sends a third of it back.
+/// One light of two: that from around is less where, of the directions that a pixel and its neighbours on the same
+/// surface tried, some were taken. What takes the light away sends a third of it back.
 fn merge(frame: &Frame, glows: &[Glow], open: &[bool]) -> Vec<Vec3> {
     let (width, height) = (frame.width as i32, frame.height as i32);
+    let side = SQUARE as i32;
     let one = |i: usize| {
         let (x, y) = (i as i32 % width, i as i32 / width);
         let (normal, depth) = (Vec3::from(frame.normals[i]), frame.first.depth[i]);
         let (mut free, mut all) = (0.0, 0.0);
-        for (dx, dy) in (0..16).map(|n| (n % 4 - 1, n / 4 - 1)) {
+        for (dx, dy) in (0..side * side).map(|n| (n % side - (side - 1) / 2, n / side - (side - 1) / 2)) {
             let (u, v) = (x + dx, y + dy);
             if u < 0 || v < 0 || u >= width || v >= height {
                 continue;
