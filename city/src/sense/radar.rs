@@ -1,11 +1,12 @@
 //! A radar for the road: some hundred detections a sweep, each a range, an azimuth and a radial velocity.
 //!
-//! A fan of rays finds what it can see; a surface scatters back by what it is (metal and vehicles most, walls less, ground
-//! and leaves little) and how squarely it is met. Power falls with the fourth power of range (the radar equation, Skolnik
-//! 2008). Returns that share a cell of range, azimuth and velocity are one detection, of the strongest; the strongest
-//! cells are kept. **Ghosts** are what multipath makes: a strong return seen again, farther along the same azimuth and
-//! with its velocity doubled (the pulse went there twice), or mirrored in the road side's plane. Velocities are positive
-//! away from the sensor and relative to it, as radars report them.
+//! A fan of rays finds what it can see; a surface scatters back by what it is (metal and vehicles most, walls less,
+//! ground and leaves little) and how squarely it is met. Power falls with the fourth power of range (the radar
+//! equation, Skolnik 2008). Returns that share a cell of range, azimuth and velocity are one detection, of the
+//! strongest; the cells that scatter most are kept, as gain is turned down for what is near. **Ghosts** are what
+//! multipath makes: a strong return seen again, farther along the same azimuth and with its velocity doubled (the pulse
+//! went there twice), or mirrored in the road side's plane. Velocities are positive away from the sensor and relative
+//! to it, as radars report them.
 //!
 //! Street Detection Gaussians (section 3.4) uses such detections as sparse, geometrically reliable depth.
 
@@ -213,7 +214,9 @@ impl Radar {
             }
         }
         let mut kept: Vec<Detection> = cells.into_values().collect();
-        kept.sort_by(|a, b| b.power.total_cmp(&a.power));
+        // gain is turned down for what is near, or nothing else would be seen
+        let even = |found: &Detection| f64::from(found.power) + 40.0 * found.true_range.log10();
+        kept.sort_by(|a, b| even(b).total_cmp(&even(a)));
         kept.truncate(self.most as usize);
         kept
     }
