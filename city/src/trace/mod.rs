@@ -8,6 +8,7 @@
 //! make bytes of it. Surfaces are matt but for glass, paint and metal, which mirror what stands before them.
 
 pub mod frame;
+mod index;
 mod lamps;
 pub mod motion;
 pub(crate) mod pattern;
