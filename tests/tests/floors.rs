@@ -8,11 +8,12 @@ use cargo_metadata::{DependencyKind, Metadata, MetadataCommand, PackageId};
 
 /// Each crate's floor in tenths, lowest first. A normal or build dependency must be strictly lower than its user, a
 /// dev-dependency not higher.
-const FLOORS: [(&str, u32); 16] = [
+const FLOORS: [(&str, u32); 17] = [
     ("scene", 0),
     ("shaders", 0),
     ("blocks", 10),
     ("cluster", 10),
+    ("city", 20),
     ("render", 20),
     ("train", 21),
     ("perceive", 22),
@@ -28,10 +29,11 @@ const FLOORS: [(&str, u32); 16] = [
 ];
 
 /// What must not be reachable through normal dependencies, however indirectly.
-const ABSENT: [(&str, &[&str]); 6] = [
+const ABSENT: [(&str, &[&str]); 7] = [
     ("scene", &["tokio", "object_store", "tonic", "rayon", "wgpu", "image"]),
     ("blocks", &["tokio", "object_store", "tonic", "rayon", "wgpu", "image"]),
     ("cluster", &["tokio", "object_store", "tonic", "rayon", "wgpu", "image"]),
+    ("city", &["tokio", "object_store", "tonic"]),
     ("render", &["tokio", "object_store", "tonic"]),
     ("train", &["tokio", "object_store", "tonic"]),
     ("coordinator", &["render", "train", "dataset", "worker", "wgpu"]),

@@ -1,0 +1,156 @@
+//! People as jointed bodies: walking in sixteen phases of their gait, and riding.
+//!
+//! x is ahead, y to the left, z up; the lower foot stands in the plane of the origin. Angles of hip, knee, shoulder and elbow
+//! follow sines that resemble measured gait (Winter, "Biomechanics and Motor Control of Human Movement", chapter 3): hips
+//! swing about ±25°, a knee bends to 60° while its leg swings, arms go against the legs.
+
+use std::f32::consts::TAU;
+
+use glam::{Affine3A, Vec3};
+
+use super::Builder;
+use crate::materials::{self as m, Surface};
+use crate::words::{Asset, Class};
+
+/// Phases of a gait.
+pub(crate) const PHASES: usize = 16;
+/// Number of different people.
+pub(crate) const BUILDS: usize = 8;
+/// Length of a double step of somebody 1.75 m tall, metres.
+pub(crate) const STRIDE: f64 = 1.4;
+
+/// What somebody looks like.
+struct Look {
+    height: f32,
+    girth: f32,
+    top: Surface,
+    trousers: Surface,
+    skin: Surface,
+    skirt: bool,
+    bag: bool,
+    hat: bool,
+}
+
+const fn look(height: f32, girth: f32, top: Surface, trousers: Surface, skin: Surface, extras: [bool; 3]) -> Look {
+    let [skirt, bag, hat] = extras;
+    Look { height, girth, top, trousers, skin, skirt, bag, hat }
+}
+
+const LOOKS: [Look; BUILDS] = [
+    look(1.78, 1.0, m::CLOTH_BLUE, m::DENIM, m::SKIN_LIGHT, [false, true, false]),
+    look(1.66, 0.9, m::CLOTH_RED, m::CLOTH_BLACK, m::SKIN_LIGHT, [true, false, false]),
+    look(1.85, 1.1, m::CLOTH_GREY, m::CLOTH_BLACK, m::SKIN_DARK, [false, false, true]),
+    look(1.70, 1.2, m::CLOTH_BEIGE, m::CLOTH_GREY, m::SKIN_LIGHT, [false, true, true]),
+    look(1.62, 0.95, m::CLOTH_GREEN, m::DENIM, m::SKIN_DARK, [false, false, false]),
+    look(1.20, 0.75, m::PLASTIC_RED, m::DENIM, m::SKIN_LIGHT, [false, true, false]),
+    look(1.73, 1.0, m::CLOTH_WHITE, m::CLOTH_BEIGE, m::SKIN_DARK, [true, true, false]),
+    look(1.80, 1.05, m::CLOTH_BLACK, m::CLOTH_GREY, m::SKIN_LIGHT, [false, false, true]),
+];
+
+/// Height of a build relative to the average: its stride too.
+pub(crate) fn scale(build: usize) -> f64 {
+    f64::from(LOOKS[build % BUILDS].height) / 1.75
+}
+
+/// Angles of the limbs, radians, positive ahead.
+#[derive(Clone, Copy)]
+struct Pose {
+    hips: [f32; 2],
+    knees: [f32; 2],
+    shoulders: [f32; 2],
+    elbows: [f32; 2],
+    lean: f32,
+}
+
+fn gait(phase: usize) -> Pose {
+    let turn = |side: f32| TAU * (phase as f32 / PHASES as f32) + side * TAU / 2.0;
+    let hip = |t: f32| 0.07 + 0.42 * t.sin();
+    // a knee bends most while its thigh comes forward
+    let knee = |t: f32| 0.12 + 0.9 * (t.cos().max(0.0)).powi(2);
+    let shoulder = |t: f32| -0.4 * t.sin();
+    let elbow = |t: f32| 0.35 - 0.2 * t.sin();
+    let (left, right) = (turn(0.0), turn(1.0));
+    Pose {
+        hips: [hip(left), hip(right)],
+        knees: [knee(left), knee(right)],
+        shoulders: [shoulder(left), shoulder(right)],
+        elbows: [elbow(left), elbow(right)],
+        lean: 0.05,
+    }
+}
+
+/// Somebody in a phase of walking.
+pub(crate) fn walker(build: usize, phase: usize) -> Asset {
+    let look = &LOOKS[build % BUILDS];
+    let mut b = Builder::new(Class::Person);
+    body(&mut b, look, gait(phase));
+    let lowest = b.lowest();
+    b.shift(Vec3::Z * -lowest);
+    b.finish(format!("person {build}, phase {phase}"))
+}
+
+/// Somebody who rides: hips at the origin.
+pub(crate) fn rider(b: &mut Builder, build: usize, pedals: bool) {
+    let look = &LOOKS[build % BUILDS];
+    let spread = if pedals { 0.35 } else { 0.0 };
+    let pose = Pose {
+        hips: [1.15 + spread, 1.15 - spread],
+        knees: [1.35 + 0.6 * spread, 1.35 - 0.6 * spread],
+        shoulders: [0.95; 2],
+        elbows: [0.25; 2],
+        lean: 0.35,
+    };
+    b.class(Class::Rider);
+    let hip = look.height * 0.52;
+    b.within(Affine3A::from_translation(-Vec3::Z * hip), |b| body(b, look, pose));
+}
+
+fn body(b: &mut Builder, look: &Look, pose: Pose) {
+    let h = look.height;
+    let hip = Vec3::Z * 0.52 * h;
+    let (thigh, shin) = (0.25 * h, 0.25 * h);
+    for (k, side) in [(0, 1.0), (1, -1.0)] {
+        let socket = hip + Vec3::Y * side * 0.055 * h * look.girth;
+        let limb = |angle: f32, length: f32| length * Vec3::new(angle.sin(), 0.0, -angle.cos());
+        let knee = socket + limb(pose.hips[k], thigh);
+        let foot = pose.hips[k] - pose.knees[k];
+        let ankle = knee + limb(foot, shin);
+        b.paint(look.trousers).tube(socket, knee, [0.05 * h * look.girth, 0.034 * h], 7);
+        b.paint(if look.skirt { look.skin } else { look.trousers }).tube(knee, ankle, [0.034 * h, 0.024 * h], 7);
+        // a foot stays near the horizontal while it is loaded
+        let pitch = (0.6 * foot).min(0.2);
+        b.within(Affine3A::from_translation(ankle) * Affine3A::from_rotation_y(-pitch), |b| {
+            let (low, high) = (Vec3::new(-0.045, -0.024, -0.035), Vec3::new(0.105, 0.024, 0.012));
+            b.paint(m::LEATHER).cuboid(low * h, high * h);
+        });
+    }
+    b.within(Affine3A::from_translation(hip) * Affine3A::from_rotation_y(pose.lean), |b| torso(b, look, pose));
+}
+
+/// What is above the hips, in their frame.
+fn torso(b: &mut Builder, look: &Look, pose: Pose) {
+    let (h, g) = (look.height, look.girth);
+    let still = |_: Vec3| 1.0;
+    if look.skirt {
+        b.paint(look.trousers).tube(Vec3::Z * -0.2 * h, Vec3::Z * 0.03 * h, [0.125 * h, 0.085 * h], 9);
+    } else {
+        b.paint(look.trousers).ball(Vec3::ZERO, Vec3::new(0.068 * g, 0.1 * g, 0.06) * h, 5, &still);
+    }
+    b.paint(look.top).ball(Vec3::Z * 0.15 * h, Vec3::new(0.068 * g, 0.108 * g, 0.185) * h, 7, &still);
+    b.paint(look.skin).tube(Vec3::Z * 0.3 * h, Vec3::Z * 0.36 * h, [0.032 * h, 0.03 * h], 6);
+    b.ball(Vec3::new(0.01, 0.0, 0.405) * h, Vec3::new(0.054, 0.043, 0.064) * h, 6, &still);
+    b.paint(if look.hat { look.trousers } else { m::HAIR });
+    b.ball(Vec3::new(-0.004, 0.0, 0.424) * h, Vec3::new(0.058, 0.048, 0.056) * h, 6, &still);
+    if look.bag {
+        b.paint(m::LEATHER).cuboid(Vec3::new(-0.14, -0.08, 0.08) * h, Vec3::new(-0.06, 0.08, 0.29) * h);
+    }
+    for (k, side) in [(0, 1.0), (1, -1.0)] {
+        let shoulder = Vec3::new(0.0, side * 0.118 * g, 0.275) * h;
+        let limb = |angle: f32, length: f32| length * h * Vec3::new(angle.sin(), side * 0.06, -angle.cos());
+        let elbow = shoulder + limb(pose.shoulders[k], 0.17);
+        let hand = elbow + limb(pose.shoulders[k] + pose.elbows[k], 0.16);
+        b.paint(look.top).tube(shoulder, elbow, [0.032 * h, 0.025 * h], 6);
+        b.tube(elbow, hand, [0.025 * h, 0.019 * h], 6);
+        b.paint(look.skin).ball(hand, Vec3::splat(0.024 * h), 4, &still);
+    }
+}

@@ -1,0 +1,93 @@
+//! Random numbers as pure functions of a key and a counter, so that neither order nor threads can change them.
+
+use glam::Vec2;
+
+/// A well mixed hash of a key and a counter (SplitMix64's finaliser, Steele et al. 2014, twice).
+pub fn bits(key: u64, counter: u64) -> u64 {
+    let mix = |mut z: u64| {
+        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+        z ^ (z >> 31)
+    };
+    mix(mix(key.wrapping_add(0x9e37_79b9_7f4a_7c15)).wrapping_add(counter.wrapping_mul(0x9e37_79b9_7f4a_7c15)))
+}
+
+/// A stream of random numbers: whoever builds something takes one of its own, by what it builds and where.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Random {
+    key: u64,
+    count: u64,
+}
+
+impl Random {
+    /// The stream of a key.
+    pub fn new(key: u64) -> Self {
+        Self { key, count: 0 }
+    }
+
+    /// A stream apart, by a number that says what for.
+    pub fn fork(&self, purpose: u64) -> Self {
+        Self::new(bits(self.key, purpose ^ 0xC17C_17C1_7C17_C17C))
+    }
+
+    /// 64 random bits.
+    pub fn bits(&mut self) -> u64 {
+        self.count += 1;
+        bits(self.key, self.count)
+    }
+
+    /// Uniform in [0, 1).
+    pub fn unit(&mut self) -> f32 {
+        (self.bits() >> 40) as f32 / (1u64 << 24) as f32
+    }
+
+    /// Uniform between two numbers.
+    pub fn range(&mut self, from: f32, to: f32) -> f32 {
+        from + (to - from) * self.unit()
+    }
+
+    /// Uniform in `0 .. n`; 0 for none.
+    pub fn below(&mut self, n: usize) -> usize {
+        (self.bits() % (n.max(1) as u64)) as usize
+    }
+
+    /// True this often.
+    pub fn chance(&mut self, probability: f32) -> bool {
+        self.unit() < probability
+    }
+
+    /// One of some things.
+    ///
+    /// # Panics
+    /// There are none.
+    pub fn one_of<'a, T>(&mut self, things: &'a [T]) -> &'a T {
+        &things[self.below(things.len())]
+    }
+
+    /// Uniform in a rectangle.
+    pub fn between(&mut self, min: Vec2, max: Vec2) -> Vec2 {
+        min + (max - min) * Vec2::new(self.unit(), self.unit())
+    }
+
+    /// Normally distributed with unit variance (Box and Muller).
+    pub fn normal(&mut self) -> f32 {
+        let radius = (-2.0 * (1.0 - self.unit()).ln()).sqrt();
+        radius * (std::f32::consts::TAU * self.unit()).cos()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn streams_are_apart_and_uniform() {
+        let (mut a, mut b) = (Random::new(1), Random::new(1).fork(2));
+        assert_ne!(a.bits(), b.bits());
+        let mean: f32 = (0..10_000).map(|_| a.unit()).sum::<f32>() / 1e4;
+        assert!((mean - 0.5).abs() < 0.02, "{mean}");
+        let variance: f32 = (0..10_000).map(|_| b.normal().powi(2)).sum::<f32>() / 1e4;
+        assert!((variance - 1.0).abs() < 0.06, "{variance}");
+        assert!((0..100).all(|_| b.below(3) < 3));
+    }
+}

@@ -1,0 +1,246 @@
+//! A car with six cameras that drives the streets end to end.
+//!
+//! Placement follows KITTI-360 as CarlaOcc (supplement 1.1) completes it: no tilt, perspective lenses of one field of view
+//! (103.7°, 1408 × 376), a stereo pair ahead, one camera to each side and a stereo pair behind. Metres from the point of
+//! the road under the car's centre, x ahead, y left, z up:
+//!
+//! | camera | x | y | z | yaw |
+//! |---|---|---|---|---|
+//! | `front-left`, `front-right` | 0.80 | ±0.30 | 1.65 | 0° |
+//! | `left`, `right` | 0.00 | ±0.55 | 1.65 | ±90° |
+//! | `rear-left`, `rear-right` | −0.80 | ±0.30 | 1.65 | 180° |
+
+use glam::{DMat3, DQuat, DVec3};
+use scene::Rigid;
+use serde::{Deserialize, Serialize};
+
+use super::{Motion, SenseError, Shot, count, looking, pinhole, within};
+use crate::{City, Waypoint, trace::motion};
+
+/// A sensor on a car: metres from the point of the road under its centre.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Mount {
+    /// Its name.
+    pub name: String,
+    /// x ahead, y left, z up, metres.
+    pub offset: DVec3,
+    /// To the left, degrees.
+    pub yaw_degrees: f64,
+}
+
+/// The car, its cameras and how it drives.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Rig {
+    /// The cameras.
+    pub cameras: Vec<Mount>,
+    /// Pixels in a row.
+    pub width: u32,
+    /// Rows.
+    pub height: u32,
+    /// Horizontal field of view, degrees.
+    pub field_degrees: f64,
+    /// Metres from one round of pictures to the next.
+    pub spacing_metres: f64,
+    /// Metres per second.
+    pub speed: f64,
+    /// Metres to the right of the lines of [`City::streets`].
+    pub lane_metres: f64,
+    /// The city's clock where it starts.
+    pub start_seconds: f64,
+    /// Every street by a car of its own, all starting at once; else one car drives one after the other.
+    pub fleet: bool,
+    /// Seconds from the first to the last row.
+    pub rolling_shutter_seconds: f64,
+    /// Seconds that the shutter is open.
+    pub shutter_seconds: f64,
+}
+
+impl Default for Rig {
+    fn default() -> Self {
+        let mount =
+            |name: &str, x, y, yaw_degrees| Mount { name: name.into(), offset: DVec3::new(x, y, 1.65), yaw_degrees };
+        Self {
+            cameras: vec![
+                mount("front-left", 0.8, 0.3, 0.0),
+                mount("front-right", 0.8, -0.3, 0.0),
+                mount("left", 0.0, 0.55, 90.0),
+                mount("right", 0.0, -0.55, -90.0),
+                mount("rear-left", -0.8, 0.3, 180.0),
+                mount("rear-right", -0.8, -0.3, 180.0),
+            ],
+            width: 1408,
+            height: 376,
+            field_degrees: 103.7,
+            spacing_metres: 2.0,
+            speed: 10.0,
+            lane_metres: 0.0,
+            start_seconds: 0.0,
+            fleet: false,
+            rolling_shutter_seconds: 0.0,
+            shutter_seconds: 0.0,
+        }
+    }
+}
+
+/// Drives every street of a city and lists the pictures on the way, round by round.
+///
+/// # Errors
+/// [`SenseError`] for settings out of range, or more pictures than a list may hold.
+pub fn drive(city: &City, rig: &Rig) -> Result<Vec<Shot>, SenseError> {
+    let lens = pinhole(rig.width, rig.height, rig.field_degrees)?;
+    within("rolling_shutter_seconds", rig.rolling_shutter_seconds, 0.0, 1.0)?;
+    within("shutter_seconds", rig.shutter_seconds, 0.0, 1.0)?;
+    let offsets = rig.cameras.iter().all(|m| m.offset.abs().max_element() < 100.0 && m.yaw_degrees.abs() <= 360.0);
+    if !offsets {
+        return Err(SenseError::Setting("a camera's mount"));
+    }
+    let legs = legs(city, rig)?;
+    count(legs.iter().map(|leg| leg.len() as f64).sum::<f64>() * rig.cameras.len() as f64)?;
+    let mut shots = Vec::new();
+    for (street, leg) in legs.iter().enumerate() {
+        for (i, here) in leg.iter().enumerate() {
+            let (a, b) = (&leg[i.saturating_sub(1)], &leg[(i + 1).min(leg.len() - 1)]);
+            let motion = Motion::between(&a.world_from_asset, &b.world_from_asset, b.seconds - a.seconds);
+            for mount in &rig.cameras {
+                let pose = &here.world_from_asset;
+                let arm = pose.rotation * mount.offset;
+                let forward = pose.rotation * (DQuat::from_rotation_z(mount.yaw_degrees.to_radians()) * DVec3::X);
+                let camera = looking(lens, pose.translation + arm, forward, DVec3::Z);
+                let name = format!("{}-{street:04}-{i:05}", mount.name);
+                let mut shot = Shot::new(name, &mount.name, here.seconds, camera);
+                // a camera on an arm moves with the car and is swung around its centre
+                shot.motion = Motion { velocity: motion.velocity + motion.spin.cross(arm), ..motion };
+                shot.rolling_shutter_seconds = rig.rolling_shutter_seconds;
+                shot.shutter_seconds = rig.shutter_seconds;
+                shots.push(shot);
+            }
+        }
+    }
+    Ok(shots)
+}
+
+/// The car's poses (x ahead, y left, z up; the origin on the road) street by street, a waypoint each spacing.
+///
+/// # Errors
+/// [`SenseError`] for settings out of range, or more waypoints than a list may hold.
+pub fn legs(city: &City, rig: &Rig) -> Result<Vec<Vec<Waypoint>>, SenseError> {
+    let spacing = within("spacing_metres", rig.spacing_metres, 0.01, 1e4)?;
+    let speed = within("speed", rig.speed, 0.01, 100.0)?;
+    let lane = within("lane_metres", rig.lane_metres, -50.0, 50.0)?;
+    let mut seconds = within("start_seconds", rig.start_seconds, -1e9, 1e9)?;
+    let streets: Vec<Line> = city.streets.iter().filter_map(|street| Line::new(street)).collect();
+    count(streets.iter().map(|line| line.length() / spacing + 1.0).sum())?;
+    let mut legs = Vec::new();
+    for line in &streets {
+        let rounds = (line.length() / spacing) as usize + 1;
+        let start = if rig.fleet { rig.start_seconds } else { seconds };
+        let waypoint = |i: usize| {
+            let way = i as f64 * spacing;
+            Waypoint { seconds: start + way / speed, world_from_asset: line.pose(way, lane) }
+        };
+        legs.push((0..rounds).map(waypoint).collect::<Vec<_>>());
+        seconds = start + line.length() / speed + 1.0;
+    }
+    Ok(legs)
+}
+
+/// The pose of a car's sensor at a moment of a leg, `world_from_sensor` with x ahead, y left and z up, and its motion.
+pub fn carried(leg: &[Waypoint], mount: &Mount, seconds: f64) -> Option<(Rigid, Motion)> {
+    const STEP: f64 = 0.01;
+    let at = |seconds| {
+        let car = motion::between(leg, seconds)?;
+        let turn = DQuat::from_rotation_z(mount.yaw_degrees.to_radians());
+        Some(Rigid { rotation: car.rotation * turn, translation: car.apply(mount.offset) })
+    };
+    // held at its ends a leg has no motion: look inwards there
+    let (first, last) = (leg.first()?.seconds, leg.last()?.seconds);
+    let (from, to) = ((seconds - STEP).max(first), (seconds + STEP).min(last));
+    Some((at(seconds)?, Motion::between(&at(from)?, &at(to)?, to - from)))
+}
+
+/// A polyline by its length.
+pub(crate) struct Line<'a> {
+    points: &'a [DVec3],
+    /// Metres to each point.
+    ways: Vec<f64>,
+}
+
+impl<'a> Line<'a> {
+    /// None for lines without a length or with points that are none.
+    pub(crate) fn new(points: &'a [DVec3]) -> Option<Self> {
+        let mut ways = vec![0.0];
+        for pair in points.windows(2) {
+            ways.push(ways[ways.len() - 1] + pair[0].distance(pair[1]));
+        }
+        let sane = points.len() > 1 && points.iter().all(|p| p.is_finite() && p.abs().max_element() < 1e7);
+        (sane && ways[ways.len() - 1] > 0.1).then_some(Self { points, ways })
+    }
+
+    pub(crate) fn length(&self) -> f64 {
+        self.ways[self.ways.len() - 1]
+    }
+
+    /// The point this far along.
+    pub(crate) fn at(&self, way: f64) -> DVec3 {
+        let next = self.ways.partition_point(|w| *w < way).clamp(1, self.points.len() - 1);
+        let (from, to) = (self.ways[next - 1], self.ways[next]);
+        let share = if to > from { ((way - from) / (to - from)).clamp(0.0, 1.0) } else { 0.0 };
+        self.points[next - 1].lerp(self.points[next], share)
+    }
+
+    /// A car's pose this far along and so far to the right; it looks where the road leads over its own length.
+    pub(crate) fn pose(&self, way: f64, right: f64) -> Rigid {
+        const AXLE: f64 = 2.0;
+        let ahead = self.at((way + AXLE).min(self.length())) - self.at((way - AXLE).max(0.0));
+        let x = ahead.try_normalize().unwrap_or(DVec3::X);
+        let y = DVec3::Z.cross(x).try_normalize().unwrap_or(DVec3::Y);
+        let rotation = DQuat::from_mat3(&DMat3::from_cols(x, y, x.cross(y))).normalize();
+        Rigid { rotation, translation: self.at(way) - right * y }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::stage;
+
+    #[test]
+    fn six_cameras_look_around_from_a_car() {
+        let city = stage::city();
+        let shots = drive(&city, &Rig::default()).unwrap();
+        assert_eq!(shots.len(), 6 * 61);
+        let round = &shots[60..66];
+        let ahead: Vec<DVec3> = round.iter().map(|s| s.camera.forward()).collect();
+        for (seen, expected) in ahead.iter().zip([DVec3::X, DVec3::X, DVec3::Y, -DVec3::Y, -DVec3::X, -DVec3::X]) {
+            assert!((*seen - expected).length() < 1e-9, "{seen}");
+        }
+        let centre = round[0].camera.centre();
+        assert!((centre - DVec3::new(-60.0 + 20.0 + 0.8, 0.3, 1.65)).length() < 1e-9, "{centre}");
+        assert!((round[3].motion.velocity - DVec3::X * 10.0).length() < 1e-9);
+        assert!((shots[60].seconds - 2.0).abs() < 1e-9);
+        let field = 2.0 * (704.0 / round[0].camera.pinhole.fx).atan().to_degrees();
+        assert!((field - 103.7).abs() < 1e-9);
+    }
+
+    #[test]
+    fn settings_that_cannot_be_are_refused() {
+        let city = stage::city();
+        for rig in [
+            Rig { spacing_metres: 0.0, ..Rig::default() },
+            Rig { spacing_metres: f64::NAN, ..Rig::default() },
+            Rig { field_degrees: 180.0, ..Rig::default() },
+            Rig { width: 0, ..Rig::default() },
+        ] {
+            assert!(drive(&city, &rig).is_err(), "{rig:?}");
+        }
+        let endless = City { streets: vec![vec![DVec3::ZERO, DVec3::X * 9e6]], ..City::default() };
+        assert!(matches!(
+            drive(&endless, &Rig { spacing_metres: 0.01, ..Rig::default() }),
+            Err(SenseError::TooMany(_))
+        ));
+        let broken = City { streets: vec![vec![], vec![DVec3::NAN, DVec3::X]], ..City::default() };
+        assert_eq!(drive(&broken, &Rig::default()), Ok(Vec::new()));
+    }
+}

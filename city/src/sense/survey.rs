@@ -1,0 +1,325 @@
+//! Pictures from above and from where a camera stays: aerial blocks flown to an overlap, nadir or with five headings,
+//! surveillance cameras over streets, and free paths between poses.
+
+use glam::{DVec2, DVec3};
+use scene::{Camera, Pinhole};
+use serde::{Deserialize, Serialize};
+
+use super::{Motion, SenseError, Shot, count, looking, pinhole, rig::Line, within};
+use crate::{
+    City, Waypoint,
+    random::Random,
+    trace::{Moment, Ray, motion},
+};
+
+/// A block flown over a city in parallel lines.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Survey {
+    /// Metres over the mean height of the streets.
+    pub height_metres: f64,
+    /// Share of a nadir picture that the next on the line shows too, 0 to 0.95.
+    pub forward_overlap: f64,
+    /// Share of it that the next line shows too, 0 to 0.95.
+    pub side_overlap: f64,
+    /// Degrees off the vertical of four more cameras, ahead, back, left and right (a Maltese cross); 0 for nadir alone.
+    pub tilt_degrees: f64,
+    /// Pixels across the line of flight.
+    pub width: u32,
+    /// Pixels along it.
+    pub height: u32,
+    /// Field of view across, degrees.
+    pub field_degrees: f64,
+    /// Metres per second.
+    pub speed: f64,
+    /// The city's clock at the first picture.
+    pub start_seconds: f64,
+    /// What to fly over, from a corner to the opposite one, world metres; the whole city where there is none.
+    pub area: Option<[DVec2; 2]>,
+    /// Seconds that the shutter is open.
+    pub shutter_seconds: f64,
+}
+
+impl Default for Survey {
+    fn default() -> Self {
+        Self {
+            height_metres: 120.0,
+            forward_overlap: 0.8,
+            side_overlap: 0.6,
+            tilt_degrees: 0.0,
+            width: 1600,
+            height: 1200,
+            field_degrees: 70.0,
+            speed: 12.0,
+            start_seconds: 0.0,
+            area: None,
+            shutter_seconds: 0.0,
+        }
+    }
+}
+
+/// The pictures of a block, line by line, there and back.
+///
+/// # Errors
+/// [`SenseError`] for settings out of range, or more pictures than a list may hold.
+pub fn survey(city: &City, settings: &Survey) -> Result<Vec<Shot>, SenseError> {
+    let lens = pinhole(settings.width, settings.height, settings.field_degrees)?;
+    let height = within("height_metres", settings.height_metres, 5.0, 2e4)?;
+    let forward = within("forward_overlap", settings.forward_overlap, 0.0, 0.95)?;
+    let side = within("side_overlap", settings.side_overlap, 0.0, 0.95)?;
+    let tilt = within("tilt_degrees", settings.tilt_degrees, 0.0, 80.0)?;
+    let speed = within("speed", settings.speed, 0.1, 300.0)?;
+    let start = within("start_seconds", settings.start_seconds, -1e9, 1e9)?;
+    let shutter = within("shutter_seconds", settings.shutter_seconds, 0.0, 1.0)?;
+    let [low, high] = settings.area.unwrap_or([DVec2::splat(-0.5), DVec2::splat(0.5)].map(|c| c * city.extent_metres));
+    let size = high - low;
+    if !(size.min_element() >= 0.0 && size.max_element() < 1e6 && low.abs().max_element() < 1e6) {
+        return Err(SenseError::Setting("area"));
+    }
+    // a metre on the ground is fx / height pixels
+    let covered = DVec2::new(f64::from(lens.width), f64::from(lens.height)) * height / lens.fx;
+    let step = covered * (DVec2::ONE - DVec2::new(side, forward));
+    let stops = (size / step).ceil() + 1.0;
+    let headings = if tilt > 0.0 { 5.0 } else { 1.0 };
+    count(stops.x * stops.y * headings)?;
+    let (lines, stops) = (stops.x as u32, stops.y as u32);
+    let even = |i: u32, n: u32| if n > 1 { f64::from(i) / f64::from(n - 1) } else { 0.5 };
+    let (top, mut way, mut shots) = (ground(city) + height, 0.0, Vec::new());
+    let mut last: Option<DVec3> = None;
+    for line in 0..lines {
+        let ahead = if line % 2 == 0 { DVec3::Y } else { -DVec3::Y };
+        for stop in 0..stops {
+            let along = if line % 2 == 0 { even(stop, stops) } else { 1.0 - even(stop, stops) };
+            let place = (low + size * DVec2::new(even(line, lines), along)).extend(top);
+            way += last.map_or(0.0, |p| p.distance(place));
+            last = Some(place);
+            for (name, heading) in headings_of(ahead, tilt) {
+                let camera = looking(lens, place, heading, ahead);
+                let mut shot = Shot::new(format!("{name}-{line:04}-{stop:04}"), name, start + way / speed, camera);
+                shot.motion.velocity = ahead * speed;
+                shot.shutter_seconds = shutter;
+                shots.push(shot);
+            }
+        }
+    }
+    Ok(shots)
+}
+
+/// Straight down, and four more ways that are tilted off it.
+fn headings_of(ahead: DVec3, tilt: f64) -> Vec<(&'static str, DVec3)> {
+    let mut headings = vec![("nadir", DVec3::NEG_Z)];
+    if tilt > 0.0 {
+        let (sine, cosine) = tilt.to_radians().sin_cos();
+        let right = ahead.cross(DVec3::Z);
+        let ways = [("ahead", ahead), ("back", -ahead), ("left", -right), ("right", right)];
+        headings.extend(ways.map(|(name, way)| (name, way * sine - DVec3::Z * cosine)));
+    }
+    headings
+}
+
+/// The mean height of the streets' points.
+fn ground(city: &City) -> f64 {
+    let heights: Vec<f64> = city.streets.iter().flatten().map(|p| p.z).filter(|z| z.is_finite()).collect();
+    heights.iter().sum::<f64>() / heights.len().max(1) as f64
+}
+
+/// Surveillance cameras: each stays, looks along its street and takes a picture every so often.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Fixed {
+    /// How many cameras.
+    pub cameras: u32,
+    /// Metres over the street.
+    pub height_metres: f64,
+    /// Metres to the side of a line of [`City::streets`].
+    pub side_metres: f64,
+    /// Degrees below the horizon.
+    pub tilt_degrees: f64,
+    /// Pixels in a row.
+    pub width: u32,
+    /// Rows.
+    pub height: u32,
+    /// Horizontal field of view, degrees.
+    pub field_degrees: f64,
+    /// Pictures of each.
+    pub pictures: u32,
+    /// Seconds from one to the next.
+    pub every_seconds: f64,
+    /// The city's clock at the first.
+    pub start_seconds: f64,
+    /// Which places are drawn.
+    pub seed: u64,
+}
+
+impl Default for Fixed {
+    fn default() -> Self {
+        Self {
+            cameras: 8,
+            height_metres: 6.0,
+            side_metres: 5.0,
+            tilt_degrees: 18.0,
+            width: 1280,
+            height: 720,
+            field_degrees: 80.0,
+            pictures: 10,
+            every_seconds: 0.5,
+            start_seconds: 0.0,
+            seed: 1,
+        }
+    }
+}
+
+/// The pictures of surveillance cameras, camera by camera, where nothing stands between a camera and its street. Fewer
+/// cameras than asked for where no such place was found.
+///
+/// # Errors
+/// [`SenseError`] for settings out of range, or more pictures than a list may hold.
+pub fn fixed(moment: &Moment, settings: &Fixed) -> Result<Vec<Shot>, SenseError> {
+    let lens = pinhole(settings.width, settings.height, settings.field_degrees)?;
+    let height = within("height_metres", settings.height_metres, 0.1, 200.0)?;
+    let side = within("side_metres", settings.side_metres, -50.0, 50.0)?;
+    let tilt = within("tilt_degrees", settings.tilt_degrees, -89.0, 89.0)?.to_radians();
+    let every = within("every_seconds", settings.every_seconds, 0.0, 1e6)?;
+    let start = within("start_seconds", settings.start_seconds, -1e9, 1e9)?;
+    count(f64::from(settings.cameras) * f64::from(settings.pictures))?;
+    let streets: Vec<Line> = moment.city().streets.iter().filter_map(|street| Line::new(street)).collect();
+    let mut random = Random::new(settings.seed).fork(17);
+    let mut shots = Vec::new();
+    let mut found = 0;
+    for _ in 0..settings.cameras.saturating_mul(20) {
+        if found == settings.cameras || streets.is_empty() {
+            break;
+        }
+        let line = random.one_of(&streets);
+        let (way, right) = (f64::from(random.unit()) * line.length(), if random.chance(0.5) { side } else { -side });
+        let Some(camera) = post(moment, line, way, right, height, tilt, lens) else { continue };
+        let sensor = format!("fixed-{found:03}");
+        shots.extend(
+            (0..settings.pictures)
+                .map(|i| Shot::new(format!("{sensor}-{i:05}"), &sensor, start + f64::from(i) * every, camera)),
+        );
+        found += 1;
+    }
+    Ok(shots)
+}
+
+/// A camera beside a street, or none where something stands between it and the street.
+fn post(moment: &Moment, line: &Line, way: f64, right: f64, height: f64, tilt: f64, lens: Pinhole) -> Option<Camera> {
+    let road = line.pose(way, 0.0);
+    let place = line.pose(way, right).translation + DVec3::Z * height;
+    // back to the middle of what it is to see
+    let ahead = road.rotation * DVec3::X;
+    let seen = line.at((way + 15.0).min(line.length())) + DVec3::Z;
+    let over = road.translation + DVec3::Z * height;
+    let is_free = |a: DVec3, b: DVec3| {
+        let direction = (b - a).as_vec3().normalize_or_zero();
+        !moment.is_blocked(&Ray { to: a.distance(b) as f32, ..Ray::new(a.as_vec3(), direction) })
+    };
+    let towards =
+        (ahead * tilt.cos() - DVec3::Z * tilt.sin() - 0.25 * right.signum() * -(road.rotation * DVec3::Y)).normalize();
+    (is_free(over, place) && is_free(place, seen)).then(|| looking(lens, place, towards, ahead))
+}
+
+/// Pictures along a path of camera poses (`world_from_camera`, OpenCV axes), which it passes smoothly: Catmull and Rom's
+/// curve for places, slerp for rotations.
+///
+/// # Errors
+/// [`SenseError`] for settings out of range, or more pictures than a list may hold.
+pub fn free(sensor: &str, path: &[Waypoint], lens: Pinhole, every_seconds: f64) -> Result<Vec<Shot>, SenseError> {
+    let every = within("every_seconds", every_seconds, 1e-4, 1e6)?;
+    let sane = path.iter().all(|w| w.seconds.is_finite() && w.world_from_asset.is_sane());
+    if !sane || path.windows(2).any(|pair| pair[0].seconds >= pair[1].seconds) {
+        return Err(SenseError::Setting("the path"));
+    }
+    let (Some(first), Some(last)) = (path.first(), path.last()) else { return Ok(Vec::new()) };
+    let pictures = count((last.seconds - first.seconds) / every + 1.0)?;
+    let mut shots = Vec::with_capacity(pictures);
+    for i in 0..pictures {
+        let seconds = first.seconds + i as f64 * every;
+        let Some(pose) = smooth(path, seconds) else { continue };
+        let mut shot = Shot::new(
+            format!("{sensor}-{i:06}"),
+            sensor,
+            seconds,
+            Camera { pinhole: lens, camera_from_world: pose.inverse() },
+        );
+        if let (Some(before), Some(after)) = (smooth(path, seconds - 5e-3), smooth(path, seconds + 5e-3)) {
+            shot.motion = Motion::between(&before, &after, 1e-2);
+        }
+        shots.push(shot);
+    }
+    Ok(shots)
+}
+
+/// A pose on the smooth curve through waypoints.
+pub fn smooth(path: &[Waypoint], seconds: f64) -> Option<scene::Rigid> {
+    let straight = motion::between(path, seconds)?;
+    let next = path.partition_point(|w| w.seconds <= seconds);
+    if next == 0 || next == path.len() {
+        return Some(straight);
+    }
+    let at = |i: usize| (path[i].seconds, path[i].world_from_asset.translation);
+    let ((s0, p0), (s1, p1)) = (at(next - 1), at(next));
+    let span = s1 - s0;
+    let (before, after) = (at(next.saturating_sub(2)), at((next + 1).min(path.len() - 1)));
+    let tangent = |a: (f64, DVec3), b: (f64, DVec3)| (b.1 - a.1) * (span / (b.0 - a.0).max(1e-9));
+    let (m0, m1) = (tangent(before, (s1, p1)), tangent((s0, p0), after));
+    let t = (seconds - s0) / span;
+    let (t2, t3) = (t * t, t * t * t);
+    let translation =
+        p0 * (2.0 * t3 - 3.0 * t2 + 1.0) + m0 * (t3 - 2.0 * t2 + t) + p1 * (3.0 * t2 - 2.0 * t3) + m1 * (t3 - t2);
+    Some(scene::Rigid { translation, ..straight })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{stage, trace::World};
+
+    #[test]
+    fn neighbours_overlap_as_asked() {
+        let city = stage::city();
+        let settings = Survey { height_metres: 50.0, forward_overlap: 0.8, side_overlap: 0.5, ..Survey::default() };
+        let shots = survey(&city, &settings).unwrap();
+        let covered = 50.0 / shots[0].camera.pinhole.fx * 1200.0;
+        let along = shots[0].camera.centre().distance(shots[1].camera.centre());
+        let overlap = 1.0 - along / covered;
+        assert!((0.8..0.86).contains(&overlap), "{overlap}");
+        // the city's corner is seen, the picture's top is ahead
+        let (corner, depth) = shots[0].camera.project(DVec3::new(-99.0, -99.0, 0.0));
+        assert!(depth > 49.0 && shots[0].camera.pinhole.width as f64 > corner.x && corner.x > 0.0);
+        assert!(
+            shots[0].camera.project(DVec3::new(-100.0, -90.0, 0.0)).0.y
+                < shots[0].camera.project(DVec3::new(-100.0, -99.0, 0.0)).0.y
+        );
+        let cross = survey(&city, &Survey { tilt_degrees: 45.0, ..settings.clone() }).unwrap();
+        assert_eq!(cross.len(), 5 * shots.len());
+        assert!(cross[1..5].iter().all(|s| (s.camera.forward().z + 0.5f64.sqrt()).abs() < 1e-9));
+        let all: DVec3 = cross[1..5].iter().map(|s| s.camera.forward().with_z(0.0)).sum();
+        assert!(all.length() < 1e-9);
+        assert!(survey(&city, &Survey { forward_overlap: 1.0, ..settings.clone() }).is_err());
+        assert!(matches!(survey(&City { extent_metres: 9e5, ..city }, &settings), Err(SenseError::TooMany(_))));
+    }
+
+    #[test]
+    fn surveillance_cameras_stay_and_see_their_street() {
+        let city = stage::city();
+        let world = World::new(&city).unwrap();
+        let shots = fixed(&world.at(0.0), &Fixed { cameras: 3, pictures: 4, ..Fixed::default() }).unwrap();
+        assert_eq!(shots.len(), 12);
+        assert!(shots[..4].iter().all(|s| s.camera == shots[0].camera) && shots[3].seconds == 1.5);
+        assert!(shots.iter().all(|s| s.camera.forward().z < 0.0 && (s.camera.centre().z - 6.0).abs() < 1e-9));
+    }
+
+    #[test]
+    fn a_free_path_passes_its_waypoints() {
+        let at =
+            |seconds: f64, x: f64, y: f64| Waypoint { seconds, world_from_asset: stage::place(DVec3::new(x, y, 2.0)) };
+        let path = [at(0.0, 0.0, 0.0), at(1.0, 1.0, 0.5), at(2.0, 2.0, 0.0), at(3.0, 3.0, 0.5)];
+        let shots = free("free", &path, pinhole(64, 64, 90.0).unwrap(), 0.5).unwrap();
+        assert_eq!(shots.len(), 7);
+        assert!((shots[2].camera.centre() - DVec3::new(1.0, 0.5, 2.0)).length() < 1e-9);
+        assert!((shots[3].motion.velocity.x - 1.0).abs() < 0.05, "{}", shots[3].motion.velocity);
+        assert!(free("free", &[path[1], path[0]], pinhole(64, 64, 90.0).unwrap(), 0.5).is_err());
+    }
+}

@@ -1,0 +1,149 @@
+//! What a city is asked for by.
+
+use std::fmt;
+use std::str::FromStr;
+
+use scene::BadInput;
+use serde::{Deserialize, Serialize};
+
+/// Everything that a city follows from.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct CitySettings {
+    /// Everything random follows from it.
+    pub seed: u64,
+    /// Area of the square city, km²: 0.05 to 25.
+    pub area_km2: f64,
+    /// How its streets run.
+    pub layout: Layout,
+    /// How many vehicles and walkers move.
+    pub traffic: Traffic,
+    /// Share of the city, from its west side, that is a bare plain: 0 to 0.8.
+    pub plain: f64,
+}
+
+impl Default for CitySettings {
+    fn default() -> Self {
+        Self { seed: 1, area_km2: 0.05, layout: Layout::Mixed, traffic: Traffic::Medium, plain: 0.0 }
+    }
+}
+
+impl CitySettings {
+    /// Side of the square city, metres.
+    pub fn extent_metres(&self) -> f64 {
+        1000.0 * self.area_km2.sqrt()
+    }
+
+    /// Refuses what is out of range, in one line.
+    pub fn check(&self) -> Result<(), BadInput> {
+        let refuse = |what: &str, range: &str| Err(BadInput::new("city", format!("{what} is out of range"), range));
+        match self {
+            s if !(0.05..=25.0).contains(&s.area_km2) => refuse("its area", "choose 0.05 to 25 km²"),
+            s if !(0.0..=0.8).contains(&s.plain) => refuse("the share of bare plain", "choose 0 to 0.8"),
+            _ => Ok(()),
+        }
+    }
+}
+
+/// An enum whose values have names in lower case with hyphens.
+macro_rules! named {
+    ($(#[$meta:meta])* $type:ident, $what:literal, { $($(#[$doc:meta])* $variant:ident = $name:literal),+ $(,)? }) => {
+        $(#[$meta])*
+        #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+        #[serde(rename_all = "kebab-case")]
+        pub enum $type { $($(#[$doc])* $variant),+ }
+
+        impl $type {
+            /// All of them, in the order of their declaration.
+            pub const ALL: &'static [Self] = &[$(Self::$variant),+];
+
+            /// The name that people type.
+            pub fn name(self) -> &'static str {
+                match self { $(Self::$variant => $name),+ }
+            }
+        }
+
+        impl fmt::Display for $type {
+            fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+                f.pad(self.name())
+            }
+        }
+
+        impl FromStr for $type {
+            type Err = BadInput;
+
+            fn from_str(text: &str) -> Result<Self, BadInput> {
+                Self::ALL.iter().copied().find(|it| it.name() == text).ok_or_else(|| {
+                    let names: Vec<_> = Self::ALL.iter().map(|it| it.name()).collect();
+                    BadInput::new($what, format!("there is no {text:?}"), format!("choose {}", names.join(", ")))
+                })
+            }
+        }
+    };
+}
+
+named!(
+    /// How streets run: a plain grid, the four layouts that reconstruction finds hard (SDG, section 2.2), and all of them.
+    Layout, "layout", {
+        /// Streets at right angles.
+        Grid = "grid",
+        /// Long bending canyons between tall facades, few cross streets.
+        CurvedCorridor = "curved-corridor",
+        /// Passages of 3 to 5 m between houses, off narrow lanes.
+        Alley = "alley",
+        /// Curved streets on slopes, detached houses.
+        Winding = "winding",
+        /// A grid with a road on a deck over its boulevard, with guardrails, and raised platforms.
+        Deck = "deck",
+        /// Quarters of each kind, joined by streets.
+        Mixed = "mixed",
+    }
+);
+
+named!(
+    /// How much moves (the levels of CarlaOcc, supplement 1.1). Parked vehicles stay at every level.
+    Traffic, "traffic", {
+        /// Nothing moves, nobody walks.
+        None = "none",
+        /// Free driving.
+        Light = "light",
+        /// A usual day.
+        Medium = "medium",
+        /// Short distances, low and uneven speeds.
+        Heavy = "heavy",
+    }
+);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_are_read_as_they_are_written() {
+        for layout in Layout::ALL {
+            assert_eq!(layout.to_string().parse::<Layout>().unwrap(), *layout);
+        }
+        for traffic in Traffic::ALL {
+            assert_eq!(traffic.to_string().parse::<Traffic>().unwrap(), *traffic);
+        }
+        let refusal = "hexagonal".parse::<Layout>().unwrap_err().to_string();
+        assert!(refusal.contains("curved-corridor") && !refusal.contains('\n'), "{refusal}");
+    }
+
+    #[test]
+    fn what_is_out_of_range_is_refused_in_one_line() {
+        let wrong = [
+            CitySettings { area_km2: 0.049, ..Default::default() },
+            CitySettings { area_km2: 25.1, ..Default::default() },
+            CitySettings { area_km2: f64::NAN, ..Default::default() },
+            CitySettings { area_km2: f64::INFINITY, ..Default::default() },
+            CitySettings { plain: -0.1, ..Default::default() },
+            CitySettings { plain: 0.81, ..Default::default() },
+            CitySettings { plain: f64::NAN, ..Default::default() },
+        ];
+        for settings in wrong {
+            let refusal = crate::City::generate(&settings).unwrap_err().to_string();
+            assert!(refusal.contains("out of range") && !refusal.contains('\n'), "{refusal}");
+        }
+    }
+}

@@ -1,0 +1,322 @@
+//! Who moves: vehicles that go around quarters, walkers that go around blocks.
+//!
+//! Everybody on one round moves alike, only later: distances hold by construction, at corners too. Rounds go clockwise, on the
+//! right, in the lane beside the quarter; quarters do not overlap, so rounds neither share a lane nor cross. Vehicles go
+//! around the quarters of every second row; the lanes beside the other rows are for who drives with sensors
+//! ([`City::streets`]).
+
+use glam::{DMat3, DQuat, DVec2, DVec3};
+use scene::Rigid;
+
+#[cfg(doc)]
+use crate::City;
+use crate::build::person;
+use crate::build::vehicle::{PAINTS, VehicleKind};
+use crate::deck::{Deck, LANES};
+use crate::parcels::upright;
+use crate::props::Prop;
+use crate::random::Random;
+use crate::roads::{Profile, Quarter, RoadKind, Roads, Step};
+use crate::settings::{Layout, Traffic};
+use crate::streetside::some_car;
+use crate::terrain::Terrain;
+use crate::words::Waypoint;
+
+/// Trajectories last this long.
+pub(crate) const SECONDS: f64 = 630.0;
+
+/// Somebody who moves.
+pub(crate) struct Mover {
+    pub(crate) prop: Prop,
+    pub(crate) waypoints: Vec<Waypoint>,
+    /// Seconds for a round of the gait; `None` for vehicles.
+    pub(crate) gait_seconds: Option<f64>,
+}
+
+/// What a level of traffic means.
+struct Level {
+    /// Seconds between vehicles of a round.
+    headway: f64,
+    /// Metres per second on a straight: from, to.
+    speed: [f32; 2],
+    /// Metres of pavement to a walker.
+    walkers: f64,
+}
+
+fn level(traffic: Traffic) -> Option<Level> {
+    match traffic {
+        Traffic::None => None,
+        Traffic::Light => Some(Level { headway: 45.0, speed: [10.0, 13.5], walkers: 220.0 }),
+        Traffic::Medium => Some(Level { headway: 16.0, speed: [8.0, 12.0], walkers: 90.0 }),
+        Traffic::Heavy => Some(Level { headway: 6.5, speed: [4.5, 10.0], walkers: 40.0 }),
+    }
+}
+
+/// Whether vehicles go around a quarter.
+fn has_round(quarter: &Quarter) -> bool {
+    quarter.row.is_multiple_of(2)
+}
+
+/// A closed way with a timetable.
+struct Round {
+    /// Places and upright-ness: pose of who is there.
+    poses: Vec<Rigid>,
+    /// Seconds since the start at each, and for the whole round.
+    times: Vec<f64>,
+    whole: f64,
+}
+
+impl Round {
+    /// A timetable for a closed way: no faster than `speed`, slower in bends, with gentle changes.
+    fn new(points: &[DVec3], poses: Vec<Rigid>, speed: f64) -> Self {
+        const SIDEWAYS: f64 = 2.2;
+        const CHANGE: f64 = 1.4;
+        let count = points.len();
+        let step = |k: usize| points[k % count].distance(points[(k + 1) % count]);
+        let mut speeds: Vec<f64> = (0..count)
+            .map(|k| {
+                let (a, b, c) = (points[(k + count - 1) % count], points[k], points[(k + 1) % count]);
+                let turn = (b - a).truncate().angle_to((c - b).truncate()).abs();
+                let radius = 0.5 * (a.distance(b) + b.distance(c)) / turn.max(1e-6);
+                (SIDEWAYS * radius).sqrt().clamp(2.0_f64.min(speed), speed)
+            })
+            .collect();
+        // twice around, so that the ends of the round agree
+        for k in (0..2 * count).rev() {
+            let (here, next) = (k % count, (k + 1) % count);
+            speeds[here] = speeds[here].min((speeds[next].powi(2) + 2.0 * CHANGE * step(k)).sqrt());
+        }
+        for k in 0..2 * count {
+            let (here, next) = (k % count, (k + 1) % count);
+            speeds[next] = speeds[next].min((speeds[here].powi(2) + 2.0 * CHANGE * step(k)).sqrt());
+        }
+        let mut times = vec![0.0];
+        for k in 0..count {
+            times.push(times[k] + 2.0 * step(k) / (speeds[k] + speeds[(k + 1) % count]));
+        }
+        let whole = times.pop().unwrap_or(1.0).max(1.0);
+        Self { poses, times, whole }
+    }
+
+    /// The waypoints of somebody who was at the start `ahead` seconds ago, from 0 to the end of time.
+    fn waypoints(&self, ahead: f64) -> Vec<Waypoint> {
+        let mut k = self.times.partition_point(|&t| t <= ahead).saturating_sub(1);
+        let mut lap = 0.0;
+        let mut waypoints = Vec::with_capacity((SECONDS / self.whole * self.times.len() as f64) as usize + 3);
+        loop {
+            let seconds = self.times[k] + lap - ahead;
+            waypoints.push(Waypoint { seconds, world_from_asset: self.poses[k] });
+            if seconds > SECONDS {
+                return waypoints;
+            }
+            k += 1;
+            if k == self.times.len() {
+                k = 0;
+                lap += self.whole;
+            }
+        }
+    }
+
+    /// So many starts around the round, unevenly by a share of their distance.
+    fn starts(&self, count: usize, uneven: f64, random: &mut Random) -> Vec<f64> {
+        let start = |k: usize, jitter: f64| (k as f64 + uneven * jitter) / count as f64 * self.whole;
+        (0..count).map(|k| start(k, random.unit().into())).collect()
+    }
+}
+
+/// The lane beside a rectangle of lattice lines, clockwise.
+fn lane(roads: &Roads, lines: [usize; 4], terrain: &Terrain) -> Vec<DVec3> {
+    let mut ring = roads.ring(&roads.around(lines), &|p| p.lane).0;
+    ring.reverse();
+    thin(ring.iter().map(|p| terrain.at(p.at)).collect())
+}
+
+/// Leaves out every second point where a closed way is straight, and points that lie on their neighbours.
+fn thin(points: Vec<DVec3>) -> Vec<DVec3> {
+    let mut kept: Vec<DVec3> = Vec::with_capacity(points.len());
+    let mut skipped = false;
+    for (k, &p) in points.iter().enumerate() {
+        let next = points[(k + 1) % points.len()];
+        let Some(&last) = kept.last() else {
+            kept.push(p);
+            continue;
+        };
+        let turn = (p - last).truncate().angle_to((next - p).truncate()).abs();
+        let straight = turn < 0.01 && !skipped && next.distance(last) < 9.0;
+        skipped = straight;
+        if !straight && p.distance(last) > 0.3 {
+            kept.push(p);
+        }
+    }
+    kept
+}
+
+/// Directions along a closed way.
+fn heading(points: &[DVec3], k: usize) -> DVec3 {
+    let count = points.len();
+    (points[(k + 1) % count] - points[(k + count - 1) % count]).normalize_or(DVec3::X)
+}
+
+/// Poses along a closed way of who leans with the road.
+fn leaning(points: &[DVec3]) -> Vec<Rigid> {
+    (0..points.len())
+        .map(|k| {
+            let x = heading(points, k);
+            let y = DVec3::Z.cross(x).normalize_or(DVec3::Y);
+            let rotation = DQuat::from_mat3(&DMat3::from_cols(x, y, x.cross(y))).normalize();
+            Rigid { rotation, translation: points[k] }
+        })
+        .collect()
+}
+
+/// The vehicles of a quarter.
+pub(crate) fn vehicles(
+    roads: &Roads,
+    terrain: &Terrain,
+    quarter: usize,
+    traffic: Traffic,
+    random: &Random,
+) -> Vec<Mover> {
+    let mut random = random.fork(0x7AFF).fork(quarter as u64);
+    let quarter = &roads.quarters[quarter];
+    let Some(level) = level(traffic).filter(|_| has_round(quarter)) else { return Vec::new() };
+    let points = lane(roads, quarter.lines, terrain);
+    let narrow = matches!(quarter.layout, Layout::Alley | Layout::Winding);
+    drive(&points, &level, narrow, &mut random)
+}
+
+/// The vehicles on the deck.
+pub(crate) fn deck_vehicles(deck: &Deck, traffic: Traffic, random: &Random) -> Vec<Mover> {
+    let Some(level) = level(traffic) else { return Vec::new() };
+    drive(&thin(deck.round()), &level, false, &mut random.fork(0xDEC4))
+}
+
+fn drive(points: &[DVec3], level: &Level, narrow: bool, random: &mut Random) -> Vec<Mover> {
+    let speed = f64::from(random.range(level.speed[0], level.speed[1])) * if narrow { 0.6 } else { 1.0 };
+    let round = Round::new(points, leaning(points), speed);
+    let count = (round.whole / level.headway + f64::from(random.unit())) as usize;
+    let starts = round.starts(count, 0.25, random);
+    starts
+        .into_iter()
+        .map(|ahead| Mover {
+            prop: some_vehicle(narrow, random),
+            waypoints: round.waypoints(ahead),
+            gait_seconds: None,
+        })
+        .collect()
+}
+
+fn some_vehicle(narrow: bool, random: &mut Random) -> Prop {
+    let pick = random.unit();
+    let kind = match pick {
+        p if p < 0.62 => return some_car(random),
+        p if p < 0.70 => VehicleKind::Taxi,
+        p if p < 0.78 => VehicleKind::Motorcycle,
+        p if p < 0.86 => VehicleKind::Bicycle,
+        _ if narrow => return some_car(random),
+        p if p < 0.93 => VehicleKind::Bus,
+        _ => VehicleKind::Truck,
+    };
+    Prop::Vehicle(kind, random.below(PAINTS) as u8)
+}
+
+/// The walkers on the pavement of a block.
+pub(crate) fn walkers(roads: &Roads, terrain: &Terrain, block: usize, traffic: Traffic, random: &Random) -> Vec<Mover> {
+    let mut random = random.fork(0x3A1C).fork(block as u64);
+    let Some(level) = level(traffic) else { return Vec::new() };
+    let walk = roads.around(roads.blocks[block].lines);
+    let alley = roads.quarters[roads.blocks[block].quarter].layout == Layout::Alley;
+    let share = if alley { 1.8 } else { 1.0 };
+    let beside_front = |p: &Profile| p.front() - (0.5 * p.pavement).min(0.6);
+    let beside_trees = |p: &Profile| p.half + 1.5;
+    let mut movers = promenade(roads, terrain, &walk, &beside_front, false, level.walkers * share, &mut random);
+    let wide = walk.iter().all(|step| match step {
+        Step::Along { edge, .. } => roads.edges[*edge].as_ref().is_some_and(|e| e.profile.pavement > 2.5),
+        Step::Through { .. } => true,
+    });
+    if wide {
+        movers.extend(promenade(roads, terrain, &walk, &beside_trees, true, level.walkers * share, &mut random));
+    }
+    movers
+}
+
+/// Walkers one after another around a block.
+fn promenade(
+    roads: &Roads,
+    terrain: &Terrain,
+    walk: &[Step],
+    distance: &dyn Fn(&Profile) -> f64,
+    clockwise: bool,
+    gap: f64,
+    random: &mut Random,
+) -> Vec<Mover> {
+    let ring = roads.ring(walk, distance).0;
+    let mut points: Vec<DVec3> = ring.iter().map(|p| terrain.at(p.at) + DVec3::Z * p.profile.curb).collect();
+    if clockwise {
+        points.reverse();
+    }
+    let points = thin(points);
+    let length: f64 = (0..points.len()).map(|k| points[k].distance(points[(k + 1) % points.len()])).sum();
+    let count = (length / gap + f64::from(random.unit())) as usize;
+    let speed = f64::from(random.range(1.0, 1.6));
+    let poses = (0..points.len()).map(|k| upright(points[k], heading(&points, k).truncate())).collect();
+    let round = Round::new(&points, poses, speed);
+    let starts = round.starts(count, 0.7, random);
+    starts
+        .into_iter()
+        .map(|ahead| {
+            let build = random.below(person::BUILDS);
+            let gait_seconds = person::STRIDE * person::scale(build) / speed;
+            let prop = Prop::Walker { build: build as u8, phase: 0 };
+            Mover { prop, waypoints: round.waypoints(ahead), gait_seconds: Some(gait_seconds) }
+        })
+        .collect()
+}
+
+/// The lanes that are kept free of traffic: around every row of quarters that has none, around single quarters of it (for
+/// the cross streets), through alleys, and along the deck.
+pub(crate) fn free_lanes(roads: &Roads, terrain: &Terrain, deck: Option<&Deck>) -> Vec<Vec<DVec3>> {
+    let rows = roads.cells[1] / roads.fine;
+    let close = |mut lane: Vec<DVec3>| {
+        lane.extend(lane.first().copied());
+        lane
+    };
+    let mut lanes = Vec::new();
+    for row in (1..rows).step_by(2) {
+        let lines = [0, roads.cells[0], row * roads.fine, (row + 1) * roads.fine];
+        lanes.push(close(lane(roads, lines, terrain)));
+        let mut quarters = roads.quarters.iter().filter(|q| q.row == row);
+        while let Some(quarter) = quarters.next() {
+            lanes.push(close(lane(roads, quarter.lines, terrain)));
+            quarters.next();
+        }
+    }
+    lanes.extend(deck.into_iter().flat_map(|deck| [deck.lane(LANES[0], true), deck.lane(LANES[0], false)]));
+    lanes.extend(alleys(roads, terrain));
+    lanes
+}
+
+/// Every run of alleys along a line, in one direction.
+fn alleys(roads: &Roads, terrain: &Terrain) -> Vec<Vec<DVec3>> {
+    let mut lanes = Vec::new();
+    let mut run: Vec<DVec2> = Vec::new();
+    let mut end = |run: &mut Vec<DVec2>| {
+        if run.len() > 3 {
+            lanes.push(run.iter().map(|&p| terrain.at(p)).collect());
+        }
+        run.clear();
+    };
+    let mut follow = |edge: usize, run: &mut Vec<DVec2>| match &roads.edges[edge] {
+        Some(edge) if edge.profile.kind == RoadKind::Alley => run.extend(edge.path.iter().map(|p| p.0)),
+        _ => end(run),
+    };
+    for j in 0..=roads.cells[1] {
+        (0..roads.cells[0]).for_each(|i| follow(roads.horizontal(i, j), &mut run));
+        follow(roads.horizontal(0, 0), &mut run);
+    }
+    for i in 0..=roads.cells[0] {
+        (0..roads.cells[1]).for_each(|j| follow(roads.vertical(i, j), &mut run));
+        follow(roads.horizontal(0, 0), &mut run);
+    }
+    lanes
+}
