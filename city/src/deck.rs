@@ -82,9 +82,9 @@ impl<'a> Deck<'a> {
         [start, self.line.length - start]
     }
 
-    /// A lane, eastwards on the right side, westwards on the left: from ramp's foot to ramp's foot.
+    /// A lane, eastwards on the right side, westwards on the left: from ramp to ramp, short of where vehicles turn.
     pub(crate) fn lane(&self, offset: f64, east: bool) -> Vec<DVec3> {
-        let [from, to] = [3.0, self.line.length - 3.0];
+        let [from, to] = [FOOT - 2.0, self.line.length - FOOT + 2.0];
         let count = ((to - from) / 4.0) as usize;
         let side = if east { -offset } else { offset };
         let lane = (0..=count).map(|k| self.at(from + (to - from) * k as f64 / count as f64, side));

@@ -86,6 +86,11 @@ impl Parcel<'_> {
         let mut s = 5.0;
         let mut slot = self.random.below(4);
         while s < length - 5.0 {
+            // room for a bus stop
+            if profile.pavement > 3.5 && (-5.0..4.0).contains(&(s - 0.5 * length)) {
+                s = 0.5 * length + 5.0;
+                continue;
+            }
             let prop = match slot % 4 {
                 0 => Some(Prop::Furniture(Piece::Lamp)),
                 _ if wide && self.random.chance(0.6) => Some(self.street_tree(profile)),
@@ -106,6 +111,7 @@ impl Parcel<'_> {
             slot += 1;
         }
         if profile.pavement > 3.5 && length > 40.0 {
+            self.on_pavement(line, 0.5 * length, profile, Prop::Furniture(Piece::Shelter));
             self.on_pavement(line, 0.5 * length + 3.9, profile, Prop::Furniture(Piece::Sign(4)));
         }
     }
@@ -179,7 +185,7 @@ impl Parcel<'_> {
                 self.scatter(90.0, &[0, 1, 3, 4, 5, 6, 7, 8], &outline, 2.8);
             }
             Layout::Alley => self.scatter(60.0, &[7, 8], &outline, 1.6),
-            _ => self.scatter(50.0, &[0, 1, 2, 4, 8], &outline, 3.2),
+            _ => self.scatter(110.0, &[0, 1, 2, 4, 8], &outline, 3.2),
         }
     }
 
