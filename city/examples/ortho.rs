@@ -27,6 +27,8 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let oblique =
         View::new(Vec3::new(-0.35 * half, -0.9 * half, 75.0), Vec3::new(0.0, -0.2 * half, 5.0), Some(0.9), 1.0);
     draw(&city, &oblique, [1280, 800], &file("oblique".to_owned()))?;
+    let beside = View::new(Vec3::new(-0.55 * half, -24.0, 19.0), Vec3::new(0.1 * half, 4.0, 0.0), Some(0.9), 1.0);
+    draw(&city, &beside, [1280, 800], &file("middle".to_owned()))?;
     let shelves: [(&str, f32, &[&str]); 4] = [
         (
             "vehicles",

@@ -261,7 +261,7 @@ impl<'a> Deck<'a> {
     pub(crate) fn lamps(&self) -> Vec<(DVec3, DVec2)> {
         let count = (self.line.length / 30.0) as usize;
         let lamp = |k: usize| {
-            let side = if k % 2 == 0 { 1.0 } else { -1.0 };
+            let side = if k.is_multiple_of(2) { 1.0 } else { -1.0 };
             let s = 30.0 * (k as f64 + 0.5);
             (self.lift(s) > 1.0).then(|| {
                 let at = self.at(s, side * (HALF + 0.5 * BARRIER)) + DVec3::Z * 0.45;

@@ -324,7 +324,6 @@ struct Lattice {
     ys: Vec<f64>,
     fine: usize,
     bends: Vec<Bend>,
-    half: f64,
     random: Random,
     /// Main cells to a region of the mixed city.
     region: [f64; 2],
@@ -365,10 +364,12 @@ impl Lattice {
             jitter *= 0.5;
         }
         let west = -half + settings.plain * extent;
-        let xs = lines(west + reach_x, half - reach_x, wide, fine, jitter, &mut random);
-        let ys = lines(-half + reach_y, half - reach_y, tall, fine, jitter, &mut random);
+        let decked = matches!(layout, Layout::Deck | Layout::Mixed);
+        let xs = lines([west + reach_x, half - reach_x], wide, fine, jitter, &mut random, &|_, _| false);
+        let deck = |line: usize, main: usize| decked && line == main / 2;
+        let ys = lines([-half + reach_y, half - reach_y], tall, fine, jitter, &mut random, &deck);
         let region = [&xs, &ys].map(|l| (((l.len() - 1) / fine) as f64 / 3.0).clamp(1.0, 4.0).floor());
-        Self { layout, xs, ys, fine, bends, half, random, region }
+        Self { layout, xs, ys, fine, bends, random, region }
     }
 
     /// The layout of a main cell.
@@ -518,7 +519,13 @@ impl Lattice {
 fn bends(layout: Layout, extent: f64, random: &mut Random) -> Vec<Bend> {
     let mut bend = |layout: Layout, shift_y: bool, length: f64, slope: f64| {
         let wave = std::f64::consts::TAU / length;
-        Bend { layout, shift_y, amplitude: slope / wave, wave, phase: f64::from(random.range(0.0, 6.283)) }
+        Bend {
+            layout,
+            shift_y,
+            amplitude: slope / wave,
+            wave,
+            phase: f64::from(random.range(0.0, std::f32::consts::TAU)),
+        }
     };
     use Layout::{CurvedCorridor, Winding};
     match layout {
@@ -551,18 +558,33 @@ fn bends(layout: Layout, extent: f64, random: &mut Random) -> Vec<Bend> {
     }
 }
 
-/// Lattice lines from one end to the other, main cells about `pitch` wide and `fine` lines to each.
-fn lines(from: f64, to: f64, pitch: f64, fine: usize, jitter: f64, random: &mut Random) -> Vec<f64> {
+/// Lattice lines from one end to the other, main cells about `pitch` wide and `fine` lines to each; the lines between main
+/// ones divide what the main roads (`broad` at a boulevard) leave.
+fn lines(
+    [from, to]: [f64; 2],
+    pitch: f64,
+    fine: usize,
+    jitter: f64,
+    random: &mut Random,
+    broad: &dyn Fn(usize, usize) -> bool,
+) -> Vec<f64> {
     let main = (((to - from) / pitch).round() as usize).max(1);
     let shares: Vec<f64> = (0..main).map(|_| 1.0 + jitter * f64::from(random.range(-1.0, 1.0))).collect();
     let scale = (to - from) / shares.iter().sum::<f64>();
+    let beside = |line: usize| {
+        let kind = if broad(line, main) { RoadKind::Boulevard } else { RoadKind::Street };
+        kind.profile().front() - RoadKind::Alley.profile().front()
+    };
     let mut lines = vec![from];
     let mut at = from;
-    for share in shares {
-        let uneven =
-            |k: usize, random: &mut Random| if k < fine { 0.2 * f64::from(random.range(-1.0, 1.0)) } else { 0.0 };
-        lines.extend((1..=fine).map(|k| at + share * scale * (k as f64 + uneven(k, random)) / fine as f64));
+    for (k, share) in shares.into_iter().enumerate() {
+        let (low, high) = (at + beside(k), at + share * scale - beside(k + 1));
+        for part in 1..fine {
+            let uneven = 0.15 * f64::from(random.range(-1.0, 1.0));
+            lines.push(low + (high - low) * (part as f64 + uneven) / fine as f64);
+        }
         at += share * scale;
+        lines.push(at);
     }
     lines
 }
@@ -587,8 +609,8 @@ fn cuts(roads: &Roads, lines: &[Vec<DVec2>], node: usize) -> [f64; 4] {
         // roads that go on straight only widen or narrow
         let straight = sine < 0.35;
         let meet = |mine: f64, other: f64| if straight { (other - mine).abs() } else { (other + mine * cosine) / sine };
-        cuts[a] = cuts[a].max((meet(front_a, front_b) + 1.5).clamp(1.5, 0.4 * length_a));
-        cuts[b] = cuts[b].max((meet(front_b, front_a) + 1.5).clamp(1.5, 0.4 * length_b));
+        cuts[a] = cuts[a].max((meet(front_a, front_b) + 1.5).clamp(1.5, 0.6 * length_a));
+        cuts[b] = cuts[b].max((meet(front_b, front_a) + 1.5).clamp(1.5, 0.6 * length_b));
     }
     cuts
 }
@@ -605,7 +627,9 @@ fn set_path(edge: &mut Option<Edge>, line: &[DVec2], cuts: [f64; 2], samples: us
         let k = along.partition_point(|&a| a <= s).clamp(1, line.len() - 1);
         line[k - 1].lerp(line[k], (s - along[k - 1]) / (along[k] - along[k - 1]))
     };
-    let (from, to) = (cuts[0], length - cuts[1]);
+    // something is left of a short road
+    let scale = (0.85 * length / (cuts[0] + cuts[1])).min(1.0);
+    let (from, to) = (scale * cuts[0], length - scale * cuts[1]);
     edge.path = (0..=samples)
         .map(|k| {
             let s = from + (to - from) * k as f64 / samples as f64;

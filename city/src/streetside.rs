@@ -171,7 +171,7 @@ impl Parcel<'_> {
         for _ in 0..tries {
             let p = self.random.between(low.as_vec2(), high.as_vec2()).as_dvec2();
             let kind = *self.random.one_of(kinds);
-            let heading = DVec2::from_angle(f64::from(self.random.range(0.0, 6.283)));
+            let heading = DVec2::from_angle(f64::from(self.random.range(0.0, std::f32::consts::TAU)));
             self.put_free(Prop::Tree(kind), p, heading, clear, outline);
         }
     }
@@ -278,7 +278,7 @@ impl Parcel<'_> {
         let across = along.perp();
         for row in 0..12 {
             // two rows back to back, then a lane
-            let y = 5.4 * f64::from(row) + 6.0 * f64::from((row + 1) / 2);
+            let y = 5.9 * f64::from(row) + 6.0 * f64::from((row + 1) / 2);
             for k in 0..(line.length / 2.7) as usize {
                 let p = corner + along * (2.7 * k as f64 + 2.0) + across * y;
                 let car = some_car(&mut self.random);

@@ -188,7 +188,8 @@ pub(crate) fn vehicles(
 /// The vehicles on the deck.
 pub(crate) fn deck_vehicles(deck: &Deck, traffic: Traffic, random: &Random) -> Vec<Mover> {
     let Some(level) = level(traffic) else { return Vec::new() };
-    drive(&thin(deck.round()), &level, false, &mut random.fork(0xDEC4))
+    // ramps bend upwards: all points stay
+    drive(&deck.round(), &level, false, &mut random.fork(0xDEC4))
 }
 
 fn drive(points: &[DVec3], level: &Level, narrow: bool, random: &mut Random) -> Vec<Mover> {

@@ -109,18 +109,28 @@ fn junction(layer: &mut Layer, roads: &Roads, node: usize, arms: &[(usize, Profi
         let corner: Vec<DVec2> = roads.corner(node, next, arm, &|p| p.half).collect();
         rim.extend(corner.into_iter().rev());
     }
-    let middle = rim.iter().sum::<DVec2>() / rim.len() as f64;
+    // every point of the rim is seen from where the centre lines meet
+    let middle = roads.nodes[node];
     let paved = if arms.iter().all(|a| a.1.kind == RoadKind::Alley) { m::COBBLES } else { m::ASPHALT };
     layer.builder.class(Class::Road).paint(paved);
     let ring = |layer: &mut Layer, share: f64| -> Vec<u32> {
         rim.iter().map(|&p| layer.corner(middle.lerp(p, share), 0.0)).collect()
     };
-    let (inner, outer, centre) = (ring(layer, 0.5), ring(layer, 1.0), layer.corner(middle, 0.0));
+    let reach = rim.iter().map(|p| p.distance(middle)).fold(0.0, f64::max);
+    let rings = (reach / 3.5).ceil().max(1.0) as usize;
+    let mut inner = ring(layer, 1.0 / rings as f64);
+    let centre = layer.corner(middle, 0.0);
     for k in 0..rim.len() {
-        let next = (k + 1) % rim.len();
-        layer.builder.face([centre, inner[k], inner[next]]);
-        layer.builder.face([inner[k], outer[k], outer[next]]);
-        layer.builder.face([inner[k], outer[next], inner[next]]);
+        layer.builder.face([centre, inner[k], inner[(k + 1) % rim.len()]]);
+    }
+    for r in 2..=rings {
+        let outer = ring(layer, r as f64 / rings as f64);
+        for k in 0..rim.len() {
+            let next = (k + 1) % rim.len();
+            layer.builder.face([inner[k], outer[k], outer[next]]);
+            layer.builder.face([inner[k], outer[next], inner[next]]);
+        }
+        inner = outer;
     }
 }
 

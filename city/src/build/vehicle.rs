@@ -190,8 +190,15 @@ fn wheels(b: &mut Builder, x: f32, half: f32, radius: f32) {
         let at = |y: f32| Vec3::new(x, side * y, radius);
         b.paint(m::TYRE).tube(at(half - 0.22), at(half + 0.005), [radius; 2], 14);
         b.paint(m::RIM).tube(at(half - 0.02), at(half + 0.015), [0.62 * radius; 2], 9);
-        // an arch of shadow around the wheel
-        b.paint(m::TRIM).tube(at(half - 0.24), at(half - 0.005), [radius + 0.05; 2], 14);
+        // an arch of shadow above the wheel
+        b.paint(m::TRIM);
+        let rim = |k: usize| {
+            let turn = std::f32::consts::PI * (k as f32 / 8.0);
+            at(half + 0.003) + (radius + 0.05) * Vec3::new(-side * turn.cos(), 0.0, turn.sin())
+        };
+        for k in 0..8 {
+            b.triangle([at(half + 0.003), rim(k), rim(k + 1)]);
+        }
     }
 }
 
