@@ -27,8 +27,18 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let oblique =
         View::new(Vec3::new(-0.35 * half, -0.9 * half, 75.0), Vec3::new(0.0, -0.2 * half, 5.0), Some(0.9), 1.0);
     draw(&city, &oblique, [1280, 800], &file("oblique".to_owned()))?;
-    let beside = View::new(Vec3::new(-0.55 * half, -24.0, 19.0), Vec3::new(0.1 * half, 4.0, 0.0), Some(0.9), 1.0);
-    draw(&city, &beside, [1280, 800], &file("middle".to_owned()))?;
+    // along the last lane, which is the deck's where there is one, from it and from above
+    if let Some(lane) = city.streets.last() {
+        let [here, ahead] = [lane.len() / 3, 2 * lane.len() / 3].map(|k| lane[k].as_vec3());
+        let over = View::new(here + Vec3::new(0.0, -12.0, 16.0), ahead, Some(0.9), 1.0);
+        draw(&city, &over, [1280, 800], &file("over".to_owned()))?;
+        draw(
+            &city,
+            &View::new(here + 1.8 * Vec3::Z, ahead + Vec3::Z, Some(0.9), 1.0),
+            [1280, 800],
+            &file("last".to_owned()),
+        )?;
+    }
     let shelves: [(&str, f32, &[&str]); 4] = [
         (
             "vehicles",

@@ -113,13 +113,10 @@ impl<'a> Deck<'a> {
         let [from, to] = self.ends();
         let count = ((to - from) / 3.0).ceil() as usize;
         let stations: Vec<f64> = (0..=count).map(|k| from + (to - from) * k as f64 / count as f64).collect();
-        (0..count)
-            .step_by(20)
-            .map(|k| self.piece(&stations[k..=(k + 20).min(count)], k == 0, k + 20 >= count, k / 20))
-            .collect()
+        (0..count).step_by(20).map(|k| self.piece(&stations[k..=(k + 20).min(count)], k / 20)).collect()
     }
 
-    fn piece(&self, stations: &[f64], first: bool, last: bool, number: usize) -> Piece {
+    fn piece(&self, stations: &[f64], number: usize) -> Piece {
         let mut layer = Layer::new(self.terrain, self.line.at(stations[0]).0, Class::Bridge);
         self.surface(&mut layer, stations);
         for pair in stations.windows(2) {
@@ -137,7 +134,6 @@ impl<'a> Deck<'a> {
                 self.abutment(&mut layer, pair[usize::from(end(pair[0]))], end(pair[0]));
             }
         }
-        let _ = (first, last);
         layer.finish(format!("deck {number}"))
     }
 

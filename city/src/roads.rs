@@ -637,3 +637,52 @@ fn set_path(edge: &mut Option<Edge>, line: &[DVec2], cuts: [f64; 2], samples: us
         })
         .collect();
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn blocks_tile_the_lattice_and_every_road_leads_somewhere() {
+        for &layout in Layout::ALL {
+            let settings = CitySettings { layout, area_km2: 0.6, ..CitySettings::default() };
+            let roads = Roads::new(&settings, &Random::new(5));
+            let area = |l: &[usize; 4]| (l[1] - l[0]) * (l[3] - l[2]);
+            assert_eq!(roads.blocks.iter().map(|b| area(&b.lines)).sum::<usize>(), roads.cells[0] * roads.cells[1]);
+            for node in 0..roads.nodes.len() {
+                let arms = (0..4).filter(|&arm| roads.arm(node, arm).is_some()).count();
+                assert_ne!(arms, 1, "{layout}: a dead end");
+            }
+            for edge in roads.edges.iter().flatten() {
+                let sane = edge.path.iter().all(|(p, d)| p.is_finite() && (d.length() - 1.0).abs() < 1e-6);
+                assert!(sane && edge.path.len() > 1, "{layout}");
+            }
+        }
+    }
+
+    #[test]
+    fn opposite_sides_of_a_block_have_as_many_points_and_rings_nest() {
+        let settings = CitySettings { layout: Layout::Mixed, area_km2: 0.6, ..CitySettings::default() };
+        let roads = Roads::new(&settings, &Random::new(6));
+        let area = |ring: &[RingPoint]| {
+            let pairs = (0..ring.len()).map(|k| (ring[k].at, ring[(k + 1) % ring.len()].at));
+            0.5 * pairs.map(|(a, b)| a.perp_dot(b)).sum::<f64>()
+        };
+        for block in &roads.blocks {
+            let walk = roads.around(block.lines);
+            let (curb, turns) = roads.ring(&walk, &|p| p.half);
+            let (front, _) = roads.ring(&walk, &Profile::front);
+            let side = |k: usize| (turns[k] + curb.len() - turns[(k + 3) % 4]) % curb.len();
+            assert_eq!((side(0), side(1)), (side(2), side(3)));
+            assert!(area(&curb) > area(&front) && area(&front) > 0.0, "{block:?}");
+        }
+        let (outside, turns) = roads.ring(&roads.outside(), &Profile::front);
+        assert!(area(&outside) < 0.0 && turns.len() == 4);
+    }
+
+    #[test]
+    fn alleys_are_three_to_five_metres_wide() {
+        let profile = RoadKind::Alley.profile();
+        assert!((3.0..5.0).contains(&(2.0 * profile.front())));
+    }
+}

@@ -419,3 +419,44 @@ fn flat(b: &mut Builder, look: &mut Look, width: f32, depth: f32) {
     let mast = look.seed.between(low + 0.5, high - 0.5);
     b.paint(m::STEEL).tube(mast.extend(eaves), mast.extend(top + 2.5), [0.03, 0.02], 5);
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_pane_has_a_back_plane_within_a_metre_and_lies_in_the_wall() {
+        for kind in [HouseKind::Town, HouseKind::Tall, HouseKind::Old, HouseKind::Villa, HouseKind::Tower] {
+            let width = WIDTHS[4];
+            let mesh = house(kind, width, Random::new(3), "house".to_owned()).mesh;
+            let corners = |k: usize| mesh.triangles[k].map(|i| mesh.positions[i as usize]);
+            let normal = |[a, b, c]: [Vec3; 3]| (b - a).cross(c - a).normalize();
+            let panes: Vec<usize> = (0..mesh.triangles.len()).filter(|&k| mesh.materials[k] == m::GLASS.0).collect();
+            assert!(panes.len() > 10, "{kind:?}");
+            for &pane in &panes {
+                assert_eq!(mesh.classes[pane], Class::Building);
+                let (out, middle) = (normal(corners(pane)), corners(pane).iter().sum::<Vec3>() / 3.0);
+                let behind = (0..mesh.triangles.len()).filter(|&k| mesh.materials[k] != m::GLASS.0).any(|k| {
+                    let [a, b, c] = corners(k);
+                    let gap = (middle - a).dot(normal([a, b, c]));
+                    let hit = middle - gap * out;
+                    let inside = |p: Vec3, q: Vec3| (q - p).cross(hit - p).dot(out) > -1e-4;
+                    let parallel = normal([a, b, c]).dot(out) > 0.99;
+                    parallel && (0.2..1.2).contains(&gap) && inside(a, b) && inside(b, c) && inside(c, a)
+                });
+                assert!(behind, "{kind:?}: nothing behind the pane at {middle}");
+            }
+        }
+    }
+
+    #[test]
+    fn houses_keep_to_their_lot_at_walking_height() {
+        for (kind, width) in [(HouseKind::Town, 0), (HouseKind::Old, 3), (HouseKind::Tower, 6), (HouseKind::Villa, 2)] {
+            let mesh = house(kind, WIDTHS[width], Random::new(9), "house".to_owned()).mesh;
+            let half = 0.5 * WIDTHS[width] + 0.13;
+            for p in mesh.positions.iter().filter(|p| p.z < 2.2) {
+                assert!(p.x.abs() <= half && p.y >= -0.13 && p.y <= kind.depth() + 0.13, "{kind:?} sticks out at {p}");
+            }
+        }
+    }
+}
