@@ -13,6 +13,7 @@
 mod build;
 mod deck;
 mod generate;
+mod lattice;
 mod materials;
 mod parcels;
 mod props;
