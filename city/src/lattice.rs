@@ -1,6 +1,7 @@
 //! The lattice that roads follow: where its lines are, how they bend, which cells belong together, and where crossings begin.
 
 use glam::DVec2;
+use rayon::prelude::*;
 
 use crate::random::Random;
 use crate::roads::{Block, Edge, Quarter, RoadKind, Roads, STEP};
@@ -160,7 +161,10 @@ impl Lattice {
         let [nx, ny] = roads.cells;
         roads.nodes = (0..=ny).flat_map(|j| (0..=nx).map(move |i| (i, j))).map(|(i, j)| place(i, j)).collect();
         let lines: Vec<Vec<DVec2>> = (0..roads.edges.len()).map(|e| self.line(roads, e)).collect();
-        let cuts: Vec<[f64; 4]> = (0..roads.nodes.len()).map(|n| cuts(roads, &lines, n)).collect();
+        let cuts: Vec<[f64; 4]> = {
+            let roads: &Roads = roads;
+            (0..roads.nodes.len()).into_par_iter().map(|n| cuts(roads, &lines, n)).collect()
+        };
         // as many samples on every edge of a column (of a row), so that the sides of a block match
         let lengths: Vec<f64> = lines.iter().map(|l| l.windows(2).map(|w| w[0].distance(w[1])).sum()).collect();
         let longest = |edges: &mut dyn Iterator<Item = usize>| edges.fold(STEP, |most, e| lengths[e].max(most));
@@ -221,9 +225,9 @@ fn bends(layout: Layout, extent: f64, random: &mut Random) -> Vec<Bend> {
         Layout::Grid | Layout::Deck => Vec::new(),
         // crooked
         Layout::Alley => vec![
-            bend(Layout::Alley, true, 87.0, 0.2),
-            bend(Layout::Alley, false, 71.0, 0.2),
-            bend(Layout::Alley, true, 310.0, 0.2),
+            bend(Layout::Alley, true, 87.0, 0.16),
+            bend(Layout::Alley, false, 71.0, 0.16),
+            bend(Layout::Alley, true, 310.0, 0.08),
         ],
         CurvedCorridor => {
             let length = (0.9 * extent).clamp(200.0, 380.0);
@@ -278,28 +282,57 @@ fn lines(
     lines
 }
 
-/// How far from a node each of its arms begins: where the fronts of neighbouring roads have met.
+/// A road as seen from one of its ends.
+struct Arm {
+    arm: usize,
+    /// Centre line away from the node, and the distance along it.
+    points: Vec<DVec2>,
+    along: Vec<f64>,
+    front: f64,
+}
+
+impl Arm {
+    fn new(roads: &Roads, lines: &[Vec<DVec2>], node: usize, arm: usize) -> Option<Self> {
+        let (index, away) = roads.arm(node, arm)?;
+        let mut points = lines[index].clone();
+        if !away {
+            points.reverse();
+        }
+        let mut along = vec![0.0];
+        for pair in points.windows(2) {
+            along.push(along[along.len() - 1] + pair[0].distance(pair[1]));
+        }
+        Some(Self { arm, points, along, front: roads.edges[index].as_ref()?.profile.front() })
+    }
+
+    /// How far out this arm's front, on its left (1) or right (-1), lies within another arm's fronts.
+    fn within(&self, side: f64, other: &Self) -> f64 {
+        let last = self.points.len() - 1;
+        let inside = |k: usize| {
+            let along = (self.points[(k + 1).min(last)] - self.points[k.saturating_sub(1)]).normalize_or_zero();
+            let p = self.points[k] + side * self.front * along.perp();
+            other.points.windows(2).any(|w| {
+                let (a, b) = (w[0], w[1]);
+                let t = ((p - a).dot(b - a) / (b - a).length_squared()).clamp(0.0, 1.0);
+                p.distance(a.lerp(b, t)) < other.front - 0.05
+            })
+        };
+        // crossings end well before the middle of the longest cut
+        let reach = self.along.partition_point(|&s| s < 0.6 * self.along[last]);
+        let out = (0..reach).rev().find(|&k| inside(k)).map_or(0, |k| k + 1);
+        self.along[out]
+    }
+}
+
+/// How far from a node each of its arms begins: where its fronts have left its neighbours'.
 fn cuts(roads: &Roads, lines: &[Vec<DVec2>], node: usize) -> [f64; 4] {
     let mut cuts = [0.0f64; 4];
-    let arms: Vec<(usize, DVec2, f64, f64)> = (0..4)
-        .filter_map(|arm| {
-            let (index, away) = roads.arm(node, arm)?;
-            let (line, profile) = (&lines[index], roads.edges[index].as_ref()?.profile);
-            let last = line.len() - 1;
-            // the direction some metres down the road, where the corner will be
-            let (a, b) = if away { (line[0], line[6]) } else { (line[last], line[last - 6]) };
-            let length: f64 = line.windows(2).map(|w| w[0].distance(w[1])).sum();
-            Some((arm, (b - a).normalize_or_zero(), profile.front(), length))
-        })
-        .collect();
+    let arms: Vec<Arm> = (0..4).filter_map(|arm| Arm::new(roads, lines, node, arm)).collect();
     for k in 0..arms.len() {
-        let ((a, out_a, front_a, length_a), (b, out_b, front_b, length_b)) = (arms[k], arms[(k + 1) % arms.len()]);
-        let (sine, cosine) = (out_a.perp_dot(out_b), out_a.dot(out_b));
-        // roads that go on straight only widen or narrow
-        let straight = sine < 0.35;
-        let meet = |mine: f64, other: f64| if straight { (other - mine).abs() } else { (other + mine * cosine) / sine };
-        cuts[a] = cuts[a].max((meet(front_a, front_b) + 1.5).clamp(1.5, 0.6 * length_a));
-        cuts[b] = cuts[b].max((meet(front_b, front_a) + 1.5).clamp(1.5, 0.6 * length_b));
+        let (one, next) = (&arms[k], &arms[(k + 1) % arms.len()]);
+        for (arm, side, other) in [(one, 1.0, next), (next, -1.0, one)] {
+            cuts[arm.arm] = cuts[arm.arm].max(arm.within(side, other) + 1.5);
+        }
     }
     cuts
 }

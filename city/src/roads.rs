@@ -51,7 +51,7 @@ impl RoadKind {
             Self::Boulevard => (12.0, 4.0, 8.2, 0.14, true),
             Self::Corridor => (5.2, 2.2, 1.6, 0.12, true),
             Self::Winding => (3.4, 1.8, 1.7, 0.10, false),
-            Self::Lane => (2.6, 0.9, 1.3, 0.06, false),
+            Self::Lane => (2.9, 0.9, 1.5, 0.06, false),
             Self::Alley => (1.2, 0.8, 0.0, 0.04, false),
         };
         Profile { kind: self, half, pavement, lane, curb, parking }

@@ -78,7 +78,7 @@ impl Round {
                 let (a, b, c) = (points[(k + count - 1) % count], points[k], points[(k + 1) % count]);
                 let turn = (b - a).truncate().angle_to((c - b).truncate()).abs();
                 let radius = 0.5 * (a.distance(b) + b.distance(c)) / turn.max(1e-6);
-                (SIDEWAYS * radius).sqrt().clamp(2.0_f64.min(speed), speed)
+                (SIDEWAYS * radius).sqrt().clamp(3.0_f64.min(speed), speed)
             })
             .collect();
         // twice around, so that the ends of the round agree
@@ -142,7 +142,9 @@ fn thin(points: Vec<DVec3>) -> Vec<DVec3> {
             continue;
         };
         let turn = (p - last).truncate().angle_to((next - p).truncate()).abs();
-        let straight = turn < 0.01 && !skipped && next.distance(last) < 9.0;
+        // neither a bend nor a step up
+        let even = (p.z - last.z.midpoint(next.z)).abs() < 0.015 + 0.1 * (p.distance(last) - next.distance(p)).abs();
+        let straight = turn < 0.01 && even && !skipped && next.distance(last) < 9.0;
         skipped = straight;
         if !straight && p.distance(last) > 0.3 {
             kept.push(p);

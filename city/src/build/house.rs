@@ -1,7 +1,7 @@
 //! Houses: walls with windows that are real recesses, doors, shops, balconies and roofs.
 //!
 //! A house stands behind its front: x along the street from `-width / 2`, y inwards from 0, z up from the pavement. Its plinth
-//! goes down three metres, for streets that climb.
+//! goes down four metres, for streets that climb.
 
 use glam::{Affine3A, Vec2, Vec3};
 
@@ -27,6 +27,9 @@ pub(crate) enum HouseKind {
 
 /// The widths that houses have, metres.
 pub(crate) const WIDTHS: [f32; 7] = [6.0, 7.5, 9.0, 10.5, 12.0, 14.0, 17.0];
+
+/// How far a plinth goes down, metres.
+pub(crate) const PLINTH: f32 = 4.0;
 
 impl HouseKind {
     /// From the front to the back, metres.
@@ -146,7 +149,7 @@ enum Wall {
 
 /// A wall in its own frame: x from 0 to `length`, facing -y.
 fn facade(b: &mut Builder, look: &mut Look, length: f32, wall: Wall) {
-    b.paint(m::PLINTH).panel([0.0, length], [-3.0, 0.0], 0.0);
+    b.paint(m::PLINTH).panel([0.0, length], [-PLINTH, 0.0], 0.0);
     let bays = ((length / look.bay) as usize).max(1);
     let bay = length / bays as f32;
     // party walls are blank but for some houses' at corners and gaps
