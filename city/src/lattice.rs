@@ -234,10 +234,10 @@ fn bends(layout: Layout, extent: f64, random: &mut Random) -> Vec<Bend> {
             vec![bend(CurvedCorridor, true, length, 0.6), bend(CurvedCorridor, false, 600.0, 0.08)]
         }
         Winding => vec![
-            bend(Winding, true, (0.8 * extent).clamp(170.0, 260.0), 0.3),
-            bend(Winding, false, (0.8 * extent).clamp(170.0, 230.0), 0.3),
-            bend(Winding, true, 118.0, 0.16),
-            bend(Winding, false, 103.0, 0.16),
+            bend(Winding, true, (0.8 * extent).clamp(170.0, 260.0), 0.24),
+            bend(Winding, false, (0.8 * extent).clamp(170.0, 230.0), 0.24),
+            bend(Winding, true, 118.0, 0.13),
+            bend(Winding, false, 103.0, 0.13),
         ],
         Layout::Mixed => vec![
             bend(CurvedCorridor, true, 230.0, 0.42),

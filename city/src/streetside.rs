@@ -132,16 +132,22 @@ impl Parcel<'_> {
                 s += f64::from(self.random.range(0.7, 9.0));
                 let prop = if self.random.chance(0.06) {
                     Prop::Vehicle(VehicleKind::MotorcycleParked, self.random.below(PAINTS) as u8)
+                } else if matches!(self.layout, Layout::Grid | Layout::Deck) && self.random.chance(0.05) {
+                    // long ones where streets are straight
+                    let kind = *self.random.one_of(&[VehicleKind::Bus, VehicleKind::Truck, VehicleKind::Truck]);
+                    Prop::Vehicle(kind, self.random.below(PAINTS) as u8)
                 } else {
                     some_car(&mut self.random)
                 };
                 let Prop::Vehicle(kind, _) = prop else { continue };
                 let length = f64::from(kind.size().x);
+                // wide ones stand a little off the curb
+                let aside = (f64::from(kind.size().y) - 1.9).max(0.0) * 0.25;
                 if s + length > line.length - 8.5 {
                     break;
                 }
                 let (p, along) = line.at(s + 0.5 * length);
-                self.put(prop, on_slope(self.terrain, p, -along));
+                self.put(prop, on_slope(self.terrain, p - aside * along.perp(), -along));
                 s += length;
             }
         }

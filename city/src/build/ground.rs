@@ -7,7 +7,7 @@ use glam::{DVec2, DVec3, Vec2, Vec3};
 use super::Builder;
 use crate::materials::{self as m, Surface};
 use crate::random::Random;
-use crate::roads::{Edge, Profile, RingPoint, RoadKind, Roads, Step};
+use crate::roads::{CORNER, Edge, Profile, RingPoint, RoadKind, Roads, Step};
 use crate::terrain::Terrain;
 use crate::words::{Asset, Class};
 
@@ -396,7 +396,11 @@ fn horizon(rings: &Rings, half: f64) -> Vec<DVec2> {
         let corner = |p: DVec2| far * DVec2::new(p.x.signum(), p.y.signum());
         let [a, b] = [from, to].map(|i| corner(rings.front[i % count].at - rings.centre()));
         for i in from..to {
-            targets[i % count] = a.lerp(b, (i - from) as f64 / (to - from) as f64);
+            let p = rings.front[i % count].at;
+            // straight out, but for a fan at each corner: so lines to the horizon do not cross a bending side
+            let out = if a.x == b.x { DVec2::new(a.x, p.y) } else { DVec2::new(p.x, a.y) };
+            let (near, steps) = if i - from <= to - i { (a, i - from) } else { (b, to - i) };
+            targets[i % count] = out.lerp(near, (1.0 - steps as f64 / (CORNER + 2) as f64).max(0.0));
         }
     }
     targets
