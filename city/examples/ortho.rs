@@ -5,8 +5,8 @@
 
 use std::path::Path;
 
-use city::{Actor, City, CitySettings, Mesh, Pattern, Traffic};
-use glam::Vec3;
+use city::{Actor, City, CitySettings, Class, Mesh, Pattern, Traffic};
+use glam::{DVec3, Vec3};
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
@@ -27,6 +27,46 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let oblique =
         View::new(Vec3::new(-0.35 * half, -0.9 * half, 75.0), Vec3::new(0.0, -0.2 * half, 5.0), Some(0.9), 1.0);
     draw(&city, &oblique, [1280, 800], &file("oblique".to_owned()))?;
+    // along the last lane, which is the deck's where there is one, from it and from above
+    if let Some(lane) = city.streets.last() {
+        let [here, ahead] = [lane.len() / 3, 2 * lane.len() / 3].map(|k| lane[k].as_vec3());
+        let over = View::new(here + Vec3::new(0.0, -12.0, 16.0), ahead, Some(0.9), 1.0);
+        draw(&city, &over, [1280, 800], &file("over".to_owned()))?;
+        draw(
+            &city,
+            &View::new(here + 1.8 * Vec3::Z, ahead + Vec3::Z, Some(0.9), 1.0),
+            [1280, 800],
+            &file("last".to_owned()),
+        )?;
+    }
+    let shelves: [(&str, f32, &[&str]); 4] = [
+        (
+            "vehicles",
+            7.0,
+            &["hatch", "saloon", "estate", "offroad", "taxi", "van", "pickup", "motor", "bicycle", "bus,", "truck"],
+        ),
+        ("people", 1.2, &["person 1", "person 2"]),
+        (
+            "furniture",
+            3.0,
+            &[
+                "lamp", "old", "sig", "street", "yield", "bin", "bench", "boll", "hyd", "shel", "col", "fence", "wall",
+                "hedge",
+            ],
+        ),
+        ("trees", 8.0, &["tree"]),
+    ];
+    for (name, apart, starts) in shelves {
+        let shelf = shelf(&city, f64::from(apart), starts);
+        let side = apart * (shelf.actors.len() as f32).sqrt();
+        let view = View::new(
+            Vec3::new(0.5 * side, -0.6 * side, 0.5 * side),
+            Vec3::new(-0.5 * apart, -0.5 * apart, 0.0),
+            Some(0.62),
+            1.0,
+        );
+        draw(&shelf, &view, [1500, 1000], &file(format!("shelf-{name}")))?;
+    }
     let count = city.streets.len();
     for k in 0..count.min(4) {
         let street = &city.streets[k * count / count.min(4)];
@@ -35,6 +75,25 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         draw(&city, &View::new(here, ahead, Some(1.1), 1.0), [1280, 800], &file(format!("street-{k}")))?;
     }
     Ok(())
+}
+
+/// Assets whose names start so, side by side.
+fn shelf(city: &City, apart: f64, starts: &[&str]) -> City {
+    let shown = |name: &str| starts.iter().any(|start| name.starts_with(start));
+    let assets: Vec<_> = city.assets.iter().filter(|a| shown(&a.name)).cloned().collect();
+    let columns = (assets.len() as f64).sqrt().ceil() as usize;
+    let actor = |k: usize| {
+        let translation = apart
+            * DVec3::new((k % columns) as f64 - 0.5 * columns as f64, (k / columns) as f64 - 0.5 * columns as f64, 0.0);
+        let pose = scene::Rigid { translation, ..scene::Rigid::IDENTITY };
+        Actor { asset: k as u32, class: Class::Terrain, instance: 0, world_from_asset: pose, trajectory: None }
+    };
+    City {
+        materials: city.materials.clone(),
+        actors: (0..assets.len()).map(actor).collect(),
+        assets,
+        ..City::default()
+    }
 }
 
 /// An eye: perspective with half a picture's width at unit distance, or from above with half its height in metres.

@@ -82,9 +82,9 @@ impl<'a> Deck<'a> {
         [start, self.line.length - start]
     }
 
-    /// A lane, eastwards on the right side, westwards on the left: from ramp's foot to ramp's foot.
+    /// A lane, eastwards on the right side, westwards on the left: from ramp to ramp, short of where vehicles turn.
     pub(crate) fn lane(&self, offset: f64, east: bool) -> Vec<DVec3> {
-        let [from, to] = [3.0, self.line.length - 3.0];
+        let [from, to] = [FOOT - 2.0, self.line.length - FOOT + 2.0];
         let count = ((to - from) / 4.0) as usize;
         let side = if east { -offset } else { offset };
         let lane = (0..=count).map(|k| self.at(from + (to - from) * k as f64 / count as f64, side));
@@ -113,13 +113,10 @@ impl<'a> Deck<'a> {
         let [from, to] = self.ends();
         let count = ((to - from) / 3.0).ceil() as usize;
         let stations: Vec<f64> = (0..=count).map(|k| from + (to - from) * k as f64 / count as f64).collect();
-        (0..count)
-            .step_by(20)
-            .map(|k| self.piece(&stations[k..=(k + 20).min(count)], k == 0, k + 20 >= count, k / 20))
-            .collect()
+        (0..count).step_by(20).map(|k| self.piece(&stations[k..=(k + 20).min(count)], k / 20)).collect()
     }
 
-    fn piece(&self, stations: &[f64], first: bool, last: bool, number: usize) -> Piece {
+    fn piece(&self, stations: &[f64], number: usize) -> Piece {
         let mut layer = Layer::new(self.terrain, self.line.at(stations[0]).0, Class::Bridge);
         self.surface(&mut layer, stations);
         for pair in stations.windows(2) {
@@ -137,7 +134,6 @@ impl<'a> Deck<'a> {
                 self.abutment(&mut layer, pair[usize::from(end(pair[0]))], end(pair[0]));
             }
         }
-        let _ = (first, last);
         layer.finish(format!("deck {number}"))
     }
 
@@ -261,7 +257,7 @@ impl<'a> Deck<'a> {
     pub(crate) fn lamps(&self) -> Vec<(DVec3, DVec2)> {
         let count = (self.line.length / 30.0) as usize;
         let lamp = |k: usize| {
-            let side = if k % 2 == 0 { 1.0 } else { -1.0 };
+            let side = if k.is_multiple_of(2) { 1.0 } else { -1.0 };
             let s = 30.0 * (k as f64 + 0.5);
             (self.lift(s) > 1.0).then(|| {
                 let at = self.at(s, side * (HALF + 0.5 * BARRIER)) + DVec3::Z * 0.45;

@@ -92,7 +92,7 @@ impl City {
         let mut actor = |prop: Prop, pose: Rigid, trajectory: Option<Trajectory>| Actor {
             asset: rows[&prop],
             class: prop.class(),
-            instance: instances.next().unwrap_or(u32::MAX),
+            instance: if prop.is_counted() { instances.next().unwrap_or(u32::MAX) } else { 0 },
             world_from_asset: pose,
             trajectory,
         };

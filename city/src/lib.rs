@@ -14,6 +14,7 @@ mod build;
 mod deck;
 pub mod faults;
 mod generate;
+mod lattice;
 mod materials;
 pub mod occupancy;
 mod parcels;

@@ -4,7 +4,7 @@ use glam::{DMat3, DQuat, DVec2, DVec3};
 use scene::Rigid;
 
 use crate::build::ground::{Cover, Line};
-use crate::build::house::{HouseKind, WIDTHS};
+use crate::build::house::{HouseKind, PLINTH, WIDTHS};
 use crate::materials as m;
 use crate::props::Prop;
 use crate::random::Random;
@@ -228,6 +228,10 @@ impl<'a> Parcel<'a> {
             return;
         }
         let high = points.iter().map(|&p| self.ground(p + behind * inwards).z).fold(f64::NEG_INFINITY, f64::max);
+        let low = footprint.corners().iter().map(|&p| self.ground(p).z).fold(f64::INFINITY, f64::min);
+        if high - low > f64::from(PLINTH) - 0.4 {
+            return;
+        }
         let variant = self.random.below(usize::from(self.variants)) as u8;
         self.footprints.push(footprint);
         self.put(Prop::House { kind, width: width as u8, variant }, upright(front.extend(high), along));

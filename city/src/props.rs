@@ -40,6 +40,11 @@ impl Prop {
         }
     }
 
+    /// Whether it has an instance number: all but what comes in pieces of two metres.
+    pub(crate) fn is_counted(self) -> bool {
+        !matches!(self, Self::Hedge | Self::Furniture(Piece::Fence | Piece::Wall))
+    }
+
     /// Builds it; the same for the same seed.
     pub(crate) fn build(self, seed: &Random) -> Asset {
         match self {

@@ -86,6 +86,11 @@ impl Parcel<'_> {
         let mut s = 5.0;
         let mut slot = self.random.below(4);
         while s < length - 5.0 {
+            // room for a bus stop
+            if profile.pavement > 3.5 && (-5.0..4.0).contains(&(s - 0.5 * length)) {
+                s = 0.5 * length + 5.0;
+                continue;
+            }
             let prop = match slot % 4 {
                 0 => Some(Prop::Furniture(Piece::Lamp)),
                 _ if wide && self.random.chance(0.6) => Some(self.street_tree(profile)),
@@ -106,6 +111,7 @@ impl Parcel<'_> {
             slot += 1;
         }
         if profile.pavement > 3.5 && length > 40.0 {
+            self.on_pavement(line, 0.5 * length, profile, Prop::Furniture(Piece::Shelter));
             self.on_pavement(line, 0.5 * length + 3.9, profile, Prop::Furniture(Piece::Sign(4)));
         }
     }
@@ -126,16 +132,22 @@ impl Parcel<'_> {
                 s += f64::from(self.random.range(0.7, 9.0));
                 let prop = if self.random.chance(0.06) {
                     Prop::Vehicle(VehicleKind::MotorcycleParked, self.random.below(PAINTS) as u8)
+                } else if matches!(self.layout, Layout::Grid | Layout::Deck) && self.random.chance(0.05) {
+                    // long ones where streets are straight
+                    let kind = *self.random.one_of(&[VehicleKind::Bus, VehicleKind::Truck, VehicleKind::Truck]);
+                    Prop::Vehicle(kind, self.random.below(PAINTS) as u8)
                 } else {
                     some_car(&mut self.random)
                 };
                 let Prop::Vehicle(kind, _) = prop else { continue };
                 let length = f64::from(kind.size().x);
+                // wide ones stand a little off the curb
+                let aside = (f64::from(kind.size().y) - 1.9).max(0.0) * 0.25;
                 if s + length > line.length - 8.5 {
                     break;
                 }
                 let (p, along) = line.at(s + 0.5 * length);
-                self.put(prop, on_slope(self.terrain, p, -along));
+                self.put(prop, on_slope(self.terrain, p - aside * along.perp(), -along));
                 s += length;
             }
         }
@@ -165,7 +177,7 @@ impl Parcel<'_> {
         for _ in 0..tries {
             let p = self.random.between(low.as_vec2(), high.as_vec2()).as_dvec2();
             let kind = *self.random.one_of(kinds);
-            let heading = DVec2::from_angle(f64::from(self.random.range(0.0, 6.283)));
+            let heading = DVec2::from_angle(f64::from(self.random.range(0.0, std::f32::consts::TAU)));
             self.put_free(Prop::Tree(kind), p, heading, clear, outline);
         }
     }
@@ -179,7 +191,7 @@ impl Parcel<'_> {
                 self.scatter(90.0, &[0, 1, 3, 4, 5, 6, 7, 8], &outline, 2.8);
             }
             Layout::Alley => self.scatter(60.0, &[7, 8], &outline, 1.6),
-            _ => self.scatter(50.0, &[0, 1, 2, 4, 8], &outline, 3.2),
+            _ => self.scatter(110.0, &[0, 1, 2, 4, 8], &outline, 3.2),
         }
     }
 
@@ -272,7 +284,7 @@ impl Parcel<'_> {
         let across = along.perp();
         for row in 0..12 {
             // two rows back to back, then a lane
-            let y = 5.4 * f64::from(row) + 6.0 * f64::from((row + 1) / 2);
+            let y = 5.9 * f64::from(row) + 6.0 * f64::from((row + 1) / 2);
             for k in 0..(line.length / 2.7) as usize {
                 let p = corner + along * (2.7 * k as f64 + 2.0) + across * y;
                 let car = some_car(&mut self.random);

@@ -40,8 +40,8 @@ impl Terrain {
         let waves = heights
             .iter()
             .map(|&(amplitude, length)| {
-                let heading = f64::from(random.range(0.0, 6.283));
-                let phase = f64::from(random.range(0.0, 6.283));
+                let heading = f64::from(random.range(0.0, std::f32::consts::TAU));
+                let phase = f64::from(random.range(0.0, std::f32::consts::TAU));
                 Wave { direction: DVec2::from_angle(heading) * TAU / length, phase, amplitude }
             })
             .collect();

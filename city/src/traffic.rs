@@ -78,7 +78,7 @@ impl Round {
                 let (a, b, c) = (points[(k + count - 1) % count], points[k], points[(k + 1) % count]);
                 let turn = (b - a).truncate().angle_to((c - b).truncate()).abs();
                 let radius = 0.5 * (a.distance(b) + b.distance(c)) / turn.max(1e-6);
-                (SIDEWAYS * radius).sqrt().clamp(2.0_f64.min(speed), speed)
+                (SIDEWAYS * radius).sqrt().clamp(3.0_f64.min(speed), speed)
             })
             .collect();
         // twice around, so that the ends of the round agree
@@ -142,7 +142,9 @@ fn thin(points: Vec<DVec3>) -> Vec<DVec3> {
             continue;
         };
         let turn = (p - last).truncate().angle_to((next - p).truncate()).abs();
-        let straight = turn < 0.01 && !skipped && next.distance(last) < 9.0;
+        // neither a bend nor a step up
+        let even = (p.z - last.z.midpoint(next.z)).abs() < 0.015 + 0.1 * (p.distance(last) - next.distance(p)).abs();
+        let straight = turn < 0.01 && even && !skipped && next.distance(last) < 9.0;
         skipped = straight;
         if !straight && p.distance(last) > 0.3 {
             kept.push(p);
@@ -181,41 +183,36 @@ pub(crate) fn vehicles(
     let quarter = &roads.quarters[quarter];
     let Some(level) = level(traffic).filter(|_| has_round(quarter)) else { return Vec::new() };
     let points = lane(roads, quarter.lines, terrain);
-    let narrow = matches!(quarter.layout, Layout::Alley | Layout::Winding);
-    drive(&points, &level, narrow, &mut random)
+    let pace = if matches!(quarter.layout, Layout::Alley | Layout::Winding) { 0.6 } else { 1.0 };
+    drive(&points, &level, pace, &mut random)
 }
 
 /// The vehicles on the deck.
 pub(crate) fn deck_vehicles(deck: &Deck, traffic: Traffic, random: &Random) -> Vec<Mover> {
     let Some(level) = level(traffic) else { return Vec::new() };
-    drive(&thin(deck.round()), &level, false, &mut random.fork(0xDEC4))
+    // ramps bend upwards: all points stay
+    drive(&deck.round(), &level, 1.0, &mut random.fork(0xDEC4))
 }
 
-fn drive(points: &[DVec3], level: &Level, narrow: bool, random: &mut Random) -> Vec<Mover> {
-    let speed = f64::from(random.range(level.speed[0], level.speed[1])) * if narrow { 0.6 } else { 1.0 };
+/// Vehicles one after another on a round, with a factor on their speed. Buses and lorries do not drive: they would swing into
+/// the other lane at corners.
+fn drive(points: &[DVec3], level: &Level, pace: f64, random: &mut Random) -> Vec<Mover> {
+    let speed = pace * f64::from(random.range(level.speed[0], level.speed[1]));
     let round = Round::new(points, leaning(points), speed);
     let count = (round.whole / level.headway + f64::from(random.unit())) as usize;
     let starts = round.starts(count, 0.25, random);
     starts
         .into_iter()
-        .map(|ahead| Mover {
-            prop: some_vehicle(narrow, random),
-            waypoints: round.waypoints(ahead),
-            gait_seconds: None,
-        })
+        .map(|ahead| Mover { prop: some_vehicle(random), waypoints: round.waypoints(ahead), gait_seconds: None })
         .collect()
 }
 
-fn some_vehicle(narrow: bool, random: &mut Random) -> Prop {
-    let pick = random.unit();
-    let kind = match pick {
-        p if p < 0.62 => return some_car(random),
-        p if p < 0.70 => VehicleKind::Taxi,
-        p if p < 0.78 => VehicleKind::Motorcycle,
-        p if p < 0.86 => VehicleKind::Bicycle,
-        _ if narrow => return some_car(random),
-        p if p < 0.93 => VehicleKind::Bus,
-        _ => VehicleKind::Truck,
+fn some_vehicle(random: &mut Random) -> Prop {
+    let kind = match random.below(12) {
+        0 => VehicleKind::Taxi,
+        1 => VehicleKind::Motorcycle,
+        2 => VehicleKind::Bicycle,
+        _ => return some_car(random),
     };
     Prop::Vehicle(kind, random.below(PAINTS) as u8)
 }

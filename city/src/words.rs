@@ -179,7 +179,8 @@ pub struct Actor {
     pub asset: u32,
     /// What it is as a whole: the class of its boxes.
     pub class: Class,
-    /// Instance, from 1, for what is counted (houses, vehicles, people, trees, poles, signs); 0 for ground and the like.
+    /// Instance, from 1, for what is counted (houses, vehicles, people, trees, poles, signs); 0 for ground and
+    /// for what comes in pieces: hedges, fences, walls.
     pub instance: u32,
     /// Its pose where it has no trajectory.
     pub world_from_asset: Rigid,

@@ -139,7 +139,8 @@ fn give_way(b: &mut Builder) {
 fn street_name(b: &mut Builder, surface: Surface) {
     post(b, Vec2::ZERO, 2.8, 0.035);
     let p = |x: f32, y: f32, z: f32| Vec3::new(x, y, z);
-    b.class(Class::TrafficSign).paint(surface);
+    b.class(Class::TrafficSign).paint(m::STEEL).cuboid(p(-0.01, -0.038, 2.39), p(1.11, -0.012, 2.66));
+    b.paint(surface);
     b.plate([p(0.0, -0.04, 2.4), p(1.1, -0.04, 2.4), p(1.1, -0.04, 2.65), p(0.0, -0.04, 2.65)]);
     b.plate([p(1.1, -0.01, 2.4), p(0.0, -0.01, 2.4), p(0.0, -0.01, 2.65), p(1.1, -0.01, 2.65)]);
 }
@@ -193,17 +194,21 @@ fn shelter(b: &mut Builder, random: &mut Random) {
     b.plate([p(1.895, 0.4, 0.5), p(1.895, -0.15, 0.5), p(1.895, -0.15, 2.0), p(1.895, 0.4, 2.0)]);
 }
 
-/// A column for advertisements.
+/// A column for advertisements, of eight sides.
 fn column(b: &mut Builder, random: &mut Random) {
-    b.paint(m::CONCRETE).tube(Vec3::ZERO, Vec3::Z * 2.6, [0.38; 2], 16);
-    b.paint(m::ZINC).tube(Vec3::Z * 2.6, Vec3::Z * 2.95, [0.46, 0.1], 16);
-    for k in 0..4 {
-        b.paint(m::poster(2 + random.below(4)));
-        let turn = std::f32::consts::TAU * k as f32 / 4.0;
+    const FLAT: f32 = 0.37;
+    let half = FLAT * (std::f32::consts::PI / 8.0).tan();
+    for k in 0..8 {
+        let turn = std::f32::consts::TAU * k as f32 / 8.0;
         let (out, along) = (Vec3::new(turn.cos(), turn.sin(), 0.0), Vec3::new(-turn.sin(), turn.cos(), 0.0));
-        let p = |s: f32, z: f32| 0.4 * out + s * along + Vec3::Z * z;
-        b.plate([p(-0.27, 1.0), p(0.27, 1.0), p(0.27, 1.8), p(-0.27, 1.8)]);
+        let side = |s: f32, z0: f32, z1: f32, above: f32| {
+            let p = |s: f32, z: f32| (FLAT + above) * out + s * along + Vec3::Z * z;
+            [p(-s, z0), p(s, z0), p(s, z1), p(-s, z1)]
+        };
+        b.paint(m::CONCRETE).quad(side(half, 0.0, 2.6, 0.0));
+        b.paint(m::poster(2 + random.below(4))).plate(side(0.9 * half, 1.5, 1.75, 0.003));
     }
+    b.paint(m::ZINC).tube(Vec3::Z * 2.6, Vec3::Z * 2.95, [0.46, 0.1], 16);
 }
 
 /// Two metres of fence along x.

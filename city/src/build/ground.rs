@@ -7,7 +7,7 @@ use glam::{DVec2, DVec3, Vec2, Vec3};
 use super::Builder;
 use crate::materials::{self as m, Surface};
 use crate::random::Random;
-use crate::roads::{Edge, Profile, RingPoint, RoadKind, Roads, Step};
+use crate::roads::{CORNER, Edge, Profile, RingPoint, RoadKind, Roads, Step};
 use crate::terrain::Terrain;
 use crate::words::{Asset, Class};
 
@@ -109,18 +109,28 @@ fn junction(layer: &mut Layer, roads: &Roads, node: usize, arms: &[(usize, Profi
         let corner: Vec<DVec2> = roads.corner(node, next, arm, &|p| p.half).collect();
         rim.extend(corner.into_iter().rev());
     }
-    let middle = rim.iter().sum::<DVec2>() / rim.len() as f64;
+    // every point of the rim is seen from where the centre lines meet
+    let middle = roads.nodes[node];
     let paved = if arms.iter().all(|a| a.1.kind == RoadKind::Alley) { m::COBBLES } else { m::ASPHALT };
     layer.builder.class(Class::Road).paint(paved);
     let ring = |layer: &mut Layer, share: f64| -> Vec<u32> {
         rim.iter().map(|&p| layer.corner(middle.lerp(p, share), 0.0)).collect()
     };
-    let (inner, outer, centre) = (ring(layer, 0.5), ring(layer, 1.0), layer.corner(middle, 0.0));
+    let reach = rim.iter().map(|p| p.distance(middle)).fold(0.0, f64::max);
+    let rings = (reach / 3.5).ceil().max(1.0) as usize;
+    let mut inner = ring(layer, 1.0 / rings as f64);
+    let centre = layer.corner(middle, 0.0);
     for k in 0..rim.len() {
-        let next = (k + 1) % rim.len();
-        layer.builder.face([centre, inner[k], inner[next]]);
-        layer.builder.face([inner[k], outer[k], outer[next]]);
-        layer.builder.face([inner[k], outer[next], inner[next]]);
+        layer.builder.face([centre, inner[k], inner[(k + 1) % rim.len()]]);
+    }
+    for r in 2..=rings {
+        let outer = ring(layer, r as f64 / rings as f64);
+        for k in 0..rim.len() {
+            let next = (k + 1) % rim.len();
+            layer.builder.face([inner[k], outer[k], outer[next]]);
+            layer.builder.face([inner[k], outer[next], inner[next]]);
+        }
+        inner = outer;
     }
 }
 
@@ -386,7 +396,11 @@ fn horizon(rings: &Rings, half: f64) -> Vec<DVec2> {
         let corner = |p: DVec2| far * DVec2::new(p.x.signum(), p.y.signum());
         let [a, b] = [from, to].map(|i| corner(rings.front[i % count].at - rings.centre()));
         for i in from..to {
-            targets[i % count] = a.lerp(b, (i - from) as f64 / (to - from) as f64);
+            let p = rings.front[i % count].at;
+            // straight out, but for a fan at each corner: so lines to the horizon do not cross a bending side
+            let out = if a.x == b.x { DVec2::new(a.x, p.y) } else { DVec2::new(p.x, a.y) };
+            let (near, steps) = if i - from <= to - i { (a, i - from) } else { (b, to - i) };
+            targets[i % count] = out.lerp(near, (1.0 - steps as f64 / (CORNER + 2) as f64).max(0.0));
         }
     }
     targets

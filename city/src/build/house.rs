@@ -1,7 +1,7 @@
 //! Houses: walls with windows that are real recesses, doors, shops, balconies and roofs.
 //!
 //! A house stands behind its front: x along the street from `-width / 2`, y inwards from 0, z up from the pavement. Its plinth
-//! goes down three metres, for streets that climb.
+//! goes down four metres, for streets that climb.
 
 use glam::{Affine3A, Vec2, Vec3};
 
@@ -27,6 +27,9 @@ pub(crate) enum HouseKind {
 
 /// The widths that houses have, metres.
 pub(crate) const WIDTHS: [f32; 7] = [6.0, 7.5, 9.0, 10.5, 12.0, 14.0, 17.0];
+
+/// How far a plinth goes down, metres.
+pub(crate) const PLINTH: f32 = 4.0;
 
 impl HouseKind {
     /// From the front to the back, metres.
@@ -146,7 +149,7 @@ enum Wall {
 
 /// A wall in its own frame: x from 0 to `length`, facing -y.
 fn facade(b: &mut Builder, look: &mut Look, length: f32, wall: Wall) {
-    b.paint(m::PLINTH).panel([0.0, length], [-3.0, 0.0], 0.0);
+    b.paint(m::PLINTH).panel([0.0, length], [-PLINTH, 0.0], 0.0);
     let bays = ((length / look.bay) as usize).max(1);
     let bay = length / bays as f32;
     // party walls are blank but for some houses' at corners and gaps
@@ -418,4 +421,45 @@ fn flat(b: &mut Builder, look: &mut Look, width: f32, depth: f32) {
     b.paint(look.wall).block((hut - 1.4).extend(eaves), (hut + 1.4).extend(eaves + 2.4));
     let mast = look.seed.between(low + 0.5, high - 0.5);
     b.paint(m::STEEL).tube(mast.extend(eaves), mast.extend(top + 2.5), [0.03, 0.02], 5);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_pane_has_a_back_plane_within_a_metre_and_lies_in_the_wall() {
+        for kind in [HouseKind::Town, HouseKind::Tall, HouseKind::Old, HouseKind::Villa, HouseKind::Tower] {
+            let width = WIDTHS[4];
+            let mesh = house(kind, width, Random::new(3), "house".to_owned()).mesh;
+            let corners = |k: usize| mesh.triangles[k].map(|i| mesh.positions[i as usize]);
+            let normal = |[a, b, c]: [Vec3; 3]| (b - a).cross(c - a).normalize();
+            let panes: Vec<usize> = (0..mesh.triangles.len()).filter(|&k| mesh.materials[k] == m::GLASS.0).collect();
+            assert!(panes.len() > 10, "{kind:?}");
+            for &pane in &panes {
+                assert_eq!(mesh.classes[pane], Class::Building);
+                let (out, middle) = (normal(corners(pane)), corners(pane).iter().sum::<Vec3>() / 3.0);
+                let behind = (0..mesh.triangles.len()).filter(|&k| mesh.materials[k] != m::GLASS.0).any(|k| {
+                    let [a, b, c] = corners(k);
+                    let gap = (middle - a).dot(normal([a, b, c]));
+                    let hit = middle - gap * out;
+                    let inside = |p: Vec3, q: Vec3| (q - p).cross(hit - p).dot(out) > -1e-4;
+                    let parallel = normal([a, b, c]).dot(out) > 0.99;
+                    parallel && (0.2..1.2).contains(&gap) && inside(a, b) && inside(b, c) && inside(c, a)
+                });
+                assert!(behind, "{kind:?}: nothing behind the pane at {middle}");
+            }
+        }
+    }
+
+    #[test]
+    fn houses_keep_to_their_lot_at_walking_height() {
+        for (kind, width) in [(HouseKind::Town, 0), (HouseKind::Old, 3), (HouseKind::Tower, 6), (HouseKind::Villa, 2)] {
+            let mesh = house(kind, WIDTHS[width], Random::new(9), "house".to_owned()).mesh;
+            let half = 0.5 * WIDTHS[width] + 0.13;
+            for p in mesh.positions.iter().filter(|p| p.z < 2.2) {
+                assert!(p.x.abs() <= half && p.y >= -0.13 && p.y <= kind.depth() + 0.13, "{kind:?} sticks out at {p}");
+            }
+        }
+    }
 }

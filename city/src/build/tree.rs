@@ -124,13 +124,15 @@ fn lump(b: &mut Builder, habit: &Habit, random: &mut Random, centre: Vec3, radii
             + 0.1 * (9.0 * d.z + 3.0 * d.x + waves[2]).sin()
     };
     b.paint(habit.leaves[random.below(2)]);
-    b.ball(centre, radii, 7, &swell);
-    for _ in 0..90 {
+    b.ball(centre, radii, 9, &swell);
+    let count = (70.0 * radii.x * radii.x).clamp(60.0, 260.0) as usize;
+    for _ in 0..count {
         let (z, turn) = (random.range(-1.0, 1.0), random.range(0.0, TAU));
         let flat = (1.0 - z * z).sqrt();
         let unit = Vec3::new(flat * turn.cos(), flat * turn.sin(), z);
-        let at = centre + radii * unit * swell(unit) * random.range(0.92, 1.1);
-        leaf(b, random, at, 0.2);
+        let at = centre + radii * unit * swell(unit) * random.range(0.95, 1.1);
+        let size = random.range(0.12, 0.34);
+        leaf(b, random, at, size);
     }
 }
 

@@ -138,7 +138,7 @@ fn car(b: &mut Builder, kind: VehicleKind, colour: Surface, random: &mut Random)
         ]);
     }
     if kind == K::Taxi {
-        b.paint(m::TRIM).cuboid(Vec3::new(-0.1, -0.3, roof), Vec3::new(0.1, 0.3, roof + 0.03));
+        b.paint(m::CAR_YELLOW).cuboid(Vec3::new(-0.098, -0.31, roof), Vec3::new(0.098, 0.31, roof + 0.19));
         b.paint(m::order(5));
         let p = |y: f32, z: f32| Vec3::new(0.1, y, roof + z);
         b.plate([p(-0.3, 0.03), p(0.3, 0.03), p(0.3, 0.18), p(-0.3, 0.18)]);
@@ -190,8 +190,15 @@ fn wheels(b: &mut Builder, x: f32, half: f32, radius: f32) {
         let at = |y: f32| Vec3::new(x, side * y, radius);
         b.paint(m::TYRE).tube(at(half - 0.22), at(half + 0.005), [radius; 2], 14);
         b.paint(m::RIM).tube(at(half - 0.02), at(half + 0.015), [0.62 * radius; 2], 9);
-        // an arch of shadow around the wheel
-        b.paint(m::TRIM).tube(at(half - 0.24), at(half - 0.005), [radius + 0.05; 2], 14);
+        // an arch of shadow above the wheel
+        b.paint(m::TRIM);
+        let rim = |k: usize| {
+            let turn = std::f32::consts::PI * (k as f32 / 8.0);
+            at(half + 0.003) + (radius + 0.05) * Vec3::new(-side * turn.cos(), 0.0, turn.sin())
+        };
+        for k in 0..8 {
+            b.triangle([at(half + 0.003), rim(k), rim(k + 1)]);
+        }
     }
 }
 
@@ -234,7 +241,7 @@ fn bus(b: &mut Builder, colour: Surface, random: &mut Random) {
         [Vec2::new(-half, -y), Vec2::new(half, y)],
         1.2,
     );
-    let roof = [Vec2::new(-half + 0.05, -y + 0.1), Vec2::new(half - 0.2, y - 0.1)];
+    let roof = [Vec2::new(-half + 0.05, -y + 0.1), Vec2::new(half - 0.01, y - 0.1)];
     b.paint(m::CAR_WHITE).tapered([Vec2::new(-half, -y), Vec2::new(half, y)], 1.2, roof, 2.95);
     b.paint(m::STEEL).block(Vec3::new(-3.0, -0.8, 2.95), Vec3::new(1.0, 0.8, 3.15));
     b.paint(m::GLASS_DARK);

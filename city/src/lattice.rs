@@ -1,0 +1,361 @@
+//! The lattice that roads follow: where its lines are, how they bend, which cells belong together, and where crossings begin.
+
+use glam::DVec2;
+use rayon::prelude::*;
+
+use crate::random::Random;
+use crate::roads::{Block, Edge, Quarter, RoadKind, Roads, STEP};
+use crate::settings::{CitySettings, Layout};
+
+/// The lattice before and after it is bent.
+pub(crate) struct Lattice {
+    layout: Layout,
+    xs: Vec<f64>,
+    ys: Vec<f64>,
+    fine: usize,
+    bends: Vec<Bend>,
+    random: Random,
+    /// Main cells to a region of the mixed city.
+    region: [f64; 2],
+}
+
+/// A shift of one coordinate that waves along the other: it cannot fold the plane while slopes multiply to under 1.
+#[derive(Clone, Copy)]
+struct Bend {
+    layout: Layout,
+    shift_y: bool,
+    amplitude: f64,
+    wave: f64,
+    phase: f64,
+}
+
+impl Lattice {
+    pub(crate) fn new(settings: &CitySettings, random: &Random) -> Self {
+        let mut random = random.fork(0x40AD);
+        let layout = settings.layout;
+        let extent = settings.extent_metres();
+        let half = 0.5 * extent;
+        // a strip beside a wide plain has no room for bends and alleys
+        let narrow = (1.0 - settings.plain) * extent < 130.0;
+        let bends = if narrow { Vec::new() } else { bends(layout, extent, &mut random) };
+        let reach = |shift_y: bool| bends.iter().filter(|b| b.shift_y == shift_y).map(|b| b.amplitude).sum::<f64>();
+        let border = RoadKind::Street.profile().front() + 0.5;
+        let (reach_x, reach_y) = (reach(false) + border, reach(true) + border);
+        let fine = if !narrow && matches!(layout, Layout::Alley | Layout::Mixed) { 3 } else { 1 };
+        let [wide, tall] = match layout {
+            Layout::CurvedCorridor => [84.0, 72.0],
+            Layout::Winding => [100.0, 84.0],
+            Layout::Deck => [104.0, 96.0],
+            Layout::Grid => [92.0, 84.0],
+            Layout::Alley | Layout::Mixed => [100.0, 96.0],
+        };
+        let mut jitter = if layout == Layout::Deck { 0.04 } else { 0.1 };
+        if extent < 400.0 {
+            jitter *= 0.5;
+        }
+        let west = -half + settings.plain * extent;
+        let decked = matches!(layout, Layout::Deck | Layout::Mixed);
+        let xs = lines([west + reach_x, half - reach_x], wide, fine, jitter, &mut random, &|_, _| false);
+        let deck = |line: usize, main: usize| decked && line == main / 2;
+        let ys = lines([-half + reach_y, half - reach_y], tall, fine, jitter, &mut random, &deck);
+        let region = [&xs, &ys].map(|l| (((l.len() - 1) / fine) as f64 / 3.0).clamp(1.0, 4.0).floor());
+        Self { layout, xs, ys, fine, bends, random, region }
+    }
+
+    /// The layout of a main cell.
+    fn layout_of(&self, i: usize, j: usize) -> Layout {
+        const TURNS: [Layout; 5] =
+            [Layout::CurvedCorridor, Layout::Alley, Layout::Grid, Layout::Winding, Layout::CurvedCorridor];
+        if self.layout != Layout::Mixed {
+            return self.layout;
+        }
+        let (i, j) = ((i as f64 / self.region[0]) as usize, (j as f64 / self.region[1]) as usize);
+        TURNS[(i + 2 * j) % 4]
+    }
+
+    /// Quarters, some of them joined, and blocks.
+    pub(crate) fn cut(&mut self) -> Roads {
+        let fine = self.fine;
+        let cells = [self.xs.len() - 1, self.ys.len() - 1];
+        let (columns, rows) = (cells[0] / fine, cells[1] / fine);
+        let decked = matches!(self.layout, Layout::Deck | Layout::Mixed);
+        let deck = (decked && rows > 1).then_some((rows / 2) * fine);
+        let mut roads =
+            Roads { cells, fine, edges: Vec::new(), nodes: Vec::new(), quarters: Vec::new(), blocks: Vec::new(), deck };
+        roads.edges = vec![None; cells[0] * (cells[1] + 1) + (cells[0] + 1) * cells[1]];
+        for row in 0..rows {
+            let mut i = 0;
+            while i < columns {
+                let layout = self.layout_of(i, row);
+                let most = match layout {
+                    Layout::CurvedCorridor => 2 + self.random.below(2),
+                    Layout::Winding | Layout::Grid => 1 + usize::from(self.random.chance(0.25)),
+                    _ => 1,
+                };
+                let joined = (1..=most).take_while(|k| i + k <= columns && self.layout_of(i + k - 1, row) == layout);
+                let count = joined.last().unwrap_or(1);
+                let lines = [i * fine, (i + count) * fine, row * fine, (row + 1) * fine];
+                self.split(&mut roads, Quarter { lines, layout, row });
+                i += count;
+            }
+        }
+        roads
+    }
+
+    fn split(&mut self, roads: &mut Roads, quarter: Quarter) {
+        let [west, east, south, north] = quarter.lines;
+        let index = roads.quarters.len();
+        roads.quarters.push(quarter);
+        if quarter.layout == Layout::Alley {
+            for j in south..north {
+                let mut i = west;
+                while i < east {
+                    let next = (i + 1 + usize::from(self.random.chance(0.3))).min(east);
+                    roads.blocks.push(Block { lines: [i, next, j, j + 1], quarter: index });
+                    i = next;
+                }
+            }
+        } else {
+            roads.blocks.push(Block { lines: quarter.lines, quarter: index });
+        }
+    }
+
+    /// Where a place of the lattice lies in the world.
+    fn bend(&self, u: f64, v: f64) -> DVec2 {
+        let mut p = DVec2::new(u, v);
+        for bend in &self.bends {
+            let weight = self.weight(bend.layout, u, v);
+            let along = if bend.shift_y { u } else { v };
+            let shift = weight * bend.amplitude * (bend.wave * along + bend.phase).sin();
+            if bend.shift_y {
+                p.y += shift;
+            } else {
+                p.x += shift;
+            }
+        }
+        p
+    }
+
+    /// How much a place belongs to a layout: smooth over the width of a main cell.
+    fn weight(&self, layout: Layout, u: f64, v: f64) -> f64 {
+        if self.layout != Layout::Mixed {
+            return 1.0;
+        }
+        let soft = |lines: &[f64], x: f64| {
+            let cells = (lines.len() - 1) / self.fine;
+            let (low, high) = (lines[0], lines[lines.len() - 1]);
+            let t = ((x - low) / (high - low) * cells as f64 - 0.5).clamp(0.0, (cells - 1) as f64);
+            let k = (t as usize).min(cells.saturating_sub(2));
+            let f = t - k as f64;
+            (k, f * f * (3.0 - 2.0 * f), cells)
+        };
+        let ((i, fu, columns), (j, fv, rows)) = (soft(&self.xs, u), soft(&self.ys, v));
+        let is = |i: usize, j: usize| f64::from(self.layout_of(i.min(columns - 1), j.min(rows - 1)) == layout);
+        let along = |j: usize| is(i, j) * (1.0 - fu) + is(i + 1, j) * fu;
+        along(j) * (1.0 - fv) + along(j + 1) * fv
+    }
+
+    /// Lays centre lines through the lattice, cut back at crossings.
+    pub(crate) fn draw(&self, roads: &mut Roads) {
+        let place = |i: usize, j: usize| self.bend(self.xs[i], self.ys[j]);
+        let [nx, ny] = roads.cells;
+        roads.nodes = (0..=ny).flat_map(|j| (0..=nx).map(move |i| (i, j))).map(|(i, j)| place(i, j)).collect();
+        let lines: Vec<Vec<DVec2>> = (0..roads.edges.len()).map(|e| self.line(roads, e)).collect();
+        let cuts: Vec<[f64; 4]> = {
+            let roads: &Roads = roads;
+            (0..roads.nodes.len()).into_par_iter().map(|n| cuts(roads, &lines, n)).collect()
+        };
+        // as many samples on every edge of a column (of a row), so that the sides of a block match
+        let lengths: Vec<f64> = lines.iter().map(|l| l.windows(2).map(|w| w[0].distance(w[1])).sum()).collect();
+        let longest = |edges: &mut dyn Iterator<Item = usize>| edges.fold(STEP, |most, e| lengths[e].max(most));
+        let count = |length: f64| (length / STEP).ceil() as usize;
+        for i in 0..nx {
+            let samples = count(longest(&mut (0..=ny).map(|j| roads.horizontal(i, j))));
+            for j in 0..=ny {
+                let (edge, ends) = (roads.horizontal(i, j), [roads.node(i, j), roads.node(i + 1, j)]);
+                let ends = [cuts[ends[0]][0], cuts[ends[1]][2]];
+                set_path(&mut roads.edges[edge], &lines[edge], ends, samples);
+            }
+        }
+        for j in 0..ny {
+            let samples = count(longest(&mut (0..=nx).map(|i| roads.vertical(i, j))));
+            for i in 0..=nx {
+                let (edge, ends) = (roads.vertical(i, j), [roads.node(i, j), roads.node(i, j + 1)]);
+                let ends = [cuts[ends[0]][1], cuts[ends[1]][3]];
+                set_path(&mut roads.edges[edge], &lines[edge], ends, samples);
+            }
+        }
+    }
+
+    /// An edge's whole line from node to node, finely.
+    fn line(&self, roads: &Roads, edge: usize) -> Vec<DVec2> {
+        const FINE: usize = 48;
+        let horizontals = self.horizontals(roads);
+        let t = (0..=FINE).map(|k| k as f64 / FINE as f64);
+        let between = |lines: &[f64], i: usize, t: f64| lines[i] + (lines[i + 1] - lines[i]) * t;
+        if edge < horizontals {
+            let (i, j) = (edge % roads.cells[0], edge / roads.cells[0]);
+            t.map(|t| self.bend(between(&self.xs, i, t), self.ys[j])).collect()
+        } else {
+            let edge = edge - horizontals;
+            let (i, j) = (edge % (roads.cells[0] + 1), edge / (roads.cells[0] + 1));
+            t.map(|t| self.bend(self.xs[i], between(&self.ys, j, t))).collect()
+        }
+    }
+
+    fn horizontals(&self, roads: &Roads) -> usize {
+        roads.cells[0] * (roads.cells[1] + 1)
+    }
+}
+
+/// Shifts whose slopes stay under 0.75 (one direction only) or 0.45 (both).
+fn bends(layout: Layout, extent: f64, random: &mut Random) -> Vec<Bend> {
+    let mut bend = |layout: Layout, shift_y: bool, length: f64, slope: f64| {
+        let wave = std::f64::consts::TAU / length;
+        Bend {
+            layout,
+            shift_y,
+            amplitude: slope / wave,
+            wave,
+            phase: f64::from(random.range(0.0, std::f32::consts::TAU)),
+        }
+    };
+    use Layout::{CurvedCorridor, Winding};
+    match layout {
+        Layout::Grid | Layout::Deck => Vec::new(),
+        // crooked
+        Layout::Alley => vec![
+            bend(Layout::Alley, true, 87.0, 0.16),
+            bend(Layout::Alley, false, 71.0, 0.16),
+            bend(Layout::Alley, true, 310.0, 0.08),
+        ],
+        CurvedCorridor => {
+            let length = (0.9 * extent).clamp(200.0, 380.0);
+            vec![bend(CurvedCorridor, true, length, 0.6), bend(CurvedCorridor, false, 600.0, 0.08)]
+        }
+        Winding => vec![
+            bend(Winding, true, (0.8 * extent).clamp(170.0, 260.0), 0.24),
+            bend(Winding, false, (0.8 * extent).clamp(170.0, 230.0), 0.24),
+            bend(Winding, true, 118.0, 0.13),
+            bend(Winding, false, 103.0, 0.13),
+        ],
+        Layout::Mixed => vec![
+            bend(CurvedCorridor, true, 230.0, 0.42),
+            bend(Winding, true, 200.0, 0.25),
+            bend(Winding, false, 180.0, 0.25),
+            bend(Winding, true, 110.0, 0.12),
+            bend(Winding, false, 97.0, 0.12),
+            bend(Layout::Alley, true, 87.0, 0.15),
+            bend(Layout::Alley, false, 71.0, 0.15),
+        ],
+    }
+}
+
+/// Lattice lines from one end to the other, main cells about `pitch` wide and `fine` lines to each; the lines between main
+/// ones divide what the main roads (`broad` at a boulevard) leave.
+fn lines(
+    [from, to]: [f64; 2],
+    pitch: f64,
+    fine: usize,
+    jitter: f64,
+    random: &mut Random,
+    broad: &dyn Fn(usize, usize) -> bool,
+) -> Vec<f64> {
+    let main = (((to - from) / pitch).round() as usize).max(1);
+    let shares: Vec<f64> = (0..main).map(|_| 1.0 + jitter * f64::from(random.range(-1.0, 1.0))).collect();
+    let scale = (to - from) / shares.iter().sum::<f64>();
+    let beside = |line: usize| {
+        let kind = if broad(line, main) { RoadKind::Boulevard } else { RoadKind::Street };
+        kind.profile().front() - RoadKind::Alley.profile().front()
+    };
+    let mut lines = vec![from];
+    let mut at = from;
+    for (k, share) in shares.into_iter().enumerate() {
+        let (low, high) = (at + beside(k), at + share * scale - beside(k + 1));
+        for part in 1..fine {
+            let uneven = 0.15 * f64::from(random.range(-1.0, 1.0));
+            lines.push(low + (high - low) * (part as f64 + uneven) / fine as f64);
+        }
+        at += share * scale;
+        lines.push(at);
+    }
+    lines
+}
+
+/// A road as seen from one of its ends.
+struct Arm {
+    arm: usize,
+    /// Centre line away from the node, and the distance along it.
+    points: Vec<DVec2>,
+    along: Vec<f64>,
+    front: f64,
+}
+
+impl Arm {
+    fn new(roads: &Roads, lines: &[Vec<DVec2>], node: usize, arm: usize) -> Option<Self> {
+        let (index, away) = roads.arm(node, arm)?;
+        let mut points = lines[index].clone();
+        if !away {
+            points.reverse();
+        }
+        let mut along = vec![0.0];
+        for pair in points.windows(2) {
+            along.push(along[along.len() - 1] + pair[0].distance(pair[1]));
+        }
+        Some(Self { arm, points, along, front: roads.edges[index].as_ref()?.profile.front() })
+    }
+
+    /// How far out this arm's front, on its left (1) or right (-1), lies within another arm's fronts.
+    fn within(&self, side: f64, other: &Self) -> f64 {
+        let last = self.points.len() - 1;
+        let inside = |k: usize| {
+            let along = (self.points[(k + 1).min(last)] - self.points[k.saturating_sub(1)]).normalize_or_zero();
+            let p = self.points[k] + side * self.front * along.perp();
+            other.points.windows(2).any(|w| {
+                let (a, b) = (w[0], w[1]);
+                let t = ((p - a).dot(b - a) / (b - a).length_squared()).clamp(0.0, 1.0);
+                p.distance(a.lerp(b, t)) < other.front - 0.05
+            })
+        };
+        // crossings end well before the middle of the longest cut
+        let reach = self.along.partition_point(|&s| s < 0.6 * self.along[last]);
+        let out = (0..reach).rev().find(|&k| inside(k)).map_or(0, |k| k + 1);
+        self.along[out]
+    }
+}
+
+/// How far from a node each of its arms begins: where its fronts have left its neighbours'.
+fn cuts(roads: &Roads, lines: &[Vec<DVec2>], node: usize) -> [f64; 4] {
+    let mut cuts = [0.0f64; 4];
+    let arms: Vec<Arm> = (0..4).filter_map(|arm| Arm::new(roads, lines, node, arm)).collect();
+    for k in 0..arms.len() {
+        let (one, next) = (&arms[k], &arms[(k + 1) % arms.len()]);
+        for (arm, side, other) in [(one, 1.0, next), (next, -1.0, one)] {
+            cuts[arm.arm] = cuts[arm.arm].max(arm.within(side, other) + 1.5);
+        }
+    }
+    cuts
+}
+
+/// Samples a line between its cuts evenly along its length.
+fn set_path(edge: &mut Option<Edge>, line: &[DVec2], cuts: [f64; 2], samples: usize) {
+    let Some(edge) = edge else { return };
+    let mut along = vec![0.0];
+    for pair in line.windows(2) {
+        along.push(along[along.len() - 1] + pair[0].distance(pair[1]));
+    }
+    let length = along[along.len() - 1];
+    let at = |s: f64| {
+        let k = along.partition_point(|&a| a <= s).clamp(1, line.len() - 1);
+        line[k - 1].lerp(line[k], (s - along[k - 1]) / (along[k] - along[k - 1]))
+    };
+    // something is left of a short road
+    let scale = (0.85 * length / (cuts[0] + cuts[1])).min(1.0);
+    let (from, to) = (scale * cuts[0], length - scale * cuts[1]);
+    edge.path = (0..=samples)
+        .map(|k| {
+            let s = from + (to - from) * k as f64 / samples as f64;
+            (at(s), (at(s + 1.0) - at(s - 1.0)).normalize_or_zero())
+        })
+        .collect();
+}
