@@ -57,6 +57,13 @@ const REFINEMENTS: u32 = 16;
 const MIN_STEPS: u32 = 10;
 
 impl Growth {
+    /// Neither adds nor removes.
+    #[must_use]
+    pub fn none(self) -> Self {
+        // It begins after the end.
+        Self { from: 2.0, ..self }
+    }
+
     /// Steps between two refinements of a job of so many steps.
     pub fn interval(&self, steps: u32) -> u32 {
         (steps / REFINEMENTS).clamp(MIN_STEPS.min(self.every), self.every).max(1)
