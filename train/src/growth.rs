@@ -217,6 +217,12 @@ mod tests {
     use super::*;
     use scene::Splat;
 
+    #[test]
+    fn short_jobs_refine_more_often() {
+        let growth = Growth::default();
+        assert_eq!([5, 57, 400, 1500, 30_000].map(|steps| growth.interval(steps)), [10, 10, 25, 50, 50]);
+    }
+
     fn row_of(n: usize) -> (Splats, Evidence) {
         let mut splats = Splats::new(0);
         for i in 0..n {
