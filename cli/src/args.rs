@@ -292,7 +292,7 @@ fn minutes(text: &str) -> Result<f64, String> {
     value.ok_or_else(|| "give minutes above 0, such as 30 or 0.5".into())
 }
 
-#[derive(Debug, Clone, Args)]
+#[derive(Debug, Clone, Default, Args)]
 pub(crate) struct EvalArgs {
     /// Folder that `plat train` wrote, a .ply or a .spz
     pub(crate) model: PathBuf,
