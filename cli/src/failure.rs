@@ -3,6 +3,7 @@
 use blocks::PlanError;
 use coordinator::LocalError;
 use dataset::ingest::IngestError;
+use dataset::rehearse::RehearseError;
 use dataset::synth::SynthError;
 use scene::BadInput;
 use store::StoreError;
@@ -66,6 +67,15 @@ impl From<SynthError> for Failure {
         match error {
             SynthError::BadInput(error) => error.into(),
             SynthError::Save(error) => error.into(),
+        }
+    }
+}
+
+impl From<RehearseError> for Failure {
+    fn from(error: RehearseError) -> Self {
+        match error {
+            RehearseError::BadInput(error) => error.into(),
+            RehearseError::Save(error) => error.into(),
         }
     }
 }

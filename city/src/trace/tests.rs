@@ -170,7 +170,7 @@ fn the_same_shot_gives_the_same_bytes_on_one_thread_and_two() {
     let world = World::new(&city).unwrap();
     let mut shot = shot(DVec3::new(-8.0, -9.0, 2.2), DVec3::new(4.0, 10.0, 1.0), 2.0);
     shot.rolling_shutter_seconds = 0.03;
-    let faults = Kind::ALL.map(|kind| Fault { kind, strength: 0.4, seed: 9 }).to_vec();
+    let faults = Kind::ALL.iter().map(|&kind| Fault { kind, strength: 0.4, seed: 9 }).collect();
     let options = Options { faults, ..Options::default() };
     let with = |threads| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
@@ -190,7 +190,7 @@ fn every_fault_changes_nothing_at_zero_and_something_at_one() {
             shot
         })
         .collect();
-    for kind in Kind::ALL {
+    for &kind in Kind::ALL {
         let with = |strength| {
             let options = Options { faults: vec![Fault { kind, strength, seed: 4 }], ..Options::default() };
             let spoilt = faults::spoil_shots(shots.clone(), &options.faults);

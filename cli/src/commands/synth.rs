@@ -1,0 +1,75 @@
+//! `plat synth`: a capture of a city that was never built.
+
+use std::path::PathBuf;
+use std::sync::Mutex;
+
+use city::CitySettings;
+use city::faults::Fault;
+use dataset::rehearse::{self, Settings, Summary};
+use serde::Serialize;
+
+use crate::args::SynthArgs;
+use crate::failure::Failure;
+use crate::output::{Output, Progress};
+
+#[derive(Serialize)]
+struct Shown {
+    out: PathBuf,
+    #[serde(flatten)]
+    summary: Summary,
+}
+
+pub(crate) fn run(args: &SynthArgs, output: &Output) -> Result<(), Failure> {
+    let settings = settings(args);
+    settings.check()?;
+    output.note(format!("building a city of {} km² and taking {} photos of it", args.area_km2, args.views));
+    let bar: Mutex<Option<(&str, Progress)>> = Mutex::new(None);
+    let summary = rehearse::write(&args.out, &settings, &|what, done, total| {
+        let mut bar = bar.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+        if bar.as_ref().is_none_or(|(shown, _)| *shown != what) {
+            *bar = None;
+            *bar = Some((what, output.progress(what, total as u64)));
+        }
+        if let Some((_, bar)) = bar.as_ref() {
+            bar.at(done as u64, "");
+        }
+    })?;
+    drop(bar);
+    let text = format!(
+        "{} photos of {} things, {} of them moving, in {} triangles; {} sparse points, each in {:.1} views\n\n\
+         the capture         {} (plat train reads it)\n\
+         what is in it       {}",
+        summary.views,
+        summary.actors,
+        summary.moving,
+        summary.triangles,
+        summary.points,
+        summary.mean_track,
+        args.out.display(),
+        args.out.join("manifest.json").display(),
+    );
+    output.result(&Shown { out: args.out.clone(), summary }, &text)
+}
+
+fn settings(args: &SynthArgs) -> Settings {
+    Settings {
+        city: CitySettings {
+            seed: args.seed,
+            area_km2: args.area_km2,
+            layout: args.layout,
+            traffic: args.traffic,
+            plain: args.plain,
+        },
+        views: args.views,
+        width: args.size.width,
+        height: args.size.height,
+        aerial: args.aerial,
+        fixed: args.fixed,
+        faults: args.fault.iter().map(|fault| Fault { seed: args.seed, ..*fault }).collect(),
+        truth: args.truth,
+        lidar: args.lidar,
+        radar: args.radar,
+        mesh: args.mesh,
+        occupancy: args.occupancy,
+    }
+}
