@@ -242,8 +242,11 @@ pub(crate) struct DemoArgs {
 #[command(after_long_help = SYNTH_HELP)]
 pub(crate) struct SynthArgs {
     /// Folder for the capture: new, empty, or of the same settings
-    #[arg(long, value_name = "DIR")]
-    pub(crate) out: PathBuf,
+    #[arg(long, value_name = "DIR", required_unless_present = "gallery")]
+    pub(crate) out: Option<PathBuf>,
+    /// Only draw a picture of what there is to choose from, of this city and size: layouts, labels, faults
+    #[arg(long, value_name = "FILE", conflicts_with = "out")]
+    pub(crate) gallery: Option<PathBuf>,
     /// Area of the square city, km²: 0.05 to 25
     #[arg(long, value_name = "A", default_value_t = 0.2)]
     pub(crate) area_km2: f64,

@@ -15,12 +15,14 @@
 //! | `scene_files` | `tracks.json`, `boxes3d.json` |
 //! | `gltf` | `city.glb` |
 //! | `npz` | `occupancy/` |
+//! | `gallery` | nothing: draws what there is to choose from |
 //! | `cameras` | `sparse/0/`, `transforms.json`, `sparse_pc.ply`, `reference_lla.json`, `truth/` |
 //!
 //! What a capture is trained with is what a crew would have: the cameras in it are those that were reported. How it truly
 //! was is in `truth/`. The same settings give the same bytes, whatever the number of threads.
 
 mod cameras;
+mod gallery;
 mod gltf;
 mod images;
 mod manifest;
@@ -40,6 +42,8 @@ use city::{City, CitySettings};
 use scene::BadInput;
 use serde::Serialize;
 use store::file::SaveError;
+
+pub use gallery::gallery;
 
 /// Everything that a rehearsal follows from.
 #[derive(Debug, Clone, PartialEq, Serialize)]

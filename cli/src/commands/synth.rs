@@ -1,8 +1,9 @@
 //! `plat synth`: a capture of a city that was never built.
 
 use std::path::PathBuf;
-use std::sync::Mutex;
+use std::sync::{Mutex, PoisonError};
 
+use ::bench::write_png;
 use city::CitySettings;
 use city::faults::Fault;
 use dataset::rehearse::{self, Settings, Summary};
@@ -19,21 +20,34 @@ struct Shown {
     summary: Summary,
 }
 
+#[derive(Serialize)]
+struct Drawn {
+    gallery: PathBuf,
+}
+
 pub(crate) fn run(args: &SynthArgs, output: &Output) -> Result<(), Failure> {
     let settings = settings(args);
     settings.check()?;
-    output.note(format!("building a city of {} km² and taking {} photos of it", args.area_km2, args.views));
     let bar: Mutex<Option<(&str, Progress)>> = Mutex::new(None);
-    let summary = rehearse::write(&args.out, &settings, &|what, done, total| {
-        let mut bar = bar.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+    let progress = |what, done, total| {
+        let mut bar = bar.lock().unwrap_or_else(PoisonError::into_inner);
         if bar.as_ref().is_none_or(|(shown, _)| *shown != what) {
+            // the old one goes before there is a new one
             *bar = None;
             *bar = Some((what, output.progress(what, total as u64)));
         }
         if let Some((_, bar)) = bar.as_ref() {
             bar.at(done as u64, "");
         }
-    })?;
+    };
+    if let Some(file) = &args.gallery {
+        write_png(file, &rehearse::gallery(&settings, &progress)?)?;
+        drop(bar);
+        return output.result(&Drawn { gallery: file.clone() }, &file.display().to_string());
+    }
+    let out = args.out.clone().ok_or_else(|| Failure::Input("--out is missing: say where the capture goes".into()))?;
+    output.note(format!("building a city of {} km² and taking {} photos of it", args.area_km2, args.views));
+    let summary = rehearse::write(&out, &settings, &progress)?;
     drop(bar);
     let text = format!(
         "{} photos of {} things, {} of them moving, in {} triangles; {} sparse points, each in {:.1} views\n\n\
@@ -45,10 +59,10 @@ pub(crate) fn run(args: &SynthArgs, output: &Output) -> Result<(), Failure> {
         summary.triangles,
         summary.points,
         summary.mean_track,
-        args.out.display(),
-        args.out.join("manifest.json").display(),
+        out.display(),
+        out.join("manifest.json").display(),
     );
-    output.result(&Shown { out: args.out.clone(), summary }, &text)
+    output.result(&Shown { out, summary }, &text)
 }
 
 fn settings(args: &SynthArgs) -> Settings {

@@ -62,7 +62,14 @@ fn a_rehearsal_opens_as_a_capture_and_its_points_are_where_views_see_them() {
     assert_eq!((aerial, street), (12, 12));
     let quarter = |p: DVec3| usize::from(p.x > 0.0) + 2 * usize::from(p.y > 0.0);
     let mut quarters = [0; 4];
-    capture.views.iter().for_each(|view| quarters[quarter(view.camera.centre())] += 1);
+    // of the air, what they look at
+    let half = 0.5 * small().city.extent_metres();
+    let place = |view: &scene::View| {
+        let (centre, forward) = (view.camera.centre(), view.camera.forward());
+        if forward.z < -0.5 { centre + forward * (centre.z / -forward.z) } else { centre }
+    };
+    capture.views.iter().for_each(|view| quarters[quarter(place(view))] += 1);
+    assert!(capture.views.iter().all(|view| place(view).truncate().abs().max_element() < 1.1 * half));
     assert!(quarters.iter().all(|&n| n >= 3), "{quarters:?}");
 
     // what was found in a picture, against where the noisy point falls in it
@@ -98,7 +105,7 @@ fn a_rehearsal_opens_as_a_capture_and_its_points_are_where_views_see_them() {
 
 #[test]
 fn the_same_settings_give_the_same_bytes_on_any_number_of_threads() {
-    let settings = Settings { views: 8, width: 48, height: 32, fixed: 0.25, ..small() };
+    let settings = Settings { views: 8, width: 48, height: 32, fixed: 0.25, ..everything() };
     let (one, two) = (written(&settings, 1), written(&settings, 2));
     let (a, b) = (files(one.0.path()), files(two.0.path()));
     assert_eq!(a.keys().collect::<Vec<_>>(), b.keys().collect::<Vec<_>>());
@@ -158,4 +165,140 @@ fn settings_out_of_range_are_refused_before_anything_is_made() {
         assert!(matches!(refusal, RehearseError::BadInput(_)) && !refusal.to_string().contains('\n'), "{refusal}");
         assert!(!out.exists());
     }
+}
+
+/// Everything that can be written, small.
+fn everything() -> Settings {
+    Settings {
+        views: 12,
+        width: 64,
+        height: 40,
+        truth: true,
+        lidar: true,
+        radar: true,
+        mesh: true,
+        occupancy: Some(2.0),
+        ..small()
+    }
+}
+
+#[test]
+fn truth_agrees_with_itself_across_files() {
+    let (folder, _) = written(&everything(), 2);
+    let root = folder.path();
+    let all = files(root);
+    let json = |name: &str| serde_json::from_slice::<serde_json::Value>(&all[Path::new(name)]).unwrap();
+    let manifest = json("manifest.json");
+    assert_eq!(manifest["complete"], true);
+
+    // a label image's things are those of boxes3d.json, and lie in their boxes
+    let boxes = json("boxes3d.json");
+    let images = boxes["images"].as_array().unwrap();
+    assert_eq!(images.len(), 12);
+    let mut checked = 0;
+    for image in images {
+        let name = image["image"].as_str().unwrap().trim_start_matches("images/").trim_end_matches(".png").to_owned();
+        let labels = image::open(root.join(format!("instance/{name}.png"))).unwrap().to_rgb8();
+        let classes = image::open(root.join(format!("semantic/{name}.png"))).unwrap().to_luma8();
+        let materials = image::open(root.join(format!("material/{name}.png"))).unwrap().to_luma16();
+        let (shape, depth) = scene::npy::read_f32(&all[Path::new(&format!("depth/{name}.npy"))]).unwrap();
+        assert_eq!((shape, labels.dimensions()), (vec![40, 64], (64, 40)));
+        for (depth, class) in depth.iter().zip(classes.iter()) {
+            assert_eq!(*depth == 0.0, *class == city::Class::Sky as u8);
+        }
+        let known = manifest["materials"].as_array().unwrap().len();
+        assert!(materials.iter().zip(&depth).all(|(m, d)| if *d > 0.0 {
+            usize::from(*m) < known
+        } else {
+            *m == 65535
+        }));
+        let id = |p: &image::Rgb<u8>| u64::from(p[0]) + 256 * u64::from(p[1]) + 65536 * u64::from(p[2]);
+        let shots = crate::open::open(root, &OpenOptions::default()).unwrap();
+        let view = shots.capture.views.iter().find(|view| view.name == format!("{name}.png")).unwrap();
+        for thing in image["boxes"].as_array().unwrap() {
+            let pixels: Vec<usize> = (0..64 * 40)
+                .filter(|&i| id(labels.get_pixel(i % 64, i / 64)) == thing["instance"].as_u64().unwrap())
+                .map(|i| i as usize)
+                .collect();
+            assert_eq!(pixels.len() as u64, thing["pixels"].as_u64().unwrap());
+            let three = |key: &str| DVec3::from_array(serde_json::from_value(thing[key].clone()).unwrap());
+            let turn: [f64; 4] = serde_json::from_value(thing["rotation"].clone()).unwrap();
+            let from_world = glam::DQuat::from_array(turn).inverse();
+            let k = view.camera.pinhole;
+            for i in pixels {
+                let (x, y, z) = ((i % 64) as f64 + 0.5, (i / 64) as f64 + 0.5, f64::from(depth[i]));
+                let local = DVec3::new((x - k.cx) / k.fx, (y - k.cy) / k.fy, 1.0) * z;
+                let point = view.camera.camera_from_world.inverse().apply(local);
+                let inside = (from_world * (point - three("centre"))).abs() - 0.5 * three("size");
+                assert!(inside.max_element() < 0.02, "{thing} has {point} outside by {inside}");
+                checked += 1;
+            }
+        }
+    }
+    assert!(checked > 20, "{checked}");
+
+    // tracks are of those that move
+    let tracks = json("tracks.json");
+    let moving = manifest["summary"]["moving"].as_u64().unwrap() as usize;
+    assert_eq!(tracks["tracks"].as_array().unwrap().len(), moving);
+    assert!(moving > 10 && tracks["tracks"][0]["poses"].as_array().unwrap().len() > 1);
+}
+
+#[test]
+fn sweeps_and_voxels_are_what_their_formats_say() {
+    let (folder, _) = written(&everything(), 2);
+    let all = files(folder.path());
+    let of = |start: &str, end: &str| -> Vec<(&PathBuf, &Vec<u8>)> {
+        all.iter().filter(|(name, _)| name.starts_with(start) && name.to_string_lossy().ends_with(end)).collect()
+    };
+    let (points, labels, truths) = (of("lidar", ".bin"), of("lidar", ".label"), of("lidar", ".npy"));
+    assert!(!points.is_empty() && points.len() == labels.len() && points.len() == truths.len());
+    let mut errors = Vec::new();
+    for ((name, points), ((_, labels), (_, truth))) in points.iter().zip(labels.iter().zip(&truths)) {
+        let (shape, truth) = scene::npy::read_f32(truth).unwrap();
+        assert!(points.len() == 16 * shape[0] && labels.len() == 4 * shape[0] && shape[1] == 7, "{name:?}");
+        for (point, truth) in points.chunks(16).zip(truth.chunks(7)) {
+            let number = |i: usize| f32::from_le_bytes(point[4 * i..4 * i + 4].try_into().unwrap());
+            let range = DVec3::new(number(0).into(), number(1).into(), number(2).into()).length();
+            errors.push((range - f64::from(truth[3])).abs());
+        }
+        let row = name.file_stem().unwrap().to_string_lossy().into_owned();
+        assert!(all.keys().any(
+            |image| image.starts_with("images") && image.to_string_lossy().ends_with(&format!("{}.png", &row[6..]))
+        ));
+    }
+    errors.sort_by(f64::total_cmp);
+    let median = errors[errors.len() / 2];
+    // half of normal errors of 2 cm are under 1.35 cm
+    assert!(errors.len() > 1000 && (0.012..0.015).contains(&median), "{median} of {}", errors.len());
+    let radar = of("radar", ".csv");
+    let columns = |line: &str| line.split(',').count();
+    assert!(
+        !radar.is_empty()
+            && radar.iter().all(|(_, text)| {
+                let text = std::str::from_utf8(text).unwrap();
+                text.lines().count() > 5 && text.lines().all(|line| columns(line) == 14)
+            })
+    );
+
+    let voxels = of("occupancy", ".npz");
+    // 223.6 m in blocks of 64 m
+    assert_eq!(voxels.len(), 16);
+    let mut taken = 0;
+    for (_, bytes) in voxels {
+        let mut archive = zip::ZipArchive::new(std::io::Cursor::new(bytes)).unwrap();
+        let mut array = |name: &str| {
+            let mut bytes = Vec::new();
+            std::io::Read::read_to_end(&mut archive.by_name(name).unwrap(), &mut bytes).unwrap();
+            bytes
+        };
+        let (semantic, instance) = (array("semantic.npy"), array("instance.npy"));
+        let (header, side) = (128, scene::npy::read_f32(&array("voxel.npy")).unwrap().1);
+        assert_eq!((side, scene::npy::read_f32(&array("origin.npy")).unwrap().0), (vec![2.0], vec![3]));
+        let text = String::from_utf8_lossy(&semantic[..header]).into_owned();
+        assert!(text.contains("'|u1'") && text.contains(", 32, 32)"), "{text}");
+        assert_eq!((semantic.len() - header) * 4, instance.len() - header);
+        taken += semantic[header..].iter().filter(|&&class| class != city::occupancy::FREE).count();
+    }
+    assert!(taken > 100_000 / 8, "{taken}");
 }

@@ -12,7 +12,7 @@ use super::{Settings, impossible};
 /// Until when the city's traffic moves, seconds: what takes longer is done by several at once.
 const TRAFFIC_SECONDS: f64 = 600.0;
 /// The aerial block is flown as high as lets its shots be enough, within these metres.
-const HEIGHTS: [f64; 2] = [70.0, 200.0];
+const HEIGHTS: [f64; 2] = [80.0, 150.0];
 /// Least overlap of aerial photos, along a line and between lines, and the most.
 const OVERLAP: [f64; 2] = [0.6, 0.5];
 const MOST_OVERLAP: f64 = 0.95;
@@ -94,13 +94,26 @@ fn fly(city: &City, settings: &Settings, wanted: usize) -> Result<Vec<Shot>, Sen
         let middle = 0.5 * (low + high);
         if enough(middle)? { low = middle } else { high = middle }
     }
-    let shots = survey(city, &block(low))?;
-    let mut shots: Vec<Shot> = kept(shots.len(), 5, wanted).into_iter().map(|i| shots[i].clone()).collect();
+    let block = block(low);
+    let all = survey(city, &block)?;
+    let mut shots: Vec<Shot> = kept(all.len(), 5, wanted).into_iter().map(|i| all[i].clone()).collect();
+    shots.iter_mut().for_each(|shot| aim(shot, block.height_metres));
     let last = shots.iter().map(|s| s.seconds).fold(0.0, f64::max);
     if last > TRAFFIC_SECONDS {
         shots.iter_mut().for_each(|shot| shot.seconds *= TRAFFIC_SECONDS / last);
     }
     Ok(shots)
+}
+
+/// Moves an oblique camera back until it looks at the ground under its stop, as crews fly beyond the edges of what they are
+/// to show: from over the edge, half of the oblique photos would show what lies around the city.
+fn aim(shot: &mut Shot, height: f64) {
+    let forward = shot.camera.forward();
+    let back = forward.with_z(0.0) * (height / -forward.z.min(-0.1));
+    for camera in [&mut shot.camera, &mut shot.reported] {
+        let pose = &mut camera.camera_from_world;
+        pose.translation += pose.rotation * back;
+    }
 }
 
 /// A car on every street, all at once.

@@ -1,0 +1,56 @@
+//! `plat synth` as scripts see it.
+
+mod common;
+
+use common::{done, plat, refused};
+
+/// The least city, with few small photos.
+const TINY: [&str; 7] = ["synth", "--area-km2", "0.05", "--views", "24", "--size", "96x54"];
+
+fn tiny<'a>(more: &[&'a str]) -> Vec<&'a str> {
+    [&TINY[..], more].concat()
+}
+
+#[test]
+fn a_rehearsal_can_be_planned_and_is_what_it_says() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    let made = done(at, &tiny(&["--out", "city", "--fault", "fog=0.3", "--fault", "pose-noise=0.1", "--seed", "4"]));
+    assert_eq!(made["views"], 24);
+    let points = made["points"].as_u64().unwrap();
+    assert!(points > 200, "{made}");
+    let manifest: serde_json::Value =
+        serde_json::from_slice(&std::fs::read(at.join("city/manifest.json")).unwrap()).unwrap();
+    assert_eq!((&manifest["complete"], &manifest["settings"]["city"]["seed"]), (&true.into(), &4.into()));
+    let faults: Vec<_> = manifest["settings"]["faults"].as_array().unwrap().iter().map(|f| &f["kind"]).collect();
+    assert_eq!(faults, ["fog", "pose-noise"]);
+    let inspected = done(at, &["inspect", "city"]);
+    assert!(inspected.to_string().contains("24"), "{inspected}");
+    let planned = plat(at, &["plan", "city", "--out", "plan.json"]);
+    assert!(planned.status.success() && at.join("plan.json").is_file());
+    // another city over it would leave photos of both
+    refused(at, &tiny(&["--out", "city", "--seed", "5", "--quiet"]), "not empty");
+}
+
+#[test]
+fn what_cannot_be_is_refused_before_anything_is_made() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    for (words, wanted) in [
+        (&["--area-km2", "0"][..], "area"),
+        (&["--area-km2", "nan"], "area"),
+        (&["--views", "0"], "views"),
+        (&["--size", "8x8"], "width"),
+        (&["--layout", "hexagonal"], "curved-corridor"),
+        (&["--traffic", "wild"], "medium"),
+        (&["--fault", "fogg"], "lens-dirt"),
+        (&["--fault", "fog=2"], "strength"),
+        (&["--aerial", "0.8", "--fixed", "0.3"], "shares"),
+        (&["--occupancy", "0.001"], "voxel"),
+        (&["--plain", "0.9"], "plain"),
+    ] {
+        refused(at, &[&["synth", "--out", "o"], words].concat(), wanted);
+    }
+    refused(at, &["synth"], "--out");
+    assert!(!at.join("o").exists());
+}
