@@ -1,16 +1,7 @@
 //! Random numbers as pure functions of a key and a counter, so that neither order nor threads can change them.
 
 use glam::Vec2;
-
-/// A well mixed hash of a key and a counter (SplitMix64's finaliser, Steele et al. 2014, twice).
-pub fn bits(key: u64, counter: u64) -> u64 {
-    let mix = |mut z: u64| {
-        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        z ^ (z >> 31)
-    };
-    mix(mix(key.wrapping_add(0x9e37_79b9_7f4a_7c15)).wrapping_add(counter.wrapping_mul(0x9e37_79b9_7f4a_7c15)))
-}
+pub use scene::random::bits;
 
 /// A stream of random numbers: whoever builds something takes one of its own, by what it builds and where.
 #[derive(Debug, Clone, PartialEq)]
@@ -38,7 +29,8 @@ impl Random {
 
     /// Uniform in [0, 1).
     pub fn unit(&mut self) -> f32 {
-        (self.bits() >> 40) as f32 / (1u64 << 24) as f32
+        self.count += 1;
+        scene::random::uniform(self.key, self.count)
     }
 
     /// Uniform between two numbers.

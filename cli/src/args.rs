@@ -1,5 +1,7 @@
 //! The command line, as data. Options without a meaning yet are not accepted.
 
+mod bench;
+
 use std::fmt;
 use std::path::PathBuf;
 use std::str::FromStr;
@@ -11,6 +13,11 @@ use clap::{Args, Parser, Subcommand, ValueEnum};
 use scene::Capture;
 use serde::{Serialize, Serializer};
 use train::importance::Order;
+
+pub(crate) use bench::{
+    AdaptiveArgs, BenchCommand, BenchDemoArgs, BenchPruneArgs, BenchTreeArgs, ChartArgs, IngestArgs, KernelsArgs,
+    ParetoArgs,
+};
 
 /// Trains Gaussian-splat models of whole cities from photos with poses.
 ///
@@ -55,26 +62,6 @@ pub(crate) enum Command {
     /// Measure plat itself
     #[command(subcommand)]
     Bench(BenchCommand),
-}
-
-#[derive(Debug, Subcommand)]
-pub(crate) enum BenchCommand {
-    /// Train with evaluations on the way, measure the result, and append it to the results
-    Pareto(ParetoArgs),
-    /// Redraw the chart and the README's table from all results
-    Chart(ChartArgs),
-    /// Time the renderer's forward and backward passes
-    Kernels(KernelsArgs),
-    /// Ingest a capture into a store of its own, and append what it took to the results
-    Ingest(IngestArgs),
-    /// Compare the orders to prune a model by, and append the figures to the results
-    Prune(BenchPruneArgs),
-    /// Measure a tree level by level and at the faces between its blocks, and append the figures to the results
-    Tree(BenchTreeArgs),
-    /// Build the demo, and append what it took and how good it is to the results
-    Demo(BenchDemoArgs),
-    /// Train a city whose one half is a bare plain, as a tree of one depth and as one that follows the need; keep both
-    Adaptive(AdaptiveArgs),
 }
 
 /// A value, or `auto`: the program chooses.
@@ -401,7 +388,7 @@ fn minutes(text: &str) -> Result<f64, String> {
     value.ok_or_else(|| "give minutes above 0, such as 30 or 0.5".into())
 }
 
-#[derive(Debug, Clone, Args)]
+#[derive(Debug, Clone, Default, Args)]
 pub(crate) struct EvalArgs {
     /// Folder that `plat train` wrote, a .ply or a .spz
     pub(crate) model: PathBuf,
@@ -576,162 +563,4 @@ pub(crate) struct ExportArgs {
     /// File to write
     #[arg(long, value_name = "PATH")]
     pub(crate) out: PathBuf,
-}
-
-#[derive(Debug, Clone, Args)]
-pub(crate) struct ParetoArgs {
-    /// What the chart calls the run
-    #[arg(long)]
-    pub(crate) label: String,
-    /// What the chart calls the capture
-    #[arg(long)]
-    pub(crate) scene: String,
-    /// Folder of the result lines; this one goes to plat.jsonl there
-    #[arg(long, value_name = "DIR", default_value = "bench/results")]
-    pub(crate) results: PathBuf,
-    /// Also measure LPIPS with this network (ONNX), see plat eval --help
-    #[arg(long, value_name = "FILE")]
-    pub(crate) lpips: Option<PathBuf>,
-    #[command(flatten)]
-    pub(crate) train: TrainArgs,
-}
-
-#[derive(Debug, Clone, Args)]
-pub(crate) struct IngestArgs {
-    /// Folder of the capture: COLMAP or transforms.json
-    pub(crate) capture: PathBuf,
-    /// Compensate opacity for the pixel's blur: the model may be drawn at any resolution by viewers that do the same, for
-    /// 0.2 to 0.6 dB at its own
-    #[arg(long)]
-    pub(crate) antialiased: bool,
-    /// Use photos at one N-th of their size
-    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
-    pub(crate) downscale: u32,
-    /// What the line calls the capture; by default the name of its folder
-    #[arg(long)]
-    pub(crate) scene: Option<String>,
-    /// Folder of the result lines; this one goes to ingest.jsonl there
-    #[arg(long, value_name = "DIR", default_value = "bench/results")]
-    pub(crate) results: PathBuf,
-}
-
-#[derive(Debug, Clone, Args)]
-pub(crate) struct BenchPruneArgs {
-    /// Folder that `plat train` wrote, a .ply or a .spz
-    pub(crate) model: PathBuf,
-    /// Folder of the capture
-    pub(crate) capture: PathBuf,
-    /// What the lines call the capture; by default the name of its folder
-    #[arg(long)]
-    pub(crate) scene: Option<String>,
-    /// Orders to compare; all by default
-    #[arg(long, value_name = "ORDER", value_parser = order, value_delimiter = ',')]
-    pub(crate) order: Vec<Order>,
-    /// Loss of PSNR allowed
-    #[arg(long, value_name = "X", value_parser = decibels, default_value_t = 0.1)]
-    pub(crate) tolerance_db: f64,
-    /// Rounds of cut and healing at most; by default as plat prune
-    #[arg(long, value_name = "N")]
-    pub(crate) rounds: Option<u32>,
-    /// Steps of healing in a round, as a share of the model's; by default as plat prune
-    #[arg(long, value_name = "F", value_parser = healing)]
-    pub(crate) healing: Option<f32>,
-    /// How far below the floor the first cut goes, dB; by default as plat prune
-    #[arg(long, value_name = "X", value_parser = decibels)]
-    pub(crate) drop_db: Option<f64>,
-    /// Folder of the result lines; these go to prune.jsonl there
-    #[arg(long, value_name = "DIR", default_value = "bench/results")]
-    pub(crate) results: PathBuf,
-    #[command(flatten)]
-    pub(crate) photos: PruneCapture,
-}
-
-fn healing(text: &str) -> Result<f32, String> {
-    share(text).map(|share| share as f32)
-}
-
-#[derive(Debug, Clone, Args)]
-pub(crate) struct BenchTreeArgs {
-    /// Folder that `plat train` wrote
-    pub(crate) model: PathBuf,
-    /// Folder of the capture
-    pub(crate) capture: PathBuf,
-    /// Also measure this model at the tree's faces: one block trained on the same capture
-    #[arg(long, value_name = "MODEL")]
-    pub(crate) whole: Option<PathBuf>,
-    /// What the line calls the capture; by default the name of its folder
-    #[arg(long)]
-    pub(crate) scene: Option<String>,
-    /// As of plat eval
-    #[arg(long, value_name = "M", value_parser = metres)]
-    pub(crate) seam_metres: Option<f64>,
-    /// Folder of the result lines; this one goes to tree.jsonl there
-    #[arg(long, value_name = "DIR", default_value = "bench/results")]
-    pub(crate) results: PathBuf,
-}
-
-#[derive(Debug, Clone, Args)]
-pub(crate) struct BenchDemoArgs {
-    /// What the chart calls the run
-    #[arg(long, default_value = "plat tree")]
-    pub(crate) label: String,
-    /// Folder of the result lines; this one goes to plat.jsonl there
-    #[arg(long, value_name = "DIR", default_value = "bench/results")]
-    pub(crate) results: PathBuf,
-    #[command(flatten)]
-    pub(crate) demo: DemoArgs,
-}
-
-#[derive(Debug, Clone, Args)]
-pub(crate) struct AdaptiveArgs {
-    /// Folder for the city and the models
-    #[arg(long, value_name = "DIR", default_value = "out/adaptive")]
-    pub(crate) out: PathBuf,
-    /// Seed of all random choices of the training
-    #[arg(long, value_name = "S", default_value_t = 0)]
-    pub(crate) seed: u64,
-    /// As of `plat train`, for both
-    #[arg(long, value_name = "X", value_parser = decibels, default_value_t = 0.1)]
-    pub(crate) tolerance_db: f64,
-    /// Threads
-    #[arg(long, value_name = "N", default_value_t = 1)]
-    pub(crate) threads: u32,
-    /// Folder of the result lines; these go to plat.jsonl there
-    #[arg(long, value_name = "DIR", default_value = "bench/results")]
-    pub(crate) results: PathBuf,
-}
-
-#[derive(Debug, Clone, Args)]
-pub(crate) struct ChartArgs {
-    /// Folder of the result lines; chart.svg goes there too
-    #[arg(long, value_name = "DIR", default_value = "bench/results")]
-    pub(crate) results: PathBuf,
-    /// File whose table between the markers is replaced
-    #[arg(long, value_name = "FILE", default_value = "README.md")]
-    pub(crate) readme: PathBuf,
-}
-
-#[derive(Debug, Clone, Args)]
-pub(crate) struct KernelsArgs {
-    /// Draw this model instead of random splats (needs --cameras)
-    #[arg(long, value_name = "MODEL", requires = "cameras", conflicts_with = "splats")]
-    pub(crate) model: Option<PathBuf>,
-    /// Cameras for --model: a capture or a transforms.json
-    #[arg(long, value_name = "CAPTURE|FILE", requires = "model")]
-    pub(crate) cameras: Option<PathBuf>,
-    /// Number of random splats
-    #[arg(long, value_name = "N", default_value_t = 12_000, value_parser = clap::value_parser!(u32).range(1..=50_000_000))]
-    pub(crate) splats: u32,
-    /// Size of the picture
-    #[arg(long, value_name = "WxH", default_value = "270x480")]
-    pub(crate) size: Size,
-    /// Threads
-    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=1024))]
-    pub(crate) threads: u32,
-    /// Append to kernels.jsonl in this folder of result lines; the line is kept out of chart and table
-    #[arg(long, value_name = "DIR")]
-    pub(crate) results: Option<PathBuf>,
-    /// Passes to take the median of
-    #[arg(long, value_name = "N", default_value_t = 20, value_parser = clap::value_parser!(u32).range(1..=10_000))]
-    pub(crate) passes: u32,
 }

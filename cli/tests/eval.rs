@@ -50,6 +50,14 @@ fn cuts_and_seams_of_a_tree_are_measured() {
     assert_eq!(control["seams"]["of"]["seam_psnr"], seams["seam_psnr"]);
     assert_ne!(control["seams"]["seam_psnr"], seams["seam_psnr"]);
     assert!(control["seams"]["faces_cost_db"].is_f64() && control["seams"]["faces"][0]["control_step"].is_f64());
+    // The same figures as a line of results.
+    let line = done(at, &["bench", "tree", "tree", "city", "--whole", "whole", "--results", "results"]);
+    assert_eq!(line["faces"]["psnr"][0], seams["seam_psnr"]);
+    assert_eq!(line["faces"]["without_psnr"][0], control["seams"]["seam_psnr"]);
+    assert_eq!((&line["levels"][0]["psnr"], &line["splats"]), (&cuts[0]["full"]["psnr"], &said["splats"]));
+    let kept = std::fs::read_to_string(at.join("results/tree.jsonl")).unwrap();
+    assert_eq!(serde_json::from_str::<serde_json::Value>(kept.trim()).unwrap(), line);
+
     let wide = done(at, &["eval", "tree", "city", "--seam-metres", "12"]);
     assert!(wide["seams"]["seam_share"].as_f64().unwrap() > share("seam_share"));
 

@@ -18,6 +18,7 @@ pub mod kitti360;
 pub mod npy;
 pub mod opensfm;
 pub mod ply;
+pub mod random;
 pub mod splats;
 pub mod spz;
 pub mod transforms;

@@ -57,6 +57,13 @@ const REFINEMENTS: u32 = 16;
 const MIN_STEPS: u32 = 10;
 
 impl Growth {
+    /// Neither adds nor removes.
+    #[must_use]
+    pub fn none(self) -> Self {
+        // It begins after the end.
+        Self { from: 2.0, ..self }
+    }
+
     /// Steps between two refinements of a job of so many steps.
     pub fn interval(&self, steps: u32) -> u32 {
         (steps / REFINEMENTS).clamp(MIN_STEPS.min(self.every), self.every).max(1)
@@ -209,6 +216,12 @@ fn halve(splats: &Splats, i: usize, growth: &Growth) -> (scene::Splat, scene::Sp
 mod tests {
     use super::*;
     use scene::Splat;
+
+    #[test]
+    fn short_jobs_refine_more_often() {
+        let growth = Growth::default();
+        assert_eq!([5, 57, 400, 1500, 30_000].map(|steps| growth.interval(steps)), [10, 10, 25, 50, 50]);
+    }
 
     fn row_of(n: usize) -> (Splats, Evidence) {
         let mut splats = Splats::new(0);

@@ -14,7 +14,6 @@ use std::mem;
 use glam::Vec3;
 use scene::Splats;
 
-use crate::growth::Growth;
 use crate::importance::{Order, Shares, Views};
 use crate::{Flow, Job, Recipe, TrainError, TrainView, random, train};
 
@@ -289,7 +288,7 @@ fn healing(recipe: &Recipe) -> Recipe {
         sh_dc: again(recipe.sh_dc),
         sh_from: [0.0; 3],
         coarse: Vec::new(),
-        growth: Growth { every: u32::MAX / 2, ..recipe.growth },
+        growth: recipe.growth.none(),
         ..recipe.clone()
     }
 }

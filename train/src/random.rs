@@ -1,19 +1,6 @@
 //! Counter-based random numbers: a value is a pure function of its key, so no order of execution can change it.
 
-/// A well mixed 64-bit hash of a key and a counter (SplitMix64's finaliser, Steele et al. 2014, twice).
-pub fn bits(key: u64, counter: u64) -> u64 {
-    let mix = |mut z: u64| {
-        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        z ^ (z >> 31)
-    };
-    mix(mix(key.wrapping_add(0x9e37_79b9_7f4a_7c15)).wrapping_add(counter.wrapping_mul(0x9e37_79b9_7f4a_7c15)))
-}
-
-/// Uniform in [0, 1).
-pub fn uniform(key: u64, counter: u64) -> f32 {
-    (bits(key, counter) >> 40) as f32 / (1u64 << 24) as f32
-}
+pub use scene::random::{bits, uniform};
 
 /// A permutation of `0 .. n` (Fisher and Yates).
 pub fn shuffle(key: u64, n: usize) -> Vec<u32> {

@@ -12,7 +12,7 @@ use scene::BlockId;
 use serde::Serialize;
 use train::prune;
 
-use crate::execute::recipe_of;
+use crate::block::recipe_of;
 
 /// CPU seconds of a pixel in a step.
 const PER_PIXEL: f64 = 0.092e-6;
@@ -86,13 +86,14 @@ pub(crate) fn cpu_seconds(plan: &Plan, task: &Task, leaf: bool) -> f64 {
     mean_pixels += left;
     // The halo's splats, and a backdrop.
     let trained_splats = f64::from(task.budget) * if task.parent.is_some() { HALO_AREA } else { 1.0 } + BACKDROP;
-    let splats = PER_SHOWN * f64::from(task.drawn) + PER_SPLAT * trained_splats;
-    let step = PER_PIXEL * pixels * mean_pixels + splats * mean_splats;
+    // The plan's count of what is drawn is of whenever there are most.
+    let [shown, all] = [PER_SHOWN * f64::from(task.drawn), PER_SPLAT * trained_splats];
+    let step = PER_PIXEL * pixels * mean_pixels + shown * mean_splats.min(1.0) + all * mean_splats;
     let read = PER_READ_PIXEL * task.window_pixels() as f64;
     if settings.tolerance_db == 0.0 || !leaf {
         return read + f64::from(task.steps) * step;
     }
     let trained = f64::from(prune::steps_before(task.steps));
     let healing = f64::from(task.steps) - trained + MEASURING * task.views.len() as f64;
-    read + trained * step + healing * (PER_PIXEL * pixels + splats * PRUNED)
+    read + trained * step + healing * (PER_PIXEL * pixels + (shown + all) * PRUNED)
 }

@@ -10,6 +10,7 @@
 //! attempt, and the coordinator may refuse it. The heartbeat and the news travel beside the compute and never hold it up.
 
 mod attempt;
+mod block;
 pub mod cap;
 pub mod clock;
 pub mod estimate;
@@ -17,6 +18,7 @@ pub mod execute;
 mod memory;
 mod merged;
 mod refine;
+mod start;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;

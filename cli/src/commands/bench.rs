@@ -153,16 +153,8 @@ pub(crate) fn tree(args: &BenchTreeArgs, output: &Output) -> Result<(), Failure>
     let ask = |model: &Path| EvalArgs {
         model: model.to_path_buf(),
         capture: args.capture.clone(),
-        test_every: None,
-        downscale: None,
-        out: None,
-        store: None,
-        lpips: None,
-        level: None,
-        budget: None,
-        seams: false,
-        seams_of: None,
         seam_metres: args.seam_metres,
+        ..EvalArgs::default()
     };
     let has_faces = model::read_tree(&args.model)?.plan.leaves().blocks().len() > 1;
     let of_tree = eval::look(&EvalArgs { level: Some(Level::All), seams: has_faces, ..ask(&args.model) }, output)?;
