@@ -80,7 +80,7 @@ fn street(city: &City, settings: &Settings) -> Result<Shot, RehearseError> {
     let of = |shot: &Shot| shot.name.rsplit('-').nth(1).map(str::to_owned);
     let longest = shots.chunk_by(|a, b| of(a) == of(b)).max_by_key(|leg| leg.len());
     let shot = longest.and_then(|leg| leg.get(leg.len() / 3)).cloned();
-    Ok(shot.map_or_else(|| above(city, settings), Ok)?)
+    shot.map_or_else(|| above(city, settings), Ok)
 }
 
 fn picture(frame: &Frame, pixel: impl Fn(usize) -> [u8; 3]) -> RgbImage {
