@@ -4,7 +4,6 @@ use blocks::PlanError;
 use coordinator::LocalError;
 use dataset::ingest::IngestError;
 use dataset::rehearse::RehearseError;
-use dataset::synth::SynthError;
 use scene::BadInput;
 use store::StoreError;
 use store::file::SaveError;
@@ -59,15 +58,6 @@ impl From<StoreError> for Failure {
 impl From<SaveError> for Failure {
     fn from(error: SaveError) -> Self {
         Self::Work(error.to_string())
-    }
-}
-
-impl From<SynthError> for Failure {
-    fn from(error: SynthError) -> Self {
-        match error {
-            SynthError::BadInput(error) => error.into(),
-            SynthError::Save(error) => error.into(),
-        }
     }
 }
 

@@ -10,5 +10,4 @@ pub mod mips;
 pub mod open;
 mod photo;
 pub mod rehearse;
-pub mod synth;
 pub mod windows;

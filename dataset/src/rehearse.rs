@@ -187,6 +187,16 @@ pub fn write(out: &Path, settings: &Settings, progress: Progress) -> Result<Summ
     Ok(summary)
 }
 
+/// As [`write`], in the place of an older rehearsal, whatever its settings. A folder with anything else in it is refused.
+///
+/// # Errors
+/// As those of [`write`].
+pub fn replace(out: &Path, settings: &Settings, progress: Progress) -> Result<Summary, RehearseError> {
+    settings.check()?;
+    manifest::forget(out, settings)?;
+    write(out, settings, progress)
+}
+
 /// Whether anything moves, so that photos have masks: all or none, as readers of `transforms.json` ask.
 fn city_moves(city: &City) -> bool {
     city.actors.iter().any(|actor| actor.trajectory.is_some())

@@ -1,7 +1,6 @@
 //! `plat synth`: a capture of a city that was never built.
 
 use std::path::PathBuf;
-use std::sync::{Mutex, PoisonError};
 
 use ::bench::write_png;
 use city::CitySettings;
@@ -11,7 +10,7 @@ use serde::Serialize;
 
 use crate::args::SynthArgs;
 use crate::failure::Failure;
-use crate::output::{Output, Progress};
+use crate::output::Output;
 
 #[derive(Serialize)]
 struct Shown {
@@ -28,27 +27,17 @@ struct Drawn {
 pub(crate) fn run(args: &SynthArgs, output: &Output) -> Result<(), Failure> {
     let settings = settings(args);
     settings.check()?;
-    let bar: Mutex<Option<(&str, Progress)>> = Mutex::new(None);
-    let progress = |what, done, total| {
-        let mut bar = bar.lock().unwrap_or_else(PoisonError::into_inner);
-        if bar.as_ref().is_none_or(|(shown, _)| *shown != what) {
-            // the old one goes before there is a new one
-            *bar = None;
-            *bar = Some((what, output.progress(what, total as u64)));
-        }
-        if let Some((_, bar)) = bar.as_ref() {
-            bar.at(done as u64, "");
-        }
-    };
+    let stages = output.stages();
+    let progress = |what, done, total| stages.at(what, done, total);
     if let Some(file) = &args.gallery {
         write_png(file, &rehearse::gallery(&settings, &progress)?)?;
-        drop(bar);
+        drop(stages);
         return output.result(&Drawn { gallery: file.clone() }, &file.display().to_string());
     }
     let out = args.out.clone().ok_or_else(|| Failure::Input("--out is missing: say where the capture goes".into()))?;
     output.note(format!("building a city of {} km² and taking {} photos of it", args.area_km2, args.views));
     let summary = rehearse::write(&out, &settings, &progress)?;
-    drop(bar);
+    drop(stages);
     let text = format!(
         "{} photos of {} things, {} of them moving, in {} triangles; {} sparse points, each in {:.1} views\n\n\
          the capture         {} (plat train reads it)\n\
