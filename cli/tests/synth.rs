@@ -47,6 +47,9 @@ fn what_cannot_be_is_refused_before_anything_is_made() {
         (&["--fault", "fog=2"], "strength"),
         (&["--aerial", "0.8", "--fixed", "0.3"], "shares"),
         (&["--occupancy", "0.001"], "voxel"),
+        (&["--occupancy", "0.1", "--occupancy-around", "1,2,3"], "degrees"),
+        (&["--occupancy", "0.1", "--occupancy-around", "1,2,3,900"], "voxels"),
+        (&["--occupancy-around", "1,2,3,4"], "--occupancy"),
         (&["--plain", "0.9"], "plain"),
     ] {
         refused(at, &[&["synth", "--out", "o"], words].concat(), wanted);

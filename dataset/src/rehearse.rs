@@ -44,6 +44,7 @@ use serde::Serialize;
 use store::file::SaveError;
 
 pub use gallery::gallery;
+pub use npz::Around;
 
 /// Everything that a rehearsal follows from.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -72,6 +73,8 @@ pub struct Settings {
     pub mesh: bool,
     /// Side of the voxels that are written, metres, 0.05 to 10; none where there is no number.
     pub occupancy: Option<f64>,
+    /// Places around which voxels are written, rather than all over the city: 1,000 at most.
+    pub around: Vec<Around>,
 }
 
 impl Default for Settings {
@@ -89,6 +92,7 @@ impl Default for Settings {
             radar: false,
             mesh: false,
             occupancy: None,
+            around: Vec::new(),
         }
     }
 }
@@ -110,8 +114,9 @@ impl Settings {
             s if s.occupancy.is_some_and(|voxel| !(0.05..=10.0).contains(&voxel)) => {
                 refuse("the side of a voxel", "choose 0.05 to 10 metres")
             }
+            s if s.around.len() > 1000 => refuse("the number of places to fill with voxels", "choose 1,000 at most"),
             s if s.faults.iter().any(|f| !f.is_sane()) => refuse("the strength of a fault", "choose 0 to 1"),
-            _ => Ok(()),
+            s => s.occupancy.map_or(Ok(()), |voxel| s.around.iter().try_for_each(|at| at.grid(voxel).map(|_| ()))),
         }
     }
 }
@@ -172,7 +177,10 @@ pub fn write(out: &Path, settings: &Settings, progress: Progress) -> Result<Summ
         gltf::write(out, &city)?;
     }
     if let Some(voxel) = settings.occupancy {
-        npz::blocks(out, &city, voxel, progress)?;
+        match settings.around.as_slice() {
+            [] => npz::blocks(out, &city, voxel, progress)?,
+            places => npz::around(out, &city, voxel, places)?,
+        }
     }
     let meshes = city.actors.iter().map(|actor| &city.assets[actor.asset as usize].mesh);
     let summary = Summary {

@@ -39,6 +39,13 @@ fn rays_meet_boxes_where_arithmetic_says() {
     let (roof, _) = cast(vec3(19.0, 0.0, 14.0), vec3(19.0, 12.0, 9.0)).unwrap();
     assert!((roof.distance - 13.0).abs() < 1e-4 && roof.normal == Vec3::Z);
     assert!(cast(vec3(0.0, 0.0, 5.0), vec3(0.0, 0.0, 9.0)).is_none());
+    // along an axis, whatever the sign of zero
+    for direction in [-Vec3::Z, vec3(0.0, 0.0, -1.0), vec3(-0.0, 0.0, -1.0)] {
+        let ray = Ray::new(vec3(20.5, 12.25, 14.0), direction);
+        let hit = moment.cast(&ray, Meets::Everything);
+        assert!(hit.is_some_and(|hit| (hit.distance - 5.0).abs() < 1e-4), "{direction}");
+        assert!(moment.is_blocked(&ray));
+    }
     // the van at its start, and three seconds later
     let at = |seconds: f64| {
         let ray = Ray::new(vec3(-50.0, -2.0, 1.0), Vec3::X);

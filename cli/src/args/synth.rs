@@ -5,6 +5,8 @@ use std::path::PathBuf;
 use city::faults::Fault;
 use city::{Layout, Traffic};
 use clap::Args;
+use dataset::rehearse::Around;
+use glam::DVec3;
 
 use super::{Size, metres};
 
@@ -63,6 +65,26 @@ pub(crate) struct SynthArgs {
     /// Write which voxels of this side the city takes up, as it stands at second 0, in blocks of 64 m
     #[arg(long, value_name = "METRES", value_parser = metres)]
     pub(crate) occupancy: Option<f64>,
+    /// Write these voxels around a pose instead: in a cube that reaches RADIUS metres from its middle, its x axis turned
+    /// HEADING degrees from east to north, as the city stands at SECONDS. May be given more than once
+    #[arg(
+        long,
+        value_name = "X,Y,Z,RADIUS[,HEADING[,SECONDS]]",
+        value_parser = around,
+        requires = "occupancy",
+        allow_hyphen_values = true
+    )]
+    pub(crate) occupancy_around: Vec<Around>,
+}
+
+fn around(text: &str) -> Result<Around, String> {
+    let numbers: Option<Vec<f64>> =
+        text.split(',').map(|n| n.trim().parse().ok().filter(|n: &f64| n.is_finite())).collect();
+    let numbers = numbers.filter(|n| (4..=6).contains(&n.len()) && n[3] > 0.0);
+    let numbers = numbers.ok_or("give it as 10,-20,1.5,25: metres, the last above 0; then degrees and seconds")?;
+    let rest = |i: usize| numbers.get(i).copied().unwrap_or(0.0);
+    let place = DVec3::new(numbers[0], numbers[1], numbers[2]);
+    Ok(Around { place, radius: numbers[3], heading_degrees: rest(4), seconds: rest(5) })
 }
 
 /// What `plat synth --help` adds to its options.
@@ -96,6 +118,8 @@ with --lidar, of every place NAME (street-LEG-NUMBER) where a car's photo was ke
   lidar/poses.jsonl      when and where each turn was
 with --radar: radar/NAME.csv (readings, then their truth), radar/poses.jsonl
 with --mesh:  city.glb   glTF 2: a node for each actor (class, instance), a mesh for each asset, materials without patterns
-with --occupancy: occupancy/X_Y.npz for each block: semantic (uint8, 255 free) and instance (uint32) by z, y, x; origin, voxel
+with --occupancy: occupancy/X_Y.npz for each block: semantic (uint8, 255 free) and instance (uint32) by z, y, x;
+              origin (the lowest corner) and voxel (its side) in metres, world_from_grid (4 x 4; the identity)
+with --occupancy-around: occupancy/around_N.npz, the same for each pose, the origin in its axes
 
 The same settings give the same bytes, whatever the number of threads.";

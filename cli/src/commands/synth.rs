@@ -74,5 +74,6 @@ fn settings(args: &SynthArgs) -> Settings {
         radar: args.radar,
         mesh: args.mesh,
         occupancy: args.occupancy,
+        around: args.occupancy_around.clone(),
     }
 }

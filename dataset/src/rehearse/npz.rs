@@ -6,14 +6,45 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 
 use city::City;
 use city::occupancy::{Grid, GridError, Voxels, voxels};
-use glam::DVec3;
+use glam::{DMat4, DQuat, DVec3};
 use rayon::prelude::*;
-use scene::npy;
+use scene::{BadInput, Rigid, npy};
+use serde::Serialize;
 use store::file::{SaveError, save};
 use zip::write::SimpleFileOptions;
 use zip::{CompressionMethod, DateTime, ZipWriter};
 
 use super::{Progress, RehearseError, impossible, make};
+
+/// A place of which voxels are asked for.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Around {
+    /// World metres.
+    pub place: DVec3,
+    /// Half of the side of the cube that is filled, metres.
+    pub radius: f64,
+    /// Which way the cube's x axis points, degrees from east towards north.
+    pub heading_degrees: f64,
+    /// The city's clock: where things that move are.
+    pub seconds: f64,
+}
+
+impl Around {
+    /// The cube in its own axes.
+    ///
+    /// # Errors
+    /// A place out of this world, or more voxels than a grid may have.
+    pub(super) fn grid(&self, voxel: f64) -> Result<Grid, BadInput> {
+        let refuse = |problem: String| BadInput::new("rehearsal", problem, "choose another place, radius or voxel");
+        if !(self.radius > 0.0 && self.heading_degrees.is_finite() && self.seconds.abs() <= 1e9) {
+            return Err(refuse("a place to fill with voxels is out of range".into()));
+        }
+        let rotation = DQuat::from_rotation_z(self.heading_degrees.to_radians());
+        let half = DVec3::splat(self.radius);
+        Grid::new(Rigid { rotation, translation: self.place }, -half, half, voxel)
+            .map_err(|e| refuse(format!("voxels around a place: {e}")))
+    }
+}
 
 /// Side of a block, metres.
 const BLOCK: f64 = 64.0;
@@ -21,7 +52,8 @@ const BLOCK: f64 = 64.0;
 const VOXELS_AT_ONCE: f64 = 2e8;
 
 /// Writes the whole city in blocks, `occupancy/X_Y.npz` where X and Y count blocks from the south-west: semantic (u8),
-/// instance (u32), each by z, y, x; origin (f64, the lowest corner), voxel (f64, its side), both metres.
+/// instance (u32), each by z, y, x; origin (f64, the lowest corner), voxel (f64, its side), both metres; world_from_grid
+/// (f64, 4 × 4): here the identity.
 pub(super) fn blocks(out: &Path, city: &City, voxel: f64, progress: Progress) -> Result<(), RehearseError> {
     let folder = out.join("occupancy");
     make(&folder)?;
@@ -34,8 +66,7 @@ pub(super) fn blocks(out: &Path, city: &City, voxel: f64, progress: Progress) ->
         let grid = Grid::of_block(from, DVec3::new(corner(x + 1), corner(y + 1), high), voxel);
         let filled = grid.and_then(|grid| voxels(city, 0.0, &grid)).map_err(|e: GridError| impossible(&e))?;
         let path = folder.join(format!("{x:03}_{y:03}.npz"));
-        let bytes = pack(&filled).map_err(|e| SaveError::new(&path, &e))?;
-        save(&path, &bytes)?;
+        put(&path, &filled)?;
         progress("voxels", done.fetch_add(1, Ordering::Relaxed) + 1, side * side);
         Ok(())
     };
@@ -47,6 +78,23 @@ pub(super) fn blocks(out: &Path, city: &City, voxel: f64, progress: Progress) ->
         written.into_iter().collect::<Result<(), _>>()?;
     }
     Ok(())
+}
+
+/// Writes the voxels around each place, `occupancy/around_N.npz` in the order of the places: as blocks, and
+/// world_from_grid (f64, 4 × 4), in whose axes the origin is.
+pub(super) fn around(out: &Path, city: &City, voxel: f64, places: &[Around]) -> Result<(), RehearseError> {
+    let folder = out.join("occupancy");
+    make(&folder)?;
+    for (i, place) in places.iter().enumerate() {
+        let filled = voxels(city, place.seconds, &place.grid(voxel)?).map_err(|e| impossible(&e))?;
+        put(&folder.join(format!("around_{i:03}.npz")), &filled)?;
+    }
+    Ok(())
+}
+
+fn put(path: &Path, filled: &Voxels) -> Result<(), SaveError> {
+    let bytes = pack(filled).map_err(|e| SaveError::new(path, &e))?;
+    save(path, &bytes)
 }
 
 /// Below and above everything that stands: whole metres, so that blocks fit each other.
@@ -68,6 +116,8 @@ fn heights(city: &City) -> (f64, f64) {
 fn pack(filled: &Voxels) -> zip::result::ZipResult<Vec<u8>> {
     let grid = &filled.grid;
     let shape = [grid.size.z, grid.size.y, grid.size.x].map(|n| n as usize);
+    let pose = DMat4::from_rotation_translation(grid.world_from_grid.rotation, grid.world_from_grid.translation);
+    let rows = pose.transpose().to_cols_array();
     let mut archive = ZipWriter::new(Cursor::new(Vec::new()));
     let options = SimpleFileOptions::default()
         .compression_method(CompressionMethod::Deflated)
@@ -77,6 +127,7 @@ fn pack(filled: &Voxels) -> zip::result::ZipResult<Vec<u8>> {
         ("instance.npy", npy::write(&shape, &filled.instance)),
         ("origin.npy", npy::write(&[3], &grid.low.to_array())),
         ("voxel.npy", npy::write(&[], &[grid.voxel_metres])),
+        ("world_from_grid.npy", npy::write(&[4, 4], &rows)),
     ] {
         archive.start_file(name, options)?;
         archive.write_all(&bytes)?;

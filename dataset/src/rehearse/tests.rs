@@ -3,7 +3,7 @@ use std::path::PathBuf;
 
 use city::faults::Kind;
 use city::{Layout, Traffic};
-use glam::DVec3;
+use glam::{DVec2, DVec3};
 
 use super::*;
 use crate::open::{OpenOptions, open};
@@ -71,6 +71,21 @@ fn a_rehearsal_opens_as_a_capture_and_its_points_are_where_views_see_them() {
     capture.views.iter().for_each(|view| quarters[quarter(place(view))] += 1);
     assert!(capture.views.iter().all(|view| place(view).truncate().abs().max_element() < 1.1 * half));
     assert!(quarters.iter().all(|&n| n >= 3), "{quarters:?}");
+    // photos from the air show the city, not what lies around it
+    let share = |view: &scene::View| {
+        let (pose, k) = (view.camera.camera_from_world.inverse(), view.camera.pinhole);
+        let places = (0..64).map(|i| (DVec2::new(f64::from(i % 8), f64::from(i / 8)) + 0.5) / 8.0);
+        let inside = |at: DVec2| {
+            let pixel = at * DVec2::new(f64::from(k.width), f64::from(k.height));
+            let ray = pose.rotation * ((pixel - DVec2::new(k.cx, k.cy)) / DVec2::new(k.fx, k.fy)).extend(1.0);
+            let ground = pose.translation + ray * (pose.translation.z / -ray.z.min(-1e-3));
+            ground.truncate().abs().max_element() <= half
+        };
+        places.filter(|&at| inside(at)).count() as f64 / 64.0
+    };
+    let shares: Vec<f64> = capture.views.iter().filter(|v| v.name.starts_with("aerial-")).map(share).collect();
+    assert!(shares.iter().all(|&share| share > 0.5), "{shares:?}");
+    assert!(shares.iter().sum::<f64>() > 0.7 * shares.len() as f64, "{shares:?}");
 
     // what was found in a picture, against where the noisy point falls in it
     let bytes = fs::read(folder.path().join("truth/shots.jsonl")).unwrap();
@@ -180,6 +195,65 @@ fn everything() -> Settings {
         occupancy: Some(2.0),
         ..small()
     }
+}
+
+/// What is taken around places, from their files: the middles of voxels in the world, with classes.
+fn taken_around(places: &[Around], voxel: f64) -> Vec<Vec<(DVec3, u8)>> {
+    let settings =
+        Settings { views: 1, width: 16, height: 16, occupancy: Some(voxel), around: places.to_vec(), ..small() };
+    let (folder, _) = written(&settings, 2);
+    let read = |(name, bytes): (&PathBuf, &Vec<u8>)| {
+        let mut archive = zip::ZipArchive::new(std::io::Cursor::new(bytes)).unwrap();
+        let mut array = |name: &str| {
+            let mut bytes = Vec::new();
+            std::io::Read::read_to_end(&mut archive.by_name(name).unwrap(), &mut bytes).unwrap();
+            bytes
+        };
+        assert!(name.to_string_lossy().contains("around_"), "{name:?}");
+        let mut numbers =
+            |name: &str| scene::npy::read_f32(&array(name)).unwrap().1.into_iter().map(f64::from).collect::<Vec<_>>();
+        let (pose, origin) = (numbers("world_from_grid.npy"), numbers("origin.npy"));
+        let semantic = array("semantic.npy");
+        let pose = glam::DMat4::from_cols_slice(&pose).transpose();
+        let side = (((semantic.len() - 128) as f64).cbrt().round()) as usize;
+        assert_eq!(side.pow(3) + 128, semantic.len());
+        let middle = |i: usize| {
+            let at = [i % side, i / side % side, i / side / side].map(|n| (n as f64 + 0.5) * voxel);
+            pose.transform_point3(DVec3::from_slice(&origin) + DVec3::from(at))
+        };
+        let taken = semantic[128..].iter().enumerate().filter(|&(_, &class)| class != city::occupancy::FREE);
+        taken.map(|(i, &class)| (middle(i), class)).collect::<Vec<_>>()
+    };
+    files(folder.path()).iter().filter(|(name, _)| name.starts_with("occupancy")).map(read).collect()
+}
+
+#[test]
+fn voxels_around_a_pose_are_the_citys_turned_and_at_its_moment() {
+    let city = City::generate(&small().city).unwrap();
+    let mover = city.actors.iter().find(|actor| actor.trajectory.is_some() && actor.class == city::Class::Car).unwrap();
+    let path = &mover.trajectory.as_ref().unwrap().waypoints;
+    let (first, seconds) = (path[0].world_from_asset.translation, path[path.len() / 2].seconds);
+    let then = city::trace::motion::pose_at(mover, seconds).translation;
+    let at = |place: DVec3, heading_degrees, seconds| Around { place, radius: 3.0, heading_degrees, seconds };
+    let places = [at(then, 0.0, seconds), at(then, 30.0, seconds), at(first, 0.0, path[0].seconds)];
+    let taken = taken_around(&places, 0.25);
+    assert_eq!(taken.len(), 3);
+    let world = World::new(&city).unwrap();
+    for (place, taken) in places.iter().zip(&taken) {
+        let car = taken.iter().filter(|(_, class)| *class == city::Class::Car as u8).count();
+        assert!(car > 200, "{car} voxels of a car at {place:?}");
+        // straight down onto the middle of the cube: the first voxel that is met holds what the ray meets
+        let moment = world.at(place.seconds);
+        let from = place.place + DVec3::Z * 2.99;
+        let ray = city::trace::Ray::new(from.as_vec3(), -glam::Vec3::Z);
+        let hit = moment.cast(&ray, city::trace::Meets::Everything).unwrap();
+        let met = from - DVec3::Z * f64::from(hit.distance);
+        assert!(taken.iter().any(|(p, _)| p.distance(met) < 0.22), "{met}");
+        assert!(taken.iter().all(|(p, _)| (*p - place.place).abs().max_element() < 3.0 * 1.5));
+    }
+    // the turned cube's corners reach out of the straight one
+    let beyond = |taken: &[(DVec3, u8)]| taken.iter().any(|(p, _)| (*p - then).abs().max_element() > 3.1);
+    assert!(!beyond(&taken[0]) && beyond(&taken[1]));
 }
 
 #[test]

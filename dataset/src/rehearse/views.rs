@@ -13,9 +13,15 @@ use super::{Settings, impossible};
 const TRAFFIC_SECONDS: f64 = 600.0;
 /// The aerial block is flown as high as lets its shots be enough, within these metres.
 const HEIGHTS: [f64; 2] = [80.0, 150.0];
+/// Nor higher than this share of the city's side: a photo would show more than the city.
+const MOST_HEIGHT: f64 = 0.4;
 /// Least overlap of aerial photos, along a line and between lines, and the most.
 const OVERLAP: [f64; 2] = [0.6, 0.5];
 const MOST_OVERLAP: f64 = 0.95;
+/// How far inside of the city's edge the outermost stops are, of the height of flight and at most of the city's side: as
+/// near as lets the city, and not what lies around it, fill most of every photo.
+const MARGIN: f64 = 0.5;
+const MOST_MARGIN: f64 = 0.25;
 /// Cameras on a post take so many photos.
 const PICTURES_OF_A_POST: u32 = 10;
 
@@ -63,13 +69,16 @@ fn fly(city: &City, settings: &Settings, wanted: usize) -> Result<Vec<Shot>, Sen
     if wanted == 0 {
         return Ok(Vec::new());
     }
-    let half = 0.48 * city.extent_metres;
     let block = |looseness: f64| {
         // from 1 to 0 the block comes down, from 0 to -1 its photos overlap more
         let (up, dense) = (looseness.max(0.0), (-looseness).max(0.0));
         let overlap = |least: f64| least + dense * (MOST_OVERLAP - least);
+        let extent = city.extent_metres;
+        let top = HEIGHTS[1].min(MOST_HEIGHT * extent).max(HEIGHTS[0]);
+        let height = HEIGHTS[0] + up * (top - HEIGHTS[0]);
+        let half = 0.5 * extent - (MARGIN * height).min(MOST_MARGIN * extent);
         Survey {
-            height_metres: HEIGHTS[0] + up * (HEIGHTS[1] - HEIGHTS[0]),
+            height_metres: height,
             forward_overlap: overlap(OVERLAP[0]),
             side_overlap: overlap(OVERLAP[1]),
             tilt_degrees: 45.0,
