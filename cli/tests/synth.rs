@@ -57,3 +57,33 @@ fn what_cannot_be_is_refused_before_anything_is_made() {
     refused(at, &["synth"], "--out");
     assert!(!at.join("o").exists());
 }
+
+#[test]
+fn a_rehearsal_trains_and_what_is_trained_shows_it() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    let voxels = ["--occupancy", "0.5", "--occupancy-around", "0,0,1,4,30"];
+    let made = done(at, &[&tiny(&["--out", "city", "--views", "40", "--aerial", "1"])[..], &voxels].concat());
+    assert!(at.join("city/occupancy/around_000.npz").is_file() && !at.join("city/occupancy/000_000.npz").exists());
+    assert!(made["moving"].as_u64().unwrap() > 0);
+    let train = |out: &str, steps: &str| {
+        let words = ["train", "city", "--out", out, "--steps", steps, "--budget", "4000", "--levels", "1"];
+        done(at, &[&words[..], &["--threads", "2", "--store", "store"]].concat());
+        done(at, &["eval", out, "city"])["psnr"].as_f64().unwrap()
+    };
+    let (begun, trained) = (train("begun", "1"), train("trained", "400"));
+    assert!(at.join("trained/merged.ply").is_file() && at.join("trained/model/model.json").is_file());
+    assert!(trained > begun + 0.5 && trained > 18.0, "{begun} dB, then {trained} dB");
+}
+
+#[test]
+fn the_gallery_is_a_picture_and_nothing_else() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    done(at, &["synth", "--area-km2", "0.05", "--size", "48x28", "--gallery", "all.png"]);
+    let picture = image::open(at.join("all.png")).unwrap();
+    // six panes a row of 31, each with a frame and a line of text
+    assert_eq!((picture.width(), picture.height()), (6 * 50, 6 * 40));
+    assert_eq!(std::fs::read_dir(at).unwrap().count(), 1);
+    refused(at, &["synth", "--gallery", "all.png", "--out", "o"], "--out");
+}

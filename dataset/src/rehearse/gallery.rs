@@ -1,4 +1,7 @@
-//! One picture of what rehearsals can show: every layout, every kind of label, every fault.
+//! One picture of what rehearsals can show: every layout, every kind of label, every fault. Streets are shown where the most
+//! goes on.
+
+use std::collections::{BTreeMap, BTreeSet};
 
 use city::faults::{self, Fault, Kind};
 use city::random::bits;
@@ -9,12 +12,15 @@ use city::{City, CitySettings, Layout};
 use font8x8::legacy::BASIC_LEGACY;
 use glam::{DVec3, Vec3};
 use image::{Rgb, RgbImage};
+use rayon::prelude::*;
 
 use super::views::views;
 use super::{Progress, RehearseError, Settings, impossible};
 
 /// Tiles in a row.
 const COLUMNS: u32 = 6;
+/// Places along streets that are tried for a lively one.
+const PLACES: usize = 64;
 /// Height of the line above each tile, pixels.
 const CAPTION: u32 = 12;
 
@@ -32,28 +38,30 @@ pub fn gallery(settings: &Settings, progress: Progress) -> Result<RgbImage, Rehe
     for &layout in Layout::ALL {
         let city = City::generate(&CitySettings { layout, ..settings.city })?;
         let world = World::new(&city).map_err(|e| impossible(&e))?;
-        for (from, shot) in [("above", above(&city, settings)?), ("the street", street(&city, settings)?)] {
+        for (from, shot) in [("above", above(&city, settings)?), ("the street", street(&world, settings)?.0)] {
             add(&mut tiles, format!("{layout} from {from}"), photo(&take(&world, &shot, &[])?));
         }
     }
     let city = City::generate(&settings.city)?;
     let world = World::new(&city).map_err(|e| impossible(&e))?;
-    let shot = street(&city, settings)?;
+    let (shot, drive) = street(&world, settings)?;
     let taken = take(&world, &shot, &[])?;
     for (name, tile) in labels(&taken) {
         add(&mut tiles, name.to_owned(), tile);
     }
     for &kind in Kind::ALL {
         let faults = [Fault { kind, strength: 1.0, seed: settings.city.seed }];
-        let tile = match kind {
-            Kind::PoseNoise | Kind::SparseViews | Kind::SensorDropout => map(&world, settings, &faults)?,
-            Kind::MovingUnmasked => over(&take(&world, &shot, &faults)?, |frame, i| frame.mask[i] != 0),
-            _ => {
-                let spoilt = faults::spoil_shots(vec![shot.clone()], &faults);
-                photo(&take(&world, spoilt.first().unwrap_or(&shot), &faults)?)
-            }
+        let (caption, tile) = match kind {
+            Kind::ExposureDrift => ("most, least", drift(&world, &shot, &drive, &faults)?),
+            Kind::PoseNoise => ("reported over true", ghost(&world, &shot, &faults)?),
+            Kind::SparseViews | Kind::SensorDropout => ("red is lost", map(&world, settings, &faults)?),
+            Kind::MovingUnmasked => ("red is forgotten", {
+                over(&take(&world, &shot, &faults)?, |frame, i| frame.moves[i] != 0 && frame.mask[i] == 0)
+            }),
+            _ => ("", photo(&take(&world, &spoilt(&shot, &faults), &faults)?)),
         };
-        add(&mut tiles, kind.to_string(), tile);
+        let colon = if caption.is_empty() { "" } else { ": " };
+        add(&mut tiles, format!("{kind}{colon}{caption}"), tile);
     }
     Ok(sheet(settings, &tiles))
 }
@@ -70,17 +78,78 @@ fn above(city: &City, settings: &Settings) -> Result<Shot, RehearseError> {
     Ok(Shot::new("above".into(), "above", 5.0, looking(lens, from, -from.with_z(from.z * 1.08), DVec3::Z)))
 }
 
-/// Ahead from a car that is a third of its way along the longest street.
-fn street(city: &City, settings: &Settings) -> Result<Shot, RehearseError> {
+/// Ahead from a car, where of some places along all streets the most goes on; and all that the car sees on its way.
+fn street(world: &World, settings: &Settings) -> Result<(Shot, Vec<Shot>), RehearseError> {
+    let city = world.city();
     let mut rig = Rig { width: settings.width, height: settings.height, fleet: true, ..Rig::default() };
     rig.cameras.truncate(1);
     rig.field_degrees = 80.0;
     let shots = drive(city, &rig).map_err(|e| impossible(&e))?;
+    // streets run to the horizon, the city does not
+    let within = |shot: &&Shot| shot.camera.centre().truncate().abs().max_element() < 0.4 * city.extent_metres;
+    let inside: Vec<&Shot> = shots.iter().filter(within).collect();
+    let tried: Vec<&Shot> = inside.iter().copied().step_by(inside.len().div_ceil(PLACES).max(1)).collect();
+    let lens = pinhole(96, 54, 80.0).map_err(|e| impossible(&e))?;
+    let sketch = Options { samples: 1, corners: false, ..Options::default() };
+    let life = |shot: &&Shot| -> Result<f64, RehearseError> {
+        let mut small = (*shot).clone();
+        small.camera.pinhole = lens;
+        Ok(liveliness(&frame(world, &small, &sketch).map_err(|e| impossible(&e))?))
+    };
+    let lives: Vec<f64> = tried.par_iter().map(life).collect::<Result<_, _>>()?;
+    let best = tried.iter().zip(&lives).rev().max_by(|a, b| a.1.total_cmp(b.1));
+    let Some((&best, _)) = best else { return Ok((above(city, settings)?, Vec::new())) };
     // shots of a street are named by it: front-left-STREET-NUMBER
-    let of = |shot: &Shot| shot.name.rsplit('-').nth(1).map(str::to_owned);
-    let longest = shots.chunk_by(|a, b| of(a) == of(b)).max_by_key(|leg| leg.len());
-    let shot = longest.and_then(|leg| leg.get(leg.len() / 3)).cloned();
-    shot.map_or_else(|| above(city, settings), Ok)
+    let street = |shot: &Shot| shot.name.rsplit('-').nth(1).map(str::to_owned);
+    let leg = shots.iter().filter(|shot| street(shot) == street(best)).cloned().collect();
+    Ok((best.clone(), leg))
+}
+
+/// How much goes on in a picture: things count that move, and those that could a little; large ones not much more than
+/// small ones, and the first of a class more than the next.
+fn liveliness(frame: &Frame) -> f64 {
+    let mut things: BTreeMap<(u8, u32), (f64, f64)> = BTreeMap::new();
+    for (i, &instance) in frame.first.instance.iter().enumerate().filter(|(_, instance)| **instance != 0) {
+        let thing = things.entry((frame.first.semantic[i], instance)).or_default();
+        thing.0 += 1.0;
+        thing.1 = if frame.moves[i] != 0 { 1.0 } else { 0.1 };
+    }
+    let mut classes: BTreeMap<u8, Vec<f64>> = BTreeMap::new();
+    for ((class, _), (pixels, weight)) in things {
+        classes.entry(class).or_default().push(weight * pixels.sqrt().min(9.0));
+    }
+    let of_class = |mut all: Vec<f64>| {
+        all.sort_by(|a, b| b.total_cmp(a));
+        all.iter().zip(1..).map(|(life, nth)| life / f64::from(nth)).sum::<f64>()
+    };
+    classes.into_values().map(of_class).sum()
+}
+
+fn spoilt(shot: &Shot, faults: &[Fault]) -> Shot {
+    faults::spoil_shots(vec![shot.clone()], faults).pop().unwrap_or_else(|| shot.clone())
+}
+
+/// The shot with the highest gain of its drive at the left, with the lowest at the right.
+fn drift(world: &World, shot: &Shot, drive: &[Shot], faults: &[Fault]) -> Result<RgbImage, RehearseError> {
+    let gains: Vec<f32> = faults::spoil_shots(drive.to_vec(), faults).iter().map(|shot| shot.exposure).collect();
+    let with = |exposure: Option<f32>| {
+        take(world, &Shot { exposure: exposure.unwrap_or(shot.exposure), ..shot.clone() }, &[])
+            .map(|frame| photo(&frame))
+    };
+    let mut tile = with(gains.iter().copied().max_by(f32::total_cmp))?;
+    let dark = with(gains.iter().copied().min_by(f32::total_cmp))?;
+    let half = i64::from(tile.width() / 2);
+    let right = image::imageops::crop_imm(&dark, half as u32, 0, tile.width() - half as u32, tile.height()).to_image();
+    image::imageops::replace(&mut tile, &right, half, 0);
+    Ok(tile)
+}
+
+/// What the reported camera would see, over what the true one saw.
+fn ghost(world: &World, shot: &Shot, faults: &[Fault]) -> Result<RgbImage, RehearseError> {
+    let spoilt = spoilt(shot, faults);
+    let seen = take(world, &spoilt, &[])?;
+    let told = take(world, &Shot { camera: spoilt.reported, ..spoilt }, &[])?;
+    Ok(picture(&seen, |i| [0, 1, 2].map(|c| seen.rgb[3 * i + c].midpoint(told.rgb[3 * i + c]))))
 }
 
 fn picture(frame: &Frame, pixel: impl Fn(usize) -> [u8; 3]) -> RgbImage {
@@ -124,21 +193,21 @@ fn labels(frame: &Frame) -> [(&'static str, RgbImage); 8] {
     ]
 }
 
-/// The city from straight above with the places of cameras: white as it was planned, red as it is reported.
+/// The city from straight above with the places of cameras: white those that are kept, red those that are lost.
 fn map(world: &World, settings: &Settings, faults: &[Fault]) -> Result<RgbImage, RehearseError> {
     let lens = pinhole(settings.width, settings.height, 60.0).map_err(|e| impossible(&e))?;
     let height = 0.6 * world.city().extent_metres * lens.fx / f64::from(lens.height.min(lens.width));
     let nadir = looking(lens, DVec3::Z * height * 1.2, DVec3::NEG_Z, DVec3::Y);
     let mut map = photo(&take(world, &Shot::new("map".into(), "map", 5.0, nadir), &[])?);
     let planned = views(world, settings)?.shots;
-    let reported = faults::spoil_shots(planned.clone(), faults);
-    let white = planned.iter().map(|shot| (shot.camera.centre(), [255; 3]));
-    let red = reported.iter().map(|shot| (shot.reported.centre(), [255, 0, 0]));
-    for (place, colour) in white.chain(red) {
-        let (pixel, _) = nadir.project(place.with_z(0.0));
-        for (dx, dy) in [(0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (1.0, 1.0)] {
-            if let Some(dot) = map.get_pixel_mut_checked((pixel.x + dx).max(0.0) as u32, (pixel.y + dy).max(0.0) as u32)
-            {
+    let kept: BTreeSet<String> =
+        faults::spoil_shots(planned.clone(), faults).into_iter().map(|shot| shot.name).collect();
+    for shot in &planned {
+        let colour = if kept.contains(&shot.name) { [255; 3] } else { [255, 0, 0] };
+        let (pixel, _) = nadir.project(shot.camera.centre().with_z(0.0));
+        for (dx, dy) in (0..9).map(|i| (f64::from(i % 3) - 1.0, f64::from(i / 3) - 1.0)) {
+            let (x, y) = ((pixel.x + dx).max(0.0) as u32, (pixel.y + dy).max(0.0) as u32);
+            if let Some(dot) = map.get_pixel_mut_checked(x, y) {
                 *dot = Rgb(colour);
             }
         }

@@ -376,3 +376,33 @@ fn sweeps_and_voxels_are_what_their_formats_say() {
     }
     assert!(taken > 100_000 / 8, "{taken}");
 }
+
+#[test]
+fn the_gallery_shows_every_layout_label_and_fault() {
+    let settings = Settings { width: 96, height: 54, ..small() };
+    let told = std::sync::Mutex::new((0, 0));
+    let sheet = gallery(&settings, &|_, done, total| *told.lock().unwrap() = (done, total)).unwrap();
+    let tiles = 2 * Layout::ALL.len() + 8 + Kind::ALL.len();
+    assert_eq!(*told.lock().unwrap(), (tiles, tiles));
+    assert_eq!(sheet.dimensions(), (6 * 98, tiles.div_ceil(6) as u32 * 66));
+    let tile = |i: usize| {
+        let (left, top) = (i as u32 % 6 * 98, i as u32 / 6 * 66 + 12);
+        image::imageops::crop_imm(&sheet, left, top, 96, 54).to_image()
+    };
+    let differs = |a: &image::RgbImage, b: &image::RgbImage| {
+        let pixels = a.pixels().zip(b.pixels());
+        pixels.filter(|(a, b)| (0..3).any(|c| a[c].abs_diff(b[c]) > 3)).count() as f64 / 5184.0
+    };
+    let all: Vec<_> = (0..tiles).map(tile).collect();
+    let clean = &all[2 * Layout::ALL.len()];
+    for (i, kind) in (2 * Layout::ALL.len() + 8..).zip(Kind::ALL) {
+        let share = differs(clean, &all[i]);
+        assert!(share > 0.005, "{kind} shows in {share} of its pane");
+    }
+    // every pane is drawn, and no layout twice
+    for (i, a) in all.iter().enumerate() {
+        assert!(a.pixels().any(|p| p != a.get_pixel(0, 0)), "pane {i} is of one colour");
+        let before = &all[..if i < 2 * Layout::ALL.len() { i } else { 0 }];
+        assert!(before.iter().all(|b| differs(a, b) > 0.05), "pane {i} is there twice");
+    }
+}
