@@ -164,7 +164,7 @@ pub(crate) struct PlanOptions {
     pub(crate) tolerance_db: f64,
     /// Refine a block only where its parent's splats are off, in the block's own photos, by more than R times what the root is
     /// off by in all (root mean squares), and look at fine pixels and add splats only while that pays; 0 adapts nothing
-    #[arg(long, value_name = "R", value_parser = residual, default_value_t = 0.25)]
+    #[arg(long, value_name = "R", value_parser = residual, default_value_t = 0.4)]
     pub(crate) residual: f64,
     /// Seed of all random choices
     #[arg(long, value_name = "S", default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=i64::MAX as u64))]

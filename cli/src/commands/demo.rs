@@ -125,7 +125,7 @@ pub(crate) fn settings(args: &DemoArgs) -> (Settings, TrainArgs) {
             steps: Auto(Some(steps)),
             budget: Auto(Some(budget)),
             tolerance_db: 0.1,
-            residual: 0.25,
+            residual: 0.4,
             seed: 0,
             antialiased: false,
             exposure: false,
