@@ -112,7 +112,7 @@ fn check(settings: &PlanSettings) -> Result<(), PlanError> {
         return bad("--tolerance-db", format!("{} is no loss", settings.tolerance_db), "give decibels from 0");
     }
     if !(0.0..1.0).contains(&settings.residual) {
-        return bad("--residual", format!("{} is out of range", settings.residual), "give 0 to 1, such as 0.25");
+        return bad("--residual", format!("{} is out of range", settings.residual), "give 0 to 1, such as 0.4");
     }
     if settings.exposure && settings.mode == Mode::Flat {
         let problem = "flat blocks have no root to share exposures from";

@@ -37,7 +37,7 @@ fn faulty(world: &World, shot: &Shot) -> Result<Vec<RgbImage>> {
     (rolling.rolling_shutter_seconds, rolling.motion.spin) = (0.08, DVec3::new(0.0, 0.0, 3.0));
     let rolled = frame(world, &rolling, &Options::default())?;
     let mut images = vec![picture(&rolled, &rolled.rgb)?];
-    for kind in Kind::ALL.into_iter().filter(|kind| !unseen.contains(kind)) {
+    for kind in Kind::ALL.iter().copied().filter(|kind| !unseen.contains(kind)) {
         for strength in [0.5, 1.0] {
             let options = Options { faults: vec![Fault { kind, strength, seed: 3 }], ..Options::default() };
             let shot = faults::spoil_shots(vec![shot.clone()], &options.faults).remove(0);

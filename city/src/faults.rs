@@ -16,60 +16,47 @@
 //!
 //! At strength 0 each of them changes nothing.
 
+use std::fmt;
+use std::str::FromStr;
+
 use glam::{DQuat, DVec3, Vec2, Vec3, vec3};
-use scene::Rigid;
+use scene::{BadInput, Rigid};
 use serde::{Deserialize, Serialize};
 
 use crate::{
     random::{Random, bits},
     sense::Shot,
+    settings::named,
     trace::{Light, Options, frame::grain},
 };
 
-/// What goes wrong.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum Kind {
-    /// The gain wanders.
-    ExposureDrift,
-    /// The sun is down.
-    Night,
-    /// Overcast, wet and streaked.
-    Rain,
-    /// Air that one does not see far through.
-    Fog,
-    /// The shutter is open for long.
-    MotionBlur,
-    /// Reported poses are off.
-    PoseNoise,
-    /// Shots are missing.
-    SparseViews,
-    /// Sensors are silent for seconds.
-    SensorDropout,
-    /// Masks miss things that move.
-    MovingUnmasked,
-    /// Roads without texture.
-    TexturelessRoad,
-    /// Spots on the lens.
-    LensDirt,
-}
-
-impl Kind {
-    /// All of them.
-    pub const ALL: [Self; 11] = [
-        Self::ExposureDrift,
-        Self::Night,
-        Self::Rain,
-        Self::Fog,
-        Self::MotionBlur,
-        Self::PoseNoise,
-        Self::SparseViews,
-        Self::SensorDropout,
-        Self::MovingUnmasked,
-        Self::TexturelessRoad,
-        Self::LensDirt,
-    ];
-}
+named!(
+    /// What goes wrong.
+    Kind, "fault", {
+        /// The gain wanders.
+        ExposureDrift = "exposure-drift",
+        /// The sun is down.
+        Night = "night",
+        /// Overcast, wet and streaked.
+        Rain = "rain",
+        /// Air that one does not see far through.
+        Fog = "fog",
+        /// The shutter is open for long.
+        MotionBlur = "motion-blur",
+        /// Reported poses are off.
+        PoseNoise = "pose-noise",
+        /// Shots are missing.
+        SparseViews = "sparse-views",
+        /// Sensors are silent for seconds.
+        SensorDropout = "sensor-dropout",
+        /// Masks miss things that move.
+        MovingUnmasked = "moving-unmasked",
+        /// Roads without texture.
+        TexturelessRoad = "textureless-road",
+        /// Spots on the lens.
+        LensDirt = "lens-dirt",
+    }
+);
 
 /// One thing that goes wrong.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -87,6 +74,20 @@ impl Fault {
     /// The strength is one.
     pub fn is_sane(&self) -> bool {
         (0.0..=1.0).contains(&self.strength)
+    }
+}
+
+impl FromStr for Fault {
+    type Err = BadInput;
+
+    /// `KIND` or `KIND=STRENGTH`, as people type it; the seed is 0.
+    fn from_str(text: &str) -> Result<Self, BadInput> {
+        let (kind, strength) = text.split_once('=').unwrap_or((text, "1"));
+        let strength = strength.parse().ok().filter(|s| (0.0..=1.0).contains(s)).ok_or_else(|| {
+            let problem = format!("{strength:?} is no strength");
+            BadInput::new("fault", problem, "give it as fog=0.4, with a strength from 0 to 1")
+        })?;
+        Ok(Self { kind: kind.parse()?, strength, seed: 0 })
     }
 }
 
@@ -270,6 +271,23 @@ fn soil(light: &mut [Vec3], width: usize, shot: &Shot, fault: &Fault) {
                 let value = &mut light[y * width + x];
                 *value = value.lerp(brown, thick * soft * soft * (3.0 - 2.0 * soft));
             }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn faults_are_read_as_people_type_them() {
+        for &kind in Kind::ALL {
+            assert_eq!(kind.to_string().parse(), Ok(Fault { kind, strength: 1.0, seed: 0 }));
+        }
+        assert_eq!("fog=0.25".parse(), Ok(Fault { kind: Kind::Fog, strength: 0.25, seed: 0 }));
+        for text in ["", "fogg", "fog=", "fog=-0.1", "fog=1.1", "fog=nan", "fog=inf", "fog=0.1=2"] {
+            let refusal = text.parse::<Fault>().unwrap_err().to_string();
+            assert!(refusal.starts_with("fault") && !refusal.contains('\n'), "{refusal}");
         }
     }
 }

@@ -63,7 +63,8 @@ surfaces! {
     CONCRETE, "concrete", [0.40, 0.39, 0.37], 0.85, 0.0, 0.4, noise(0.02, 2.5, 0.3);
     CONCRETE_SMOOTH, "concrete, smooth", [0.5, 0.5, 0.49], 0.7, 0.0, 0.42, PLAIN;
     LAWN, "lawn", [0.095, 0.18, 0.045], 0.95, 0.0, 0.45, noise(0.01, 3.0, 0.6);
-    MEADOW, "meadow", [0.16, 0.19, 0.07], 0.95, 0.0, 0.42, noise(0.02, 12.0, 0.65);
+    MEADOW, "meadow", [0.16, 0.19, 0.07], 0.95, 0.0, 0.42, noise(0.02, 12.0, 0.4);
+    PASTURE, "pasture, grazed bare", [0.19, 0.2, 0.09], 0.95, 0.0, 0.42, noise(0.05, 12.0, 0.1);
     SOIL, "soil", [0.16, 0.11, 0.07], 0.95, 0.0, 0.3, noise(0.01, 1.0, 0.5);
     GRAVEL, "gravel", [0.36, 0.33, 0.28], 0.95, 0.0, 0.32, noise(0.01, 0.6, 0.6);
     PAINT_WHITE, "road paint, white", [0.8, 0.8, 0.78], 0.6, 0.0, 0.8, noise(0.02, 0.5, 0.2);

@@ -81,6 +81,7 @@ macro_rules! named {
         }
     };
 }
+pub(crate) use named;
 
 named!(
     /// How streets run: a plain grid, the four layouts that reconstruction finds hard (SDG, section 2.2), and all of them.

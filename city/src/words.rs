@@ -58,6 +58,35 @@ pub enum Class {
     StreetFurniture = 35,
 }
 
+impl Class {
+    /// All of them, in the order of their numbers.
+    pub const ALL: [Self; 23] = [
+        Self::Road,
+        Self::Sidewalk,
+        Self::Building,
+        Self::Wall,
+        Self::Fence,
+        Self::Pole,
+        Self::TrafficLight,
+        Self::TrafficSign,
+        Self::Vegetation,
+        Self::Terrain,
+        Self::Sky,
+        Self::Person,
+        Self::Rider,
+        Self::Car,
+        Self::Truck,
+        Self::Bus,
+        Self::Train,
+        Self::Motorcycle,
+        Self::Bicycle,
+        Self::RoadMarking,
+        Self::GuardRail,
+        Self::Bridge,
+        Self::StreetFurniture,
+    ];
+}
+
 /// How a material's colour varies over a surface. Patterns are functions of the surface's own coordinates (`uv`, metres),
 /// so that they stay with it, and are filtered to the footprint of a pixel: no detail finer than it is drawn.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]

@@ -1,6 +1,7 @@
 //! The command line, as data. Options without a meaning yet are not accepted.
 
 mod bench;
+mod synth;
 
 use std::fmt;
 use std::path::PathBuf;
@@ -16,6 +17,7 @@ pub(crate) use bench::{
     AdaptiveArgs, BenchCommand, BenchDemoArgs, BenchPruneArgs, BenchTreeArgs, ChartArgs, IngestArgs, KernelsArgs,
     ParetoArgs,
 };
+pub(crate) use synth::SynthArgs;
 
 /// Trains Gaussian-splat models of whole cities from photos with poses.
 ///
@@ -41,6 +43,8 @@ pub(crate) struct Cli {
 pub(crate) enum Command {
     /// Build, train and look at a small synthetic city: the first thing to type
     Demo(DemoArgs),
+    /// Rehearse a capture in a generated city: photos, masks, cameras, points and, if asked for, all the truth behind them
+    Synth(SynthArgs),
     /// Say what is in a capture, how it would be divided, and what that would take
     Inspect(InspectArgs),
     /// Divide a capture into blocks, check the plan and draw it
@@ -160,7 +164,7 @@ pub(crate) struct PlanOptions {
     pub(crate) tolerance_db: f64,
     /// Refine a block only where its parent's splats are off, in the block's own photos, by more than R times what the root is
     /// off by in all (root mean squares), and look at fine pixels and add splats only while that pays; 0 adapts nothing
-    #[arg(long, value_name = "R", value_parser = residual, default_value_t = 0.25)]
+    #[arg(long, value_name = "R", value_parser = residual, default_value_t = 0.4)]
     pub(crate) residual: f64,
     /// Seed of all random choices
     #[arg(long, value_name = "S", default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=i64::MAX as u64))]

@@ -108,6 +108,9 @@ fn with_file(mut argv: Vec<OsString>, file: &Path) -> Result<Vec<OsString>, BadI
             (ArgAction::Set, toml::Value::String(text)) => flags.push(format!("--{key}={text}").into()),
             (ArgAction::Set, toml::Value::Integer(number)) => flags.push(format!("--{key}={number}").into()),
             (ArgAction::Set, toml::Value::Float(number)) => flags.push(format!("--{key}={number}").into()),
+            (ArgAction::Append, toml::Value::Array(values)) if values.iter().all(toml::Value::is_str) => {
+                flags.extend(values.iter().filter_map(|text| Some(format!("--{key}={}", text.as_str()?).into())));
+            }
             _ => return Err(bad(format!("'{key}' has a value of the wrong kind"), "see --help for what it takes")),
         }
     }
@@ -185,6 +188,16 @@ mod tests {
     }
 
     #[test]
+    fn a_list_is_an_option_given_more_than_once() {
+        let file = file("fault = [\"fog=0.5\", \"night\"]\n");
+        let path = file.path().to_str().unwrap();
+        let cli = parse(&["plat", "synth", "--out", "a", "--fault", "rain", "--config", path]).unwrap();
+        let Command::Synth(synth) = cli.command else { panic!("not synth") };
+        let faults: Vec<_> = synth.fault.iter().map(|f| (f.kind.name(), f.strength)).collect();
+        assert_eq!(faults, [("fog", 0.5), ("night", 1.0), ("rain", 1.0)]);
+    }
+
+    #[test]
     fn bad_files_are_named_in_one_line() {
         for (text, wanted) in [
             ("stepps = 3", "stepps"),
@@ -192,6 +205,7 @@ mod tests {
             ("seed = 1\nsteps = \"many\"", "many"),
             ("steps = true", "steps"),
             ("steps = [1, 2]", "steps"),
+            ("steps = [\"1\"]", "steps"),
             ("config = \"other.toml\"", "config"),
         ] {
             let file = file(text);

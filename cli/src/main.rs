@@ -39,6 +39,7 @@ fn main() -> ExitCode {
     let output = Output::new(cli.json, cli.quiet);
     let done = match &cli.command {
         Command::Demo(args) => commands::demo::run(args, &output),
+        Command::Synth(args) => commands::synth::run(args, &output),
         Command::Inspect(args) => commands::inspect::run(args, &output),
         Command::Plan(args) => commands::plan::run(args, &output),
         Command::Train(args) => commands::train::run(args, &output),

@@ -4,6 +4,7 @@ use std::fmt::Display;
 use std::io::{ErrorKind, IsTerminal, Write};
 use std::path::Path;
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Mutex, PoisonError};
 
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde::Serialize;
@@ -52,6 +53,11 @@ impl Output {
         });
         Progress { bar, what: what.to_owned(), total, output: *self, tenths: AtomicU64::new(0) }
     }
+
+    /// Progress of something whose stages become known on the way.
+    pub(crate) fn stages(&self) -> Stages {
+        Stages { output: *self, now: Mutex::new(None) }
+    }
 }
 
 /// A bar on a terminal, a line for every tenth elsewhere.
@@ -90,6 +96,27 @@ impl Drop for Progress {
     fn drop(&mut self) {
         if let Some(bar) = &self.bar {
             bar.finish_and_clear();
+        }
+    }
+}
+
+/// Progress of work in stages that are named as they begin: a bar for each, one after the other.
+pub(crate) struct Stages {
+    output: Output,
+    now: Mutex<Option<(&'static str, Progress)>>,
+}
+
+impl Stages {
+    /// So much of this stage is done now; from any thread.
+    pub(crate) fn at(&self, what: &'static str, done: usize, total: usize) {
+        let mut now = self.now.lock().unwrap_or_else(PoisonError::into_inner);
+        if now.as_ref().is_none_or(|(shown, _)| *shown != what) {
+            // The old one goes before there is a new one.
+            *now = None;
+            *now = Some((what, self.output.progress(what, total as u64)));
+        }
+        if let Some((_, progress)) = now.as_ref() {
+            progress.at(done as u64, "");
         }
     }
 }

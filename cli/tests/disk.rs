@@ -22,6 +22,8 @@ const BLOCK: u64 = 512;
 const TRAIN: [&str; 12] =
     ["train", "city", "--steps", "20", "--budget", "400", "--levels", "1", "--threads", "2", "--checkpoint-every", "0"];
 
+const SYNTH: [&str; 9] = ["synth", "--area-km2", "0.05", "--views", "8", "--size", "64x36", "--traffic", "light"];
+
 /// The command where no file may become longer than so many blocks.
 fn limited(at: &Path, blocks: u64, words: &[&str]) -> Command {
     let mut shell = Command::new("sh");
@@ -111,6 +113,7 @@ fn a_place_that_takes_nothing_is_named() {
             &["plan", "city", "--out", out],
             &["plan", "city", "--svg", drawing],
             &["demo", "--quick", "--out", out],
+            &[&SYNTH[..], &["--out", out]].concat(),
             &["render", "some.ply", "--cameras", "city", "--out", out],
             &["export", "model", "--to", "ply", "--out", file],
             &["prune", "some.ply", "--keep", "0.5", "--out", file],
@@ -245,4 +248,39 @@ fn a_demo_on_a_full_disk_is_no_capture() {
         let output = plat(at, &["inspect", "o/city"]);
         assert_eq!(output.status.code(), Some(2), "{blocks} blocks");
     }
+}
+
+#[test]
+fn a_rehearsal_on_a_full_disk_is_no_capture_and_is_finished_where_there_is_room() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    let synth = |out: &'static str| [&SYNTH[..], &["--truth", "--occupancy", "2", "--out", out]].concat();
+    done(at, &synth("calm"));
+    let complete = |out: &str| -> Value {
+        serde_json::from_slice::<Value>(&fs::read(at.join(out).join("manifest.json")).unwrap()).unwrap()["complete"]
+            .clone()
+    };
+    // the claim fails; then a photo, then depths, then voxels
+    let mut failures = 0;
+    for blocks in [0, 4, 12, 40] {
+        let mut run = limited(at, blocks, &synth("o"));
+        if run.output().unwrap().status.success() {
+            continue;
+        }
+        stopped(&mut run, 1, "cannot be written: ");
+        failures += 1;
+        if blocks > 0 {
+            assert_eq!(complete("o"), false, "{blocks} blocks");
+        }
+    }
+    assert!(failures >= 3, "{failures} of the limits were too small");
+    done(at, &synth("o"));
+    assert_eq!(complete("o"), true);
+    let files = |out: &str| {
+        let output = Command::new("find").args([".", "-type", "f"]).current_dir(at.join(out)).output().unwrap();
+        let mut names: Vec<_> = String::from_utf8(output.stdout).unwrap().lines().map(str::to_owned).collect();
+        names.sort();
+        names.into_iter().map(|name| (fs::read(at.join(out).join(&name)).unwrap(), name)).collect::<Vec<_>>()
+    };
+    assert!(files("o") == files("calm"), "a full disk shows in the capture");
 }

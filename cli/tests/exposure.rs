@@ -1,11 +1,14 @@
 //! Exposures of views, and far content, through a whole job: what the root has, all blocks have, and no one else's.
 
+mod common;
+
 use std::collections::BTreeSet;
 use std::path::Path;
 use std::process::{Command, Output};
 
 use blocks::Plan;
-use dataset::synth::{CitySettings, write_city};
+use city::CitySettings;
+use dataset::rehearse::{self, Settings};
 use scene::{ArtefactId, BlockId, Capture, Exposures, Splats, frame, ply};
 use serde_json::Value;
 
@@ -49,8 +52,8 @@ fn far(splats: &Splats, plan: &Plan) -> Vec<Vec<u32>> {
 fn exposures_and_the_sky_come_from_the_root_and_stay_as_they_are() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
-    let settings = CitySettings { seed: 3, extent_metres: 80.0, views: 32, width: 80, height: 60, plain: 0.0 };
-    write_city(&at.join("city"), &settings, |_, _| {}).unwrap();
+    let settings = common::small(32, 80, 60);
+    rehearse::write(&at.join("city"), &settings, &|_, _, _| ()).unwrap();
     let gains = expose_photos(&at.join("city/images"));
     let train = |out: &str, more: &[&str]| {
         let job = ["train", "city", "--out", out, "--steps", "1500", "--budget", "4000", "--tolerance-db", "0"];
@@ -117,7 +120,8 @@ fn exposures_and_the_sky_come_from_the_root_and_stay_as_they_are() {
     let pruned = prune("city", "pruned");
     assert!(pruned.status.success() && !said(&pruned).contains("exposures"), "{}", said(&pruned));
     assert_eq!(bytes("pruned/model/exposures.plat"), file);
-    write_city(&at.join("other"), &CitySettings { seed: 4, ..settings }, |_, _| {}).unwrap();
+    let other = Settings { city: CitySettings { seed: 4, ..settings.city }, ..settings };
+    rehearse::write(&at.join("other"), &other, &|_, _, _| ()).unwrap();
     let pruned = prune("other", "by_others");
     assert!(said(&pruned).contains("exposures are left out"), "{}", said(&pruned));
 

@@ -5,17 +5,16 @@ use std::fs;
 use std::io::Cursor;
 use std::path::Path;
 
+use city::{CitySettings, Traffic};
 use dataset::ingest::{IngestError, IngestOptions, ingest, load_capture};
 use dataset::open::{OpenOptions, Source, open};
-use dataset::synth::{CitySettings, write_city};
+use dataset::rehearse::{self, Settings};
 use glam::{DQuat, DVec3};
 use image::{DynamicImage, ImageFormat, Rgb, RgbImage};
 use scene::CameraModel;
 use scene::colmap::{self, Reconstruction};
 use store::Store;
 use tempfile::TempDir;
-
-const CITY: CitySettings = CitySettings { seed: 3, extent_metres: 90.0, views: 24, width: 48, height: 32, plain: 0.0 };
 
 /// Opens, ingests, loads and plans; all words in one line if the capture is at fault.
 fn run(path: &Path) -> Result<Source, String> {
@@ -46,7 +45,10 @@ fn refused(path: &Path, words: &[&str]) {
 
 fn city() -> (TempDir, Reconstruction) {
     let folder = tempfile::tempdir().unwrap();
-    write_city(folder.path(), &CITY, |_, _| ()).unwrap();
+    // Nothing moves, so that photos have no masks.
+    let city = CitySettings { traffic: Traffic::None, ..CitySettings::default() };
+    let settings = Settings { city, views: 24, width: 48, height: 32, ..Settings::default() };
+    rehearse::write(folder.path(), &settings, &|_, _, _| ()).unwrap();
     let read = |name: &str| fs::read(folder.path().join("sparse/0").join(name)).unwrap();
     let model = Reconstruction {
         cameras: colmap::read_cameras_bin(&read("cameras.bin")).unwrap(),

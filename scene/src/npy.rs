@@ -1,4 +1,4 @@
-//! NumPy's array files (`.npy`), as far as plat needs them: floats in C order.
+//! NumPy's array files (`.npy`), as far as plat needs them: numbers in C order, of which floats are read back.
 //!
 //! Source: NumPy, "A simple file format for NumPy arrays" (`numpy.lib.format`).
 
@@ -6,25 +6,56 @@ use crate::error::CodecError;
 
 const MAGIC: &[u8; 6] = b"\x93NUMPY";
 
-/// An array of this shape (slowest axis first) as npy 1.0, `<f4`; the data begin at a multiple of 64 bytes.
+/// A number that arrays are made of.
+pub trait Number: Copy {
+    /// NumPy's name of the type.
+    const DESCR: &'static str;
+
+    /// Appends its bytes, little-endian.
+    fn put(self, bytes: &mut Vec<u8>);
+}
+
+macro_rules! number {
+    ($($type:ty = $descr:literal),+) => {
+        $(impl Number for $type {
+            const DESCR: &'static str = $descr;
+
+            fn put(self, bytes: &mut Vec<u8>) {
+                bytes.extend_from_slice(&self.to_le_bytes());
+            }
+        })+
+    };
+}
+
+number!(u8 = "|u1", u32 = "<u4", f32 = "<f4", f64 = "<f8");
+
+/// An array of this shape (slowest axis first) as npy 1.0; the data begin at a multiple of 64 bytes.
 ///
 /// # Panics
 /// When the shape does not hold `data.len()` numbers.
-pub fn write_f32(shape: &[usize], data: &[f32]) -> Vec<u8> {
+pub fn write<T: Number>(shape: &[usize], data: &[T]) -> Vec<u8> {
     assert_eq!(shape.iter().product::<usize>(), data.len(), "the shape {shape:?} does not fit the data");
     let axes: String = shape.iter().map(|n| format!("{n}, ")).collect();
     let axes = if shape.len() == 1 { axes.trim_end() } else { axes.trim_end_matches(", ") };
-    let mut dict = format!("{{'descr': '<f4', 'fortran_order': False, 'shape': ({axes}), }}");
+    let mut dict = format!("{{'descr': '{}', 'fortran_order': False, 'shape': ({axes}), }}", T::DESCR);
     let unpadded = MAGIC.len() + 4 + dict.len() + 1;
     dict.extend(std::iter::repeat_n(' ', unpadded.next_multiple_of(64) - unpadded));
     dict.push('\n');
-    let mut bytes = Vec::with_capacity(MAGIC.len() + 4 + dict.len() + 4 * data.len());
+    let mut bytes = Vec::with_capacity(MAGIC.len() + 4 + dict.len() + size_of_val(data));
     bytes.extend_from_slice(MAGIC);
     bytes.extend_from_slice(&[1, 0]);
     bytes.extend_from_slice(&u16::try_from(dict.len()).expect("a shape has a few axes").to_le_bytes());
     bytes.extend_from_slice(dict.as_bytes());
-    data.iter().for_each(|value| bytes.extend_from_slice(&value.to_le_bytes()));
+    data.iter().for_each(|value| value.put(&mut bytes));
     bytes
+}
+
+/// [`write`] of floats.
+///
+/// # Panics
+/// As [`write`].
+pub fn write_f32(shape: &[usize], data: &[f32]) -> Vec<u8> {
+    write(shape, data)
 }
 
 /// Shape and numbers of an array of `<f4` (bit for bit) or `<f8` (rounded) in C order. Numbers that are not finite
@@ -131,6 +162,9 @@ mod tests {
         let bytes = with_dict("{'descr': '<f8', 'fortran_order': False, 'shape': (2,), }\n", &body);
         assert_eq!(read_f32(&bytes), Ok((vec![2], vec![1.5, -2.0])));
         assert_eq!(read_f32(&write_f32(&[], &[7.0])), Ok((vec![], vec![7.0])));
+        assert_eq!(read_f32(&write(&[2, 1], &[0.1, 2.5f64])), Ok((vec![2, 1], vec![0.1, 2.5])));
+        assert!(write(&[3], &[1u8, 2, 3]).ends_with(b"\n\x01\x02\x03"));
+        assert!(write(&[1], &[258u32]).starts_with(b"\x93NUMPY\x01\x00v\x00{'descr': '<u4', "));
         let header = b"\x93NUMPY\x01\x00v\x00{'descr': '<f4', 'fortran_order': False, 'shape': (1,), }";
         assert!(write_f32(&[1], &[0.0]).starts_with(header));
     }

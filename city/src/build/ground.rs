@@ -367,16 +367,19 @@ pub(crate) fn country(roads: &Roads, terrain: &Terrain, half: f64, west_gap: f64
             let to = (from + PIECE).min(count);
             let mut layer = Layer::new(terrain, rings.front[from].at, Class::Sidewalk);
             rings.pavement(&mut layer, from, to);
-            layer.builder.class(Class::Terrain).paint(m::MEADOW);
+            layer.builder.class(Class::Terrain);
+            let place = |k: usize, share: f64| rings.front[k % count].at.lerp(far[k % count], share);
             let sheet: Vec<Vec<u32>> = (from..=to)
                 .map(|k| {
                     let near = rings.front[k % count];
-                    let at =
-                        |t: &f64| (near.at.lerp(far[k % count], *t), near.profile.curb * (1.0 - (20.0 * t).min(1.0)));
+                    let at = |t: &f64| (place(k, *t), near.profile.curb * (1.0 - (20.0 * t).min(1.0)));
                     shares.iter().map(at).map(|(p, above)| layer.corner(p, above)).collect()
                 })
                 .collect();
-            layer.sheet(&sheet, |_, _, _| {});
+            layer.sheet(&sheet, |builder, k, c| {
+                let bare = west_gap > 0.0 && place(from + k, shares[c]).x < west_gap - half;
+                builder.paint(if bare { m::PASTURE } else { m::MEADOW });
+            });
             layer.finish(format!("country {}", from / PIECE))
         })
         .collect()

@@ -58,31 +58,51 @@ impl Default for Survey {
     }
 }
 
+impl Survey {
+    /// Lines, and stops on each, at which a picture is taken in every heading.
+    ///
+    /// # Errors
+    /// [`SenseError`] for settings out of range, or more stops than a list may hold.
+    pub fn stops(&self, city: &City) -> Result<[u32; 2], SenseError> {
+        let lens = pinhole(self.width, self.height, self.field_degrees)?;
+        let height = within("height_metres", self.height_metres, 5.0, 2e4)?;
+        let forward = within("forward_overlap", self.forward_overlap, 0.0, 0.95)?;
+        let side = within("side_overlap", self.side_overlap, 0.0, 0.95)?;
+        within("tilt_degrees", self.tilt_degrees, 0.0, 80.0)?;
+        let [low, high] = self.corners(city);
+        let size = high - low;
+        if !(size.min_element() >= 0.0 && size.max_element() < 1e6 && low.abs().max_element() < 1e6) {
+            return Err(SenseError::Setting("area"));
+        }
+        // a metre on the ground is fx / height pixels
+        let covered = DVec2::new(f64::from(lens.width), f64::from(lens.height)) * height / lens.fx;
+        let step = covered * (DVec2::ONE - DVec2::new(side, forward));
+        let stops = (size / step).ceil() + 1.0;
+        count(stops.x * stops.y)?;
+        Ok([stops.x as u32, stops.y as u32])
+    }
+
+    /// What is flown over.
+    fn corners(&self, city: &City) -> [DVec2; 2] {
+        self.area.unwrap_or([-0.5, 0.5].map(|side| DVec2::splat(side * city.extent_metres)))
+    }
+}
+
 /// The pictures of a block, line by line, there and back.
 ///
 /// # Errors
 /// [`SenseError`] for settings out of range, or more pictures than a list may hold.
 pub fn survey(city: &City, settings: &Survey) -> Result<Vec<Shot>, SenseError> {
     let lens = pinhole(settings.width, settings.height, settings.field_degrees)?;
-    let height = within("height_metres", settings.height_metres, 5.0, 2e4)?;
-    let forward = within("forward_overlap", settings.forward_overlap, 0.0, 0.95)?;
-    let side = within("side_overlap", settings.side_overlap, 0.0, 0.95)?;
-    let tilt = within("tilt_degrees", settings.tilt_degrees, 0.0, 80.0)?;
+    let [lines, stops] = settings.stops(city)?;
+    let headings = if settings.tilt_degrees > 0.0 { 5.0 } else { 1.0 };
+    count(f64::from(lines) * f64::from(stops) * headings)?;
+    let (height, tilt) = (settings.height_metres, settings.tilt_degrees);
     let speed = within("speed", settings.speed, 0.1, 300.0)?;
     let start = within("start_seconds", settings.start_seconds, -1e9, 1e9)?;
     let shutter = within("shutter_seconds", settings.shutter_seconds, 0.0, 1.0)?;
-    let [low, high] = settings.area.unwrap_or([DVec2::splat(-0.5), DVec2::splat(0.5)].map(|c| c * city.extent_metres));
+    let [low, high] = settings.corners(city);
     let size = high - low;
-    if !(size.min_element() >= 0.0 && size.max_element() < 1e6 && low.abs().max_element() < 1e6) {
-        return Err(SenseError::Setting("area"));
-    }
-    // a metre on the ground is fx / height pixels
-    let covered = DVec2::new(f64::from(lens.width), f64::from(lens.height)) * height / lens.fx;
-    let step = covered * (DVec2::ONE - DVec2::new(side, forward));
-    let stops = (size / step).ceil() + 1.0;
-    let headings = if tilt > 0.0 { 5.0 } else { 1.0 };
-    count(stops.x * stops.y * headings)?;
-    let (lines, stops) = (stops.x as u32, stops.y as u32);
     let even = |i: u32, n: u32| if n > 1 { f64::from(i) / f64::from(n - 1) } else { 0.5 };
     let (top, mut way, mut shots) = (ground(city) + height, 0.0, Vec::new());
     let mut last: Option<DVec3> = None;

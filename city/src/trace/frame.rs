@@ -1,7 +1,8 @@
 //! A shot as a picture and its truth.
 //!
-//! Colours are the mean of stratified samples of a pixel, spread over the time its row is exposed. Truth is of the one
-//! ray through the pixel's centre, at the middle of its row's exposure.
+//! Truth is of the one ray through the pixel's centre, at the middle of its row's exposure. A pixel's colour is what this ray
+//! shows where its neighbours show the same; where they differ, at edges of things and of shadows, and where the picture
+//! is blurred, it is the mean of stratified samples, spread over the time its row is exposed (Whitted 1980).
 
 use glam::{DVec2, DVec3, Quat, Vec2, Vec3};
 use rayon::prelude::*;
@@ -30,6 +31,8 @@ const TICKS: usize = 15;
 /// Side of the square of pixels that share their tries for light from around: one direction each. With fewer, what stands
 /// near shows as so many faint shadows of itself.
 const SQUARE: u32 = 8;
+/// How much a pixel may differ from a neighbour in a colour's square root, of 1, and be left at one sample.
+const SMOOTH: f32 = 0.035;
 /// How near something must be to take light from around away, metres.
 const CORNER: f32 = 4.0;
 
@@ -37,7 +40,7 @@ const CORNER: f32 = 4.0;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Options {
-    /// Samples of a pixel along each side, 1 to 8.
+    /// Samples along each side of a pixel that is not like its neighbours, 1 to 8.
     pub samples: u32,
     /// Whether near surfaces keep sky and ground light from each other.
     pub corners: bool,
@@ -114,6 +117,9 @@ pub fn frame(world: &World, shot: &Shot, options: &Options) -> Result<Frame, Fra
         open.extend(row.open);
         out.take(row.truth);
     }
+    if take.side > 1 {
+        take.sharpen(&mut glows);
+    }
     let mut light = merge(&out, &glows, &open);
     for value in &mut light {
         *value *= shot.exposure;
@@ -172,6 +178,19 @@ struct Take<'a> {
     moments: Vec<Moment<'a>>,
 }
 
+/// The mean light of a pixel's samples, and of those at its left, right, upper and lower side.
+#[derive(Default)]
+struct Sampled {
+    mean: Glow,
+    sides: [Glow; 4],
+}
+
+/// Whether light differs so much that it shows.
+fn differ(a: &Glow, b: &Glow) -> bool {
+    let seen = |glow: &Glow| (glow.direct + glow.around).map(f32::sqrt);
+    (seen(a) - seen(b)).abs().max_element() > SMOOTH
+}
+
 /// A row of a picture.
 struct Row {
     truth: Frame,
@@ -215,15 +234,58 @@ impl<'a> Take<'a> {
     fn row(&self, y: u32) -> Row {
         let time = self.row_time(y);
         let (moment, pose) = self.moment(time);
+        let shader = Shader { moment, light: &self.light, spread: self.spread(1) };
         let mut row = Row { truth: Frame::default(), glows: Vec::new(), open: Vec::new() };
         for x in 0..self.width {
             let (ray, along) = self.ray(&pose, f64::from(x) + 0.5, f64::from(y) + 0.5);
             let hit = moment.cast(&ray, Meets::Everything);
             self.truth(&mut row.truth, moment, &ray, along, hit.as_ref());
             row.open.push(self.is_open(moment, &ray, hit.as_ref(), x, y));
+            row.glows.push(if self.blurs() { Glow::default() } else { shader.of(&ray, hit.as_ref()) });
         }
-        row.glows = (0..self.width).map(|x| self.colour(x, y, time)).collect();
         row
+    }
+
+    /// Whether samples of a pixel are of different times.
+    fn blurs(&self) -> bool {
+        self.shot.shutter_seconds > 0.0
+    }
+
+    /// Width of a sample per metre of distance, of so many along each side of a pixel.
+    fn spread(&self, side: u32) -> f32 {
+        1.2 / (self.shot.camera.pinhole.fx as f32 * side as f32)
+    }
+
+    /// Samples anew what is not like its neighbours; then, as long as there are any, the neighbours of which the samples on
+    /// their side tell that they are not alike either: so a line is followed where it passes between pixels' centres.
+    fn sharpen(&self, glows: &mut [Glow]) {
+        let (width, height) = (self.width as usize, self.height as usize);
+        let mut done = vec![false; glows.len()];
+        let beside = |i: usize| {
+            let (x, y) = (i % width, i / width);
+            let there = [x > 0, x + 1 < width, y > 0, y + 1 < height];
+            let place = [i.wrapping_sub(1), i + 1, i.wrapping_sub(width), i + width];
+            (0..4).filter(move |&side| there[side]).map(move |side| (side, place[side]))
+        };
+        let is_edge = |i: &usize| self.blurs() || beside(*i).any(|(_, j)| differ(&glows[*i], &glows[j]));
+        let mut edges: Vec<usize> = (0..glows.len()).into_par_iter().filter(is_edge).collect();
+        while !edges.is_empty() {
+            let sampled: Vec<Sampled> =
+                edges.par_iter().map(|&i| self.colour((i % width) as u32, (i / width) as u32)).collect();
+            for (&i, pixel) in edges.iter().zip(&sampled) {
+                (glows[i], done[i]) = (pixel.mean, true);
+            }
+            let mut more = Vec::new();
+            for (&i, pixel) in edges.iter().zip(&sampled) {
+                for (side, j) in beside(i) {
+                    if !done[j] && differ(&pixel.sides[side], &glows[j]) {
+                        done[j] = true;
+                        more.push(j);
+                    }
+                }
+            }
+            edges = more;
+        }
     }
 
     /// The ray through a place of the picture, and how many metres of depth a metre along it is.
@@ -235,24 +297,30 @@ impl<'a> Take<'a> {
         (Ray::new(pose.translation.as_vec3(), direction), (1.0 / length) as f32)
     }
 
-    /// The mean light of a pixel.
-    fn colour(&self, x: u32, y: u32, time: f64) -> Glow {
-        let side = self.side;
+    /// Samples a pixel.
+    fn colour(&self, x: u32, y: u32) -> Sampled {
+        let (time, side) = (self.row_time(y), self.side);
         let samples = side * side;
-        let spread = 1.0 / (self.shot.camera.pinhole.fx as f32 * side as f32) * 1.2;
-        let mut sum = Glow::default();
+        let spread = self.spread(side);
+        let mut out = Sampled::default();
         for i in 0..samples {
-            let place = (DVec2::new(f64::from(i % side), f64::from(i / side)) + 0.5) / f64::from(side);
+            let (column, line) = (i % side, i / side);
+            let place = (DVec2::new(f64::from(column), f64::from(line)) + 0.5) / f64::from(side);
             // each sample has its own part of the exposure, and neighbours other ones
             let turn = (i * 7 + x * 5 + y * 11) % samples;
             let blur = self.shot.shutter_seconds * ((f64::from(turn) + 0.5) / f64::from(samples) - 0.5);
             let (moment, pose) = self.moment(time + blur);
             let (ray, _) = self.ray(&pose, f64::from(x) + place.x, f64::from(y) + place.y);
             let glow = Shader { moment, light: &self.light, spread }.glow(&ray);
-            sum = Glow { direct: sum.direct + glow.direct, around: sum.around + glow.around };
+            out.mean = out.mean.plus(glow);
+            for (sum, at_rim) in
+                out.sides.iter_mut().zip([column == 0, column + 1 == side, line == 0, line + 1 == side])
+            {
+                *sum = if at_rim { sum.plus(glow) } else { *sum };
+            }
         }
-        let share = 1.0 / samples as f32;
-        Glow { direct: share * sum.direct, around: share * sum.around }
+        let share = |glow: Glow, of: u32| glow.scale(Vec3::splat(1.0 / of as f32));
+        Sampled { mean: share(out.mean, samples), sides: out.sides.map(|glow| share(glow, side)) }
     }
 
     fn truth(&self, out: &mut Frame, moment: &Moment, ray: &Ray, along: f32, hit: Option<&Hit>) {

@@ -218,9 +218,11 @@ impl Level {
     }
 }
 
-/// The tree's own ray: its crate has another version of our vectors.
+/// The tree's own ray: its crate has another version of our vectors, and takes -0 for uphill where it inverts it and for
+/// downhill where it compares it, so that a ray along an axis would meet nothing.
 #[inline(always)]
 fn outer(origin: Vec3, direction: Vec3, to: f32) -> obvhs::ray::Ray {
+    let direction = direction + Vec3::ZERO;
     obvhs::ray::Ray::new(origin.to_array().into(), direction.to_array().into(), 0.0, to)
 }
 

@@ -93,7 +93,7 @@ pub(crate) struct Glow {
 }
 
 impl Glow {
-    fn scale(self, by: Vec3) -> Self {
+    pub(crate) fn scale(self, by: Vec3) -> Self {
         Self { direct: self.direct * by, around: self.around * by }
     }
 
@@ -101,7 +101,7 @@ impl Glow {
         Self { direct: self.direct + light, ..self }
     }
 
-    fn plus(self, other: Self) -> Self {
+    pub(crate) fn plus(self, other: Self) -> Self {
         Self { direct: self.direct + other.direct, around: self.around + other.around }
     }
 }
@@ -117,10 +117,12 @@ pub(crate) struct Shader<'a> {
 impl Shader<'_> {
     /// The light along a ray.
     pub(crate) fn glow(&self, ray: &Ray) -> Glow {
-        match self.moment.cast(ray, Meets::Everything) {
-            Some(hit) => self.surface(ray, &hit),
-            None => self.sky(ray),
-        }
+        self.of(ray, self.moment.cast(ray, Meets::Everything).as_ref())
+    }
+
+    /// The light along a ray of which it is known what it meets first.
+    pub(crate) fn of(&self, ray: &Ray, hit: Option<&Hit>) -> Glow {
+        hit.map_or_else(|| self.sky(ray), |hit| self.surface(ray, hit))
     }
 
     fn sky(&self, ray: &Ray) -> Glow {

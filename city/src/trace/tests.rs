@@ -39,6 +39,13 @@ fn rays_meet_boxes_where_arithmetic_says() {
     let (roof, _) = cast(vec3(19.0, 0.0, 14.0), vec3(19.0, 12.0, 9.0)).unwrap();
     assert!((roof.distance - 13.0).abs() < 1e-4 && roof.normal == Vec3::Z);
     assert!(cast(vec3(0.0, 0.0, 5.0), vec3(0.0, 0.0, 9.0)).is_none());
+    // along an axis, whatever the sign of zero
+    for direction in [-Vec3::Z, vec3(0.0, 0.0, -1.0), vec3(-0.0, 0.0, -1.0)] {
+        let ray = Ray::new(vec3(20.5, 12.25, 14.0), direction);
+        let hit = moment.cast(&ray, Meets::Everything);
+        assert!(hit.is_some_and(|hit| (hit.distance - 5.0).abs() < 1e-4), "{direction}");
+        assert!(moment.is_blocked(&ray));
+    }
     // the van at its start, and three seconds later
     let at = |seconds: f64| {
         let ray = Ray::new(vec3(-50.0, -2.0, 1.0), Vec3::X);
@@ -170,7 +177,7 @@ fn the_same_shot_gives_the_same_bytes_on_one_thread_and_two() {
     let world = World::new(&city).unwrap();
     let mut shot = shot(DVec3::new(-8.0, -9.0, 2.2), DVec3::new(4.0, 10.0, 1.0), 2.0);
     shot.rolling_shutter_seconds = 0.03;
-    let faults = Kind::ALL.map(|kind| Fault { kind, strength: 0.4, seed: 9 }).to_vec();
+    let faults = Kind::ALL.iter().map(|&kind| Fault { kind, strength: 0.4, seed: 9 }).collect();
     let options = Options { faults, ..Options::default() };
     let with = |threads| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
@@ -190,7 +197,7 @@ fn every_fault_changes_nothing_at_zero_and_something_at_one() {
             shot
         })
         .collect();
-    for kind in Kind::ALL {
+    for &kind in Kind::ALL {
         let with = |strength| {
             let options = Options { faults: vec![Fault { kind, strength, seed: 4 }], ..Options::default() };
             let spoilt = faults::spoil_shots(shots.clone(), &options.faults);

@@ -5,7 +5,8 @@ use std::path::Path;
 
 use ::bench::parts::{Ingest, Tree, TreeFaces, TreeLevel};
 use ::bench::{CurvePoint, PartLine, append, append_part, read_folder, replace_table, table};
-use dataset::synth::{CitySettings, write_city};
+use city::CitySettings;
+use dataset::rehearse::Settings;
 use serde::Serialize;
 use store::Store;
 use store::file::save;
@@ -63,10 +64,8 @@ pub(crate) fn demo(args: &BenchDemoArgs, output: &Output) -> Result<(), Failure>
 pub(crate) fn adaptive(args: &AdaptiveArgs, output: &Output) -> Result<(), Failure> {
     let demo = DemoArgs { out: args.out.clone(), quick: false };
     let (city, settings) = demo::settings(&demo);
-    let city = CitySettings { plain: 0.5, ..city };
-    let progress = output.progress("city", u64::from(city.views));
-    write_city(&settings.capture, &city, |done, _| progress.at(done as u64, ""))?;
-    drop(progress);
+    let city = Settings { city: CitySettings { plain: 0.5, ..city.city }, ..city };
+    demo::rehearsed(&settings.capture, &city, output)?;
     for (label, residual) in [("fixed depth", 0.0), ("adaptive", settings.plan.residual)] {
         let levels = Auto(Some(2));
         let plan =

@@ -1,10 +1,11 @@
 //! `plat demo`: a small synthetic city from nothing to pictures.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use ::bench::{CurvePoint, birdseye_camera, oblique_camera, write_png};
 use ::render::cpu::Renderer;
-use dataset::synth::{CitySettings, write_city};
+use city::{CitySettings, Traffic};
+use dataset::rehearse::{self, Settings, Summary};
 use glam::DVec3;
 use serde::Serialize;
 use store::Store;
@@ -46,11 +47,13 @@ pub(crate) fn run(args: &DemoArgs, output: &Output) -> Result<(), Failure> {
 pub(crate) fn build(args: &DemoArgs, output: &Output) -> Result<Built, Failure> {
     let city_folder = args.out.join("city");
     let (city, train_args) = settings(args);
-    output.note(format!("building a city of {:.0} m and taking {} photos of it", city.extent_metres, city.views));
-    let progress = output.progress("city", u64::from(city.views));
-    let built = write_city(&city_folder, &city, |done, _| progress.at(done as u64, ""))?;
-    drop(progress);
-    output.note(format!("{} solids, {} photos, {} sparse points", built.solids, built.views, built.points));
+    let metres = city.city.extent_metres();
+    output.note(format!("building a city of {metres:.0} m and taking {} photos of it", city.views));
+    let built = rehearsed(&city_folder, &city, output)?;
+    output.note(format!(
+        "{} things in {} triangles, {} photos, {} sparse points",
+        built.actors, built.triangles, built.views, built.points
+    ));
 
     let trained = train(&train_args, output)?;
     let store = Store::open(&args.out.join("store").display().to_string())?.blocking();
@@ -72,14 +75,13 @@ pub(crate) fn build(args: &DemoArgs, output: &Output) -> Result<Built, Failure> 
     report.record.measured(&evaluated.record);
     report.record.command = "demo";
     let text = format!(
-        "a city of {:.0} m in {} splats and {} blocks, {:.1} dB PSNR and {:.3} SSIM on {} held-out photos,\n\
+        "a city of {metres:.0} m in {} splats and {} blocks, {:.1} dB PSNR and {:.3} SSIM on {} held-out photos,\n\
          trained in {:.0} CPU seconds ({:.0} seconds)\n\n\
          from above          {}\n\
          from the south      {}\n\
          photo|render|error  {}\n\
          the plan            {}\n\
          the model           {} (any splat viewer opens it)",
-        city.extent_metres,
         report.record.splats,
         report.tasks,
         report.record.psnr.unwrap_or_default(),
@@ -98,11 +100,18 @@ pub(crate) fn build(args: &DemoArgs, output: &Output) -> Result<Built, Failure> 
     Ok(Built { shown, text, curve: trained.curve })
 }
 
+/// Photographs the city, in the place of an older one.
+pub(crate) fn rehearsed(folder: &Path, settings: &Settings, output: &Output) -> Result<Summary, Failure> {
+    let bars = output.stages();
+    Ok(rehearse::replace(folder, settings, &|what, done, total| bars.at(what, done, total))?)
+}
+
 /// The city and how it is trained.
-pub(crate) fn settings(args: &DemoArgs) -> (CitySettings, TrainArgs) {
-    let whole = CitySettings::default();
+pub(crate) fn settings(args: &DemoArgs) -> (Settings, TrainArgs) {
+    let city = CitySettings { traffic: Traffic::Light, ..CitySettings::default() };
+    let whole = Settings { city, views: 320, width: 240, height: 160, aerial: 0.4, ..Settings::default() };
     let (city, steps, budget) = if args.quick {
-        (CitySettings { extent_metres: 100.0, views: 64, width: 160, height: 112, ..whole }, 2500, 20_000)
+        (Settings { views: 96, width: 160, height: 112, ..whole }, 2500, 20_000)
     } else {
         (whole, 8000, 60_000)
     };
@@ -116,7 +125,7 @@ pub(crate) fn settings(args: &DemoArgs) -> (CitySettings, TrainArgs) {
             steps: Auto(Some(steps)),
             budget: Auto(Some(budget)),
             tolerance_db: 0.1,
-            residual: 0.25,
+            residual: 0.4,
             seed: 0,
             antialiased: false,
             exposure: false,

@@ -9,4 +9,5 @@ pub(crate) mod kernels;
 pub(crate) mod plan;
 pub(crate) mod prune;
 pub(crate) mod render;
+pub(crate) mod synth;
 pub(crate) mod train;

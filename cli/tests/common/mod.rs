@@ -4,7 +4,8 @@
 use std::path::Path;
 use std::process::{Command, Output};
 
-use dataset::synth::{CitySettings, write_city};
+use city::{CitySettings, Layout, Traffic};
+use dataset::rehearse::{self, Settings};
 use serde_json::Value;
 
 /// The program in a folder with these words, not yet run.
@@ -46,8 +47,13 @@ pub(crate) fn stopped(command: &mut Command, code: i32, wanted: &str) {
     assert!(output.stdout.is_empty(), "{command:?}");
 }
 
+/// A small city where nothing moves, mostly from the air, so that few photos show all of it.
+pub(crate) fn small(views: u32, width: u32, height: u32) -> Settings {
+    let city = CitySettings { seed: 3, layout: Layout::Grid, traffic: Traffic::None, ..CitySettings::default() };
+    Settings { city, views, width, height, aerial: 0.75, ..Settings::default() }
+}
+
 /// Writes the capture of a small city into the folder `city`.
 pub(crate) fn city(folder: &Path, views: u32, width: u32, height: u32) {
-    let settings = CitySettings { seed: 3, extent_metres: 80.0, views, width, height, plain: 0.0 };
-    write_city(&folder.join("city"), &settings, |_, _| {}).unwrap();
+    rehearse::write(&folder.join("city"), &small(views, width, height), &|_, _, _| ()).unwrap();
 }

@@ -1,5 +1,6 @@
 use std::path::Path;
 
+use city::{CitySettings, Traffic};
 use glam::DVec3;
 use image::{GrayImage, RgbImage};
 
@@ -8,13 +9,14 @@ use super::*;
 mod formats;
 mod reprojection;
 
-use crate::synth::{CitySettings, write_city};
-
-const CITY: CitySettings = CitySettings { seed: 3, extent_metres: 90.0, views: 24, width: 48, height: 32, plain: 0.0 };
+use crate::rehearse::{self, Settings};
 
 fn city() -> tempfile::TempDir {
     let folder = tempfile::tempdir().unwrap();
-    write_city(folder.path(), &CITY, |_, _| ()).unwrap();
+    // Nothing moves, so that photos have no masks.
+    let city = CitySettings { traffic: Traffic::None, ..CitySettings::default() };
+    let settings = Settings { city, views: 24, width: 48, height: 32, ..Settings::default() };
+    rehearse::write(folder.path(), &settings, &|_, _, _| ()).unwrap();
     folder
 }
 
@@ -105,6 +107,7 @@ fn masks_beside_the_images_are_found() {
 #[test]
 fn the_origin_comes_from_either_file() {
     let folder = city();
+    std::fs::remove_file(folder.path().join("reference_lla.json")).unwrap();
     let origin = |name: &str, text: &str| {
         std::fs::write(folder.path().join(name), text).unwrap();
         opened(folder.path()).map(|source| source.capture.geo_origin)

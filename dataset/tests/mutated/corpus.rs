@@ -4,9 +4,11 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::rc::Rc;
 
+use city::{CitySettings, Traffic};
 use dataset::ingest;
+use dataset::mips;
 use dataset::open::{self, OpenOptions};
-use dataset::{mips, synth};
+use dataset::rehearse::{self, Settings};
 use glam::Vec3;
 use image::{DynamicImage, ImageFormat, Rgb, RgbImage, Rgba, RgbaImage};
 use scene::frame;
@@ -183,8 +185,9 @@ impl Corpus {
 
     fn written(&mut self) {
         let folder = tempfile::tempdir().expect("a folder");
-        let city = synth::CitySettings { seed: 3, extent_metres: 90.0, views: 24, width: 48, height: 32, plain: 0.0 };
-        synth::write_city(folder.path(), &city, |_, _| ()).expect("a city");
+        let city = CitySettings { traffic: Traffic::None, ..CitySettings::default() };
+        let settings = Settings { city, views: 24, width: 48, height: 32, ..Settings::default() };
+        rehearse::write(folder.path(), &settings, &|_, _, _| ()).expect("a city");
         for (name, codec) in ["cameras", "images", "points3D"].into_iter().zip(&colmap_binary()) {
             let bytes = fs::read(folder.path().join(format!("sparse/0/{name}.bin"))).expect("the city has it");
             self.plain(&format!("city {name}.bin"), bytes, codec);

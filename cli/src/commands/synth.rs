@@ -1,0 +1,79 @@
+//! `plat synth`: a capture of a city that was never built.
+
+use std::path::PathBuf;
+
+use ::bench::write_png;
+use city::CitySettings;
+use city::faults::Fault;
+use dataset::rehearse::{self, Settings, Summary};
+use serde::Serialize;
+
+use crate::args::SynthArgs;
+use crate::failure::Failure;
+use crate::output::Output;
+
+#[derive(Serialize)]
+struct Shown {
+    out: PathBuf,
+    #[serde(flatten)]
+    summary: Summary,
+}
+
+#[derive(Serialize)]
+struct Drawn {
+    gallery: PathBuf,
+}
+
+pub(crate) fn run(args: &SynthArgs, output: &Output) -> Result<(), Failure> {
+    let settings = settings(args);
+    settings.check()?;
+    let stages = output.stages();
+    let progress = |what, done, total| stages.at(what, done, total);
+    if let Some(file) = &args.gallery {
+        write_png(file, &rehearse::gallery(&settings, &progress)?)?;
+        drop(stages);
+        return output.result(&Drawn { gallery: file.clone() }, &file.display().to_string());
+    }
+    let out = args.out.clone().ok_or_else(|| Failure::Input("--out is missing: say where the capture goes".into()))?;
+    output.note(format!("building a city of {} km² and taking {} photos of it", args.area_km2, args.views));
+    let summary = rehearse::write(&out, &settings, &progress)?;
+    drop(stages);
+    let text = format!(
+        "{} photos of {} things, {} of them moving, in {} triangles; {} sparse points, each in {:.1} views\n\n\
+         the capture         {} (plat train reads it)\n\
+         what is in it       {}",
+        summary.views,
+        summary.actors,
+        summary.moving,
+        summary.triangles,
+        summary.points,
+        summary.mean_track,
+        out.display(),
+        out.join("manifest.json").display(),
+    );
+    output.result(&Shown { out, summary }, &text)
+}
+
+fn settings(args: &SynthArgs) -> Settings {
+    Settings {
+        city: CitySettings {
+            seed: args.seed,
+            area_km2: args.area_km2,
+            layout: args.layout,
+            traffic: args.traffic,
+            plain: args.plain,
+        },
+        views: args.views,
+        width: args.size.width,
+        height: args.size.height,
+        aerial: args.aerial,
+        fixed: args.fixed,
+        faults: args.fault.iter().map(|fault| Fault { seed: args.seed, ..*fault }).collect(),
+        truth: args.truth,
+        lidar: args.lidar,
+        radar: args.radar,
+        mesh: args.mesh,
+        occupancy: args.occupancy,
+        around: args.occupancy_around.clone(),
+    }
+}

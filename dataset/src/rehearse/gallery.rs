@@ -1,0 +1,234 @@
+//! One picture of what rehearsals can show: every layout, every kind of label, every fault. Streets are shown where the most
+//! goes on.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use city::faults::{self, Fault, Kind};
+use city::random::bits;
+use city::sense::rig::{Rig, drive};
+use city::sense::{Shot, looking, pinhole};
+use city::trace::{Frame, Options, World, frame};
+use city::{City, CitySettings, Layout};
+use font8x8::legacy::BASIC_LEGACY;
+use glam::{DVec3, Vec3};
+use image::{Rgb, RgbImage};
+use rayon::prelude::*;
+
+use super::views::views;
+use super::{Progress, RehearseError, Settings, impossible};
+
+/// Tiles in a row.
+const COLUMNS: u32 = 6;
+/// Places along streets that are tried for a lively one.
+const PLACES: usize = 64;
+/// Height of the line above each tile, pixels.
+const CAPTION: u32 = 12;
+
+/// Draws the gallery of a city's settings, its tiles as large as the photos.
+///
+/// # Errors
+/// Settings out of range.
+pub fn gallery(settings: &Settings, progress: Progress) -> Result<RgbImage, RehearseError> {
+    settings.check()?;
+    let (mut tiles, total) = (Vec::new(), 2 * Layout::ALL.len() + 8 + Kind::ALL.len());
+    let add = |tiles: &mut Vec<(String, RgbImage)>, name: String, tile| {
+        tiles.push((name, tile));
+        progress("gallery", tiles.len(), total);
+    };
+    for &layout in Layout::ALL {
+        let city = City::generate(&CitySettings { layout, ..settings.city })?;
+        let world = World::new(&city).map_err(|e| impossible(&e))?;
+        for (from, shot) in [("above", above(&city, settings)?), ("the street", street(&world, settings)?.0)] {
+            add(&mut tiles, format!("{layout} from {from}"), photo(&take(&world, &shot, &[])?));
+        }
+    }
+    let city = City::generate(&settings.city)?;
+    let world = World::new(&city).map_err(|e| impossible(&e))?;
+    let (shot, drive) = street(&world, settings)?;
+    let taken = take(&world, &shot, &[])?;
+    for (name, tile) in labels(&taken) {
+        add(&mut tiles, name.to_owned(), tile);
+    }
+    for &kind in Kind::ALL {
+        let faults = [Fault { kind, strength: 1.0, seed: settings.city.seed }];
+        let (caption, tile) = match kind {
+            Kind::ExposureDrift => ("most, least", drift(&world, &shot, &drive, &faults)?),
+            Kind::PoseNoise => ("reported over true", ghost(&world, &shot, &faults)?),
+            Kind::SparseViews | Kind::SensorDropout => ("red is lost", map(&world, settings, &faults)?),
+            Kind::MovingUnmasked => ("red is forgotten", {
+                over(&take(&world, &shot, &faults)?, |frame, i| frame.moves[i] != 0 && frame.mask[i] == 0)
+            }),
+            _ => ("", photo(&take(&world, &spoilt(&shot, &faults), &faults)?)),
+        };
+        let colon = if caption.is_empty() { "" } else { ": " };
+        add(&mut tiles, format!("{kind}{colon}{caption}"), tile);
+    }
+    Ok(sheet(settings, &tiles))
+}
+
+fn take(world: &World, shot: &Shot, faults: &[Fault]) -> Result<Frame, RehearseError> {
+    let options = Options { samples: 3, faults: faults.to_vec(), ..Options::default() };
+    Ok(frame(world, shot, &options).map_err(|e| impossible(&e))?)
+}
+
+/// The city from a corner, all of it.
+fn above(city: &City, settings: &Settings) -> Result<Shot, RehearseError> {
+    let lens = pinhole(settings.width, settings.height, 60.0).map_err(|e| impossible(&e))?;
+    let from = city.extent_metres * DVec3::new(-0.62, -0.62, 0.6);
+    Ok(Shot::new("above".into(), "above", 5.0, looking(lens, from, -from.with_z(from.z * 1.08), DVec3::Z)))
+}
+
+/// Ahead from a car, where of some places along all streets the most goes on; and all that the car sees on its way.
+fn street(world: &World, settings: &Settings) -> Result<(Shot, Vec<Shot>), RehearseError> {
+    let city = world.city();
+    let mut rig = Rig { width: settings.width, height: settings.height, fleet: true, ..Rig::default() };
+    rig.cameras.truncate(1);
+    rig.field_degrees = 80.0;
+    let shots = drive(city, &rig).map_err(|e| impossible(&e))?;
+    // streets run to the horizon, the city does not
+    let within = |shot: &&Shot| shot.camera.centre().truncate().abs().max_element() < 0.4 * city.extent_metres;
+    let inside: Vec<&Shot> = shots.iter().filter(within).collect();
+    let tried: Vec<&Shot> = inside.iter().copied().step_by(inside.len().div_ceil(PLACES).max(1)).collect();
+    let lens = pinhole(96, 54, 80.0).map_err(|e| impossible(&e))?;
+    let sketch = Options { samples: 1, corners: false, ..Options::default() };
+    let life = |shot: &&Shot| -> Result<f64, RehearseError> {
+        let mut small = (*shot).clone();
+        small.camera.pinhole = lens;
+        Ok(liveliness(&frame(world, &small, &sketch).map_err(|e| impossible(&e))?))
+    };
+    let lives: Vec<f64> = tried.par_iter().map(life).collect::<Result<_, _>>()?;
+    let best = tried.iter().zip(&lives).rev().max_by(|a, b| a.1.total_cmp(b.1));
+    let Some((&best, _)) = best else { return Ok((above(city, settings)?, Vec::new())) };
+    // shots of a street are named by it: front-left-STREET-NUMBER
+    let street = |shot: &Shot| shot.name.rsplit('-').nth(1).map(str::to_owned);
+    let leg = shots.iter().filter(|shot| street(shot) == street(best)).cloned().collect();
+    Ok((best.clone(), leg))
+}
+
+/// How much goes on in a picture: things count that move, and those that could a little; large ones not much more than
+/// small ones, and the first of a class more than the next.
+fn liveliness(frame: &Frame) -> f64 {
+    let mut things: BTreeMap<(u8, u32), (f64, f64)> = BTreeMap::new();
+    for (i, &instance) in frame.first.instance.iter().enumerate().filter(|(_, instance)| **instance != 0) {
+        let thing = things.entry((frame.first.semantic[i], instance)).or_default();
+        thing.0 += 1.0;
+        thing.1 = if frame.moves[i] != 0 { 1.0 } else { 0.1 };
+    }
+    let mut classes: BTreeMap<u8, Vec<f64>> = BTreeMap::new();
+    for ((class, _), (pixels, weight)) in things {
+        classes.entry(class).or_default().push(weight * pixels.sqrt().min(9.0));
+    }
+    let of_class = |mut all: Vec<f64>| {
+        all.sort_by(|a, b| b.total_cmp(a));
+        all.iter().zip(1..).map(|(life, nth)| life / f64::from(nth)).sum::<f64>()
+    };
+    classes.into_values().map(of_class).sum()
+}
+
+fn spoilt(shot: &Shot, faults: &[Fault]) -> Shot {
+    faults::spoil_shots(vec![shot.clone()], faults).pop().unwrap_or_else(|| shot.clone())
+}
+
+/// The shot with the highest gain of its drive at the left, with the lowest at the right.
+fn drift(world: &World, shot: &Shot, drive: &[Shot], faults: &[Fault]) -> Result<RgbImage, RehearseError> {
+    let gains: Vec<f32> = faults::spoil_shots(drive.to_vec(), faults).iter().map(|shot| shot.exposure).collect();
+    let with = |exposure: Option<f32>| {
+        take(world, &Shot { exposure: exposure.unwrap_or(shot.exposure), ..shot.clone() }, &[])
+            .map(|frame| photo(&frame))
+    };
+    let mut tile = with(gains.iter().copied().max_by(f32::total_cmp))?;
+    let dark = with(gains.iter().copied().min_by(f32::total_cmp))?;
+    let half = i64::from(tile.width() / 2);
+    let right = image::imageops::crop_imm(&dark, half as u32, 0, tile.width() - half as u32, tile.height()).to_image();
+    image::imageops::replace(&mut tile, &right, half, 0);
+    Ok(tile)
+}
+
+/// What the reported camera would see, over what the true one saw.
+fn ghost(world: &World, shot: &Shot, faults: &[Fault]) -> Result<RgbImage, RehearseError> {
+    let spoilt = spoilt(shot, faults);
+    let seen = take(world, &spoilt, &[])?;
+    let told = take(world, &Shot { camera: spoilt.reported, ..spoilt }, &[])?;
+    Ok(picture(&seen, |i| [0, 1, 2].map(|c| seen.rgb[3 * i + c].midpoint(told.rgb[3 * i + c]))))
+}
+
+fn picture(frame: &Frame, pixel: impl Fn(usize) -> [u8; 3]) -> RgbImage {
+    RgbImage::from_fn(frame.width, frame.height, |x, y| Rgb(pixel((y * frame.width + x) as usize)))
+}
+
+fn photo(frame: &Frame) -> RgbImage {
+    picture(frame, |i| [0, 1, 2].map(|c| frame.rgb[3 * i + c]))
+}
+
+/// The photo with something in red.
+fn over(frame: &Frame, is_red: impl Fn(&Frame, usize) -> bool) -> RgbImage {
+    picture(frame, |i| {
+        let [r, g, b] = [0, 1, 2].map(|c| frame.rgb[3 * i + c]);
+        if is_red(frame, i) { [255, g / 3, b / 3] } else { [r, g, b] }
+    })
+}
+
+/// A colour for a number; black for nothing.
+fn colour(n: u32, nothing: u32) -> [u8; 3] {
+    let [r, g, b, ..] = bits(11, u64::from(n)).to_le_bytes();
+    if n == nothing { [0; 3] } else { [r, g, b].map(|c| 48 + c / 5 * 4) }
+}
+
+fn labels(frame: &Frame) -> [(&'static str, RgbImage); 8] {
+    let near = |depth: f32| if depth > 0.0 { [(255.0 / (1.0 + depth / 12.0)) as u8; 3] } else { [0; 3] };
+    let direction = |normal: [f32; 3]| {
+        let n = Vec3::from(normal);
+        if n == Vec3::ZERO { [0; 3] } else { (127.5 * (n + 1.0)).to_array().map(|c| c as u8) }
+    };
+    let (first, behind) = (&frame.first, &frame.behind);
+    [
+        ("photo", photo(frame)),
+        ("depth", picture(frame, |i| near(first.depth[i]))),
+        ("normals", picture(frame, |i| direction(frame.normals[i]))),
+        ("semantic", picture(frame, |i| colour(first.semantic[i].into(), city::Class::Sky as u32))),
+        ("instance", picture(frame, |i| colour(first.instance[i], 0))),
+        ("material", picture(frame, |i| colour(first.material[i].into(), u32::from(u16::MAX)))),
+        ("behind glass", picture(frame, |i| colour(behind.material[i].into(), u32::from(u16::MAX)))),
+        ("what moves", over(frame, |frame, i| frame.moves[i] != 0)),
+    ]
+}
+
+/// The city from straight above with the places of cameras: white those that are kept, red those that are lost.
+fn map(world: &World, settings: &Settings, faults: &[Fault]) -> Result<RgbImage, RehearseError> {
+    let lens = pinhole(settings.width, settings.height, 60.0).map_err(|e| impossible(&e))?;
+    let height = 0.6 * world.city().extent_metres * lens.fx / f64::from(lens.height.min(lens.width));
+    let nadir = looking(lens, DVec3::Z * height * 1.2, DVec3::NEG_Z, DVec3::Y);
+    let mut map = photo(&take(world, &Shot::new("map".into(), "map", 5.0, nadir), &[])?);
+    let planned = views(world, settings)?.shots;
+    let kept: BTreeSet<String> =
+        faults::spoil_shots(planned.clone(), faults).into_iter().map(|shot| shot.name).collect();
+    for shot in &planned {
+        let colour = if kept.contains(&shot.name) { [255; 3] } else { [255, 0, 0] };
+        let (pixel, _) = nadir.project(shot.camera.centre().with_z(0.0));
+        for (dx, dy) in (0..9).map(|i| (f64::from(i % 3) - 1.0, f64::from(i / 3) - 1.0)) {
+            let (x, y) = ((pixel.x + dx).max(0.0) as u32, (pixel.y + dy).max(0.0) as u32);
+            if let Some(dot) = map.get_pixel_mut_checked(x, y) {
+                *dot = Rgb(colour);
+            }
+        }
+    }
+    Ok(map)
+}
+
+fn sheet(settings: &Settings, tiles: &[(String, RgbImage)]) -> RgbImage {
+    let (width, height) = (settings.width + 2, settings.height + CAPTION);
+    let rows = (tiles.len() as u32).div_ceil(COLUMNS);
+    let mut sheet = RgbImage::from_pixel(COLUMNS * width, rows * height, Rgb([24; 3]));
+    for (i, (name, tile)) in (0..).zip(tiles) {
+        let (left, top) = (i % COLUMNS * width, i / COLUMNS * height);
+        image::imageops::replace(&mut sheet, tile, left.into(), (top + CAPTION).into());
+        for (letter, at) in name.chars().zip(0..settings.width / 8) {
+            for (y, row) in (0..).zip(BASIC_LEGACY[letter as usize & 127]) {
+                for x in (0..8).filter(|x| row >> x & 1 == 1) {
+                    sheet.put_pixel(left + 8 * at + x, top + 2 + y, Rgb([230; 3]));
+                }
+            }
+        }
+    }
+    sheet
+}

@@ -1,0 +1,142 @@
+//! What moves and what photos show of things that are counted: `tracks.json` and `boxes3d.json`. Both have a line for each
+//! entry, so that they can be read piece by piece.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use city::sense::Shot;
+use city::trace::{Frame, motion};
+use city::{Actor, City, Class};
+use glam::{DQuat, DVec3, Vec3};
+use scene::Rigid;
+use serde_json::{Value, json};
+use store::file::{SaveError, save};
+
+/// Poses of a track are of the time in which photos are taken, and of so many seconds before and after.
+const MARGIN_SECONDS: f64 = 2.0;
+
+/// The classes that have boxes.
+const BOXED: [Class; 9] = [
+    Class::TrafficLight,
+    Class::TrafficSign,
+    Class::Person,
+    Class::Rider,
+    Class::Car,
+    Class::Truck,
+    Class::Bus,
+    Class::Motorcycle,
+    Class::Bicycle,
+];
+
+/// Writes the tracks of everything that moves.
+pub(super) fn tracks(out: &Path, city: &City, shots: &[Shot]) -> Result<(), SaveError> {
+    let seconds = |start: f64, pick: fn(f64, f64) -> f64| shots.iter().map(|shot| shot.seconds).fold(start, pick);
+    let (from, to) = (seconds(f64::INFINITY, f64::min), seconds(f64::NEG_INFINITY, f64::max));
+    let track = |actor: &Actor| {
+        let path = &actor.trajectory.as_ref()?.waypoints;
+        // one pose before and one after what is wanted, so that it can be interpolated
+        let first = path.partition_point(|w| w.seconds < from - MARGIN_SECONDS).saturating_sub(1);
+        let last = (path.partition_point(|w| w.seconds <= to + MARGIN_SECONDS) + 1).min(path.len());
+        let poses = path.get(first..last)?.iter().map(|w| {
+            let Rigid { rotation: q, translation: t } = w.world_from_asset;
+            json!([round(w.seconds, 1e3), metres(t), turn(q)])
+        });
+        let (low, high) = bounds(city, actor.asset)?;
+        Some(json!({
+            "instance": actor.instance,
+            "class": actor.class,
+            "asset": city.assets.get(actor.asset as usize)?.name,
+            "low": metres(low.as_dvec3()),
+            "high": metres(high.as_dvec3()),
+            "poses": poses.collect::<Vec<Value>>(),
+        }))
+    };
+    let lines = city.actors.iter().filter_map(track).map(|value| value.to_string());
+    let about = "poses: [seconds, [x, y, z], quaternion [x, y, z, w]], world_from_object, straight and by slerp between \
+                 them; low, high: the object's corners in its own axes (x ahead, y left, z up), metres";
+    save(&out.join("tracks.json"), listed("tracks", about, lines).as_bytes())
+}
+
+/// Writes the boxes, of which [`Instances::boxes`] made a line for each shot.
+pub(super) fn boxes(out: &Path, lines: &[String]) -> Result<(), SaveError> {
+    let about = "centre, size and rotation (quaternion [x, y, z, w]) of world_from_box, metres; x ahead, y left, z up; \
+                 velocity in the world, m/s; pixels: how many show it; box2d: [left, top, right, bottom] of those";
+    save(&out.join("boxes3d.json"), listed("images", about, lines.iter().cloned()).as_bytes())
+}
+
+/// An object with a word about it and a list, a line for each entry.
+fn listed(name: &str, about: &str, lines: impl Iterator<Item = String>) -> String {
+    let lines: Vec<String> = lines.collect();
+    format!("{{\"about\": {}, \"{name}\": [\n{}\n]}}\n", json!(about), lines.join(",\n"))
+}
+
+/// The city's things by their instance.
+pub(super) struct Instances<'a> {
+    city: &'a City,
+    actors: BTreeMap<u32, &'a Actor>,
+}
+
+/// What a photo shows of a thing.
+struct Shown {
+    pixels: u32,
+    /// Left, top, right and bottom; the last two are one beyond.
+    around: [u32; 4],
+}
+
+impl<'a> Instances<'a> {
+    pub(super) fn new(city: &'a City) -> Self {
+        let boxed = city.actors.iter().filter(|actor| actor.instance > 0 && BOXED.contains(&actor.class));
+        Self { city, actors: boxed.map(|actor| (actor.instance, actor)).collect() }
+    }
+
+    /// A line about what the photo shows, by instance.
+    pub(super) fn boxes(&self, shot: &Shot, frame: &Frame) -> String {
+        let mut shown: BTreeMap<u32, Shown> = BTreeMap::new();
+        for (i, instance) in (0..).zip(&frame.first.instance).filter(|(_, instance)| **instance > 0) {
+            let (x, y) = (i % frame.width, i / frame.width);
+            let thing = shown.entry(*instance).or_insert(Shown { pixels: 0, around: [x, y, x, y] });
+            let [left, top, right, bottom] = thing.around;
+            thing.pixels += 1;
+            thing.around = [left.min(x), top.min(y), right.max(x + 1), bottom.max(y + 1)];
+        }
+        let boxes: Vec<Value> = shown.iter().filter_map(|(instance, shown)| self.one(shot, *instance, shown)).collect();
+        json!({ "image": format!("images/{}.png", shot.name), "seconds": shot.seconds, "boxes": boxes }).to_string()
+    }
+
+    fn one(&self, shot: &Shot, instance: u32, shown: &Shown) -> Option<Value> {
+        let actor = self.actors.get(&instance)?;
+        let pose = motion::pose_at(actor, shot.seconds);
+        let (low, high) = bounds(self.city, motion::asset_at(actor, shot.seconds))?;
+        let centre = pose.apply((0.5 * (low + high)).as_dvec3());
+        Some(json!({
+            "instance": instance,
+            "class": actor.class,
+            "moves": actor.trajectory.is_some(),
+            "centre": metres(centre),
+            "size": metres((high - low).as_dvec3()),
+            "rotation": turn(pose.rotation),
+            "velocity": metres(motion::velocity_at(actor, shot.seconds, centre)),
+            "pixels": shown.pixels,
+            "box2d": shown.around,
+        }))
+    }
+}
+
+/// Lowest and highest corner of an asset, in its own axes.
+fn bounds(city: &City, asset: u32) -> Option<(Vec3, Vec3)> {
+    let positions = &city.assets.get(asset as usize)?.mesh.positions;
+    let first = *positions.first()?;
+    Some(positions.iter().fold((first, first), |(low, high), p| (low.min(*p), high.max(*p))))
+}
+
+fn metres(v: DVec3) -> [f64; 3] {
+    v.to_array().map(|c| round(c, 1e3))
+}
+
+fn turn(q: DQuat) -> [f64; 4] {
+    [q.x, q.y, q.z, q.w].map(|c| round(c, 1e6))
+}
+
+fn round(value: f64, parts: f64) -> f64 {
+    (value * parts).round() / parts
+}
