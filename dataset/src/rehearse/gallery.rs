@@ -38,13 +38,13 @@ pub fn gallery(settings: &Settings, progress: Progress) -> Result<RgbImage, Rehe
     for &layout in Layout::ALL {
         let city = City::generate(&CitySettings { layout, ..settings.city })?;
         let world = World::new(&city).map_err(|e| impossible(&e))?;
-        for (from, shot) in [("above", above(&city, settings)?), ("the street", street(&world, settings)?.0)] {
+        for (from, shot) in [("above", above(&city, settings)?), ("the street", street(&world, settings)?)] {
             add(&mut tiles, format!("{layout} from {from}"), photo(&take(&world, &shot, &[])?));
         }
     }
     let city = City::generate(&settings.city)?;
     let world = World::new(&city).map_err(|e| impossible(&e))?;
-    let (shot, drive) = street(&world, settings)?;
+    let shot = street(&world, settings)?;
     let taken = take(&world, &shot, &[])?;
     for (name, tile) in labels(&taken) {
         add(&mut tiles, name.to_owned(), tile);
@@ -52,7 +52,7 @@ pub fn gallery(settings: &Settings, progress: Progress) -> Result<RgbImage, Rehe
     for &kind in Kind::ALL {
         let faults = [Fault { kind, strength: 1.0, seed: settings.city.seed }];
         let (caption, tile) = match kind {
-            Kind::ExposureDrift => ("most, least", drift(&world, &shot, &drive, &faults)?),
+            Kind::ExposureDrift => ("most, least", drift(&world, &shot, &faults)?),
             Kind::PoseNoise => ("reported over true", ghost(&world, &shot, &faults)?),
             Kind::SparseViews | Kind::SensorDropout => ("red is lost", map(&world, settings, &faults)?),
             Kind::MovingUnmasked => ("red is forgotten", {
@@ -78,8 +78,8 @@ fn above(city: &City, settings: &Settings) -> Result<Shot, RehearseError> {
     Ok(Shot::new("above".into(), "above", 5.0, looking(lens, from, -from.with_z(from.z * 1.08), DVec3::Z)))
 }
 
-/// Ahead from a car, where of some places along all streets the most goes on; and all that the car sees on its way.
-fn street(world: &World, settings: &Settings) -> Result<(Shot, Vec<Shot>), RehearseError> {
+/// Ahead from a car, where of some places along all streets the most goes on.
+fn street(world: &World, settings: &Settings) -> Result<Shot, RehearseError> {
     let city = world.city();
     let mut rig = Rig { width: settings.width, height: settings.height, fleet: true, ..Rig::default() };
     rig.cameras.truncate(1);
@@ -98,11 +98,7 @@ fn street(world: &World, settings: &Settings) -> Result<(Shot, Vec<Shot>), Rehea
     };
     let lives: Vec<f64> = tried.par_iter().map(life).collect::<Result<_, _>>()?;
     let best = tried.iter().zip(&lives).rev().max_by(|a, b| a.1.total_cmp(b.1));
-    let Some((&best, _)) = best else { return Ok((above(city, settings)?, Vec::new())) };
-    // shots of a street are named by it: front-left-STREET-NUMBER
-    let street = |shot: &Shot| shot.name.rsplit('-').nth(1).map(str::to_owned);
-    let leg = shots.iter().filter(|shot| street(shot) == street(best)).cloned().collect();
-    Ok((best.clone(), leg))
+    best.map_or_else(|| above(city, settings), |(&best, _)| Ok(best.clone()))
 }
 
 /// How much goes on in a picture: things count that move, and those that could a little; large ones not much more than
@@ -129,9 +125,10 @@ fn spoilt(shot: &Shot, faults: &[Fault]) -> Shot {
     faults::spoil_shots(vec![shot.clone()], faults).pop().unwrap_or_else(|| shot.clone())
 }
 
-/// The shot with the highest gain of its drive at the left, with the lowest at the right.
-fn drift(world: &World, shot: &Shot, drive: &[Shot], faults: &[Fault]) -> Result<RgbImage, RehearseError> {
-    let gains: Vec<f32> = faults::spoil_shots(drive.to_vec(), faults).iter().map(|shot| shot.exposure).collect();
+/// The shot with the highest gain of two minutes at the left, with the lowest at the right.
+fn drift(world: &World, shot: &Shot, faults: &[Fault]) -> Result<RgbImage, RehearseError> {
+    let later = (0..120).map(|i| Shot { seconds: shot.seconds + f64::from(i), ..shot.clone() }).collect();
+    let gains: Vec<f32> = faults::spoil_shots(later, faults).iter().map(|shot| shot.exposure).collect();
     let with = |exposure: Option<f32>| {
         take(world, &Shot { exposure: exposure.unwrap_or(shot.exposure), ..shot.clone() }, &[])
             .map(|frame| photo(&frame))

@@ -399,6 +399,15 @@ fn the_gallery_shows_every_layout_label_and_fault() {
         let share = differs(clean, &all[i]);
         assert!(share > 0.005, "{kind} shows in {share} of its pane");
     }
+    let light = |from: u32, to: u32| {
+        let drift = &all[2 * Layout::ALL.len() + 8];
+        (from..to).flat_map(|x| (0..54).map(move |y| f64::from(drift.get_pixel(x, y)[1]))).sum::<f64>()
+    };
+    let clean_light = |from: u32, to: u32| {
+        (from..to).flat_map(|x| (0..54).map(move |y| f64::from(clean.get_pixel(x, y)[1]))).sum::<f64>()
+    };
+    let (left, right) = (light(0, 48) / clean_light(0, 48), light(48, 96) / clean_light(48, 96));
+    assert!(left > 1.1 && right < 0.9, "the exposure drifts to {left} and {right} of the bytes");
     // every pane is drawn, and no layout twice
     for (i, a) in all.iter().enumerate() {
         assert!(a.pixels().any(|p| p != a.get_pixel(0, 0)), "pane {i} is of one colour");
