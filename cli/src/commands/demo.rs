@@ -45,7 +45,7 @@ pub(crate) fn run(args: &DemoArgs, output: &Output) -> Result<(), Failure> {
 
 /// Builds the city, trains it, measures it and draws it.
 pub(crate) fn build(args: &DemoArgs, output: &Output) -> Result<Built, Failure> {
-    let city_folder = args.out.join("city");
+    let city_folder = args.out.join("capture");
     let (city, train_args) = settings(args);
     let metres = city.city.extent_metres();
     output.note(format!("building a city of {metres:.0} m and taking {} photos of it", city.views));
@@ -116,7 +116,7 @@ pub(crate) fn settings(args: &DemoArgs) -> (Settings, TrainArgs) {
         (whole, 8000, 60_000)
     };
     let train = TrainArgs {
-        capture: args.out.join("city"),
+        capture: args.out.join("capture"),
         out: args.out.clone(),
         store: None,
         plan: PlanOptions {
