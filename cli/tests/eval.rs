@@ -10,7 +10,7 @@ fn cuts_and_seams_of_a_tree_are_measured() {
     let at = folder.path();
     city(at, 24, 96, 72);
     let train = |out: &str, blocks: &str| {
-        let options = ["--steps", "300", "--budget", "3000", "--levels", "1", "--threads", "1", "--tolerance-db", "0"];
+        let options = ["--steps", "600", "--budget", "3000", "--levels", "1", "--threads", "1", "--tolerance-db", "0"];
         done(at, &[&["train", "city", "--out", out, "--blocks", blocks][..], &options].concat())
     };
     train("tree", "tree");
@@ -26,7 +26,7 @@ fn cuts_and_seams_of_a_tree_are_measured() {
     // The finest level is the model itself: it loses nothing, and as many of its splats are all of them.
     assert_eq!([figure(1, "loss_db"), figure(1, "away_loss_db"), figure(1, "away_gain_db")], [0.0; 3]);
     assert_eq!((&cuts[1]["full"]["psnr"], &cuts[1]["splats"]), (&said["psnr"], &said["splats"].as_f64().into()));
-    assert!(figure(0, "loss_db") > 0.03, "{}", figure(0, "loss_db"));
+    assert!(figure(0, "loss_db") > 0.1, "{}", figure(0, "loss_db"));
     let [coarse, fine] = [0, 1].map(|cut| figure(cut, "away_mip"));
     assert!(coarse > fine, "coarser pixels fit smaller pictures: {coarse} {fine}");
     // Three ways to draw from afar, three results; which is best is for real scenes to say.

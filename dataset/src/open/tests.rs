@@ -12,10 +12,14 @@ mod reprojection;
 use crate::rehearse::{self, Settings};
 
 fn city() -> tempfile::TempDir {
+    city_of(24)
+}
+
+fn city_of(views: u32) -> tempfile::TempDir {
     let folder = tempfile::tempdir().unwrap();
     // Nothing moves, so that photos have no masks.
     let city = CitySettings { traffic: Traffic::None, ..CitySettings::default() };
-    let settings = Settings { city, views: 24, width: 48, height: 32, ..Settings::default() };
+    let settings = Settings { city, views, width: 48, height: 32, ..Settings::default() };
     rehearse::write(folder.path(), &settings, &|_, _, _| ()).unwrap();
     folder
 }

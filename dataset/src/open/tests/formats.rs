@@ -70,7 +70,8 @@ fn captures_in_splits_are_whole_and_get_points() {
 
 #[test]
 fn made_points_lie_where_the_city_is() {
-    let folder = city();
+    // So many that every place is seen from several sides, as in a capture.
+    let folder = city_of(96);
     let true_points = opened(folder.path()).unwrap().capture.points.positions;
     for name in ["points3D.bin", "points3D.txt"] {
         let _ = fs::remove_file(folder.path().join("sparse/0").join(name));
@@ -78,9 +79,9 @@ fn made_points_lie_where_the_city_is() {
     let source = opened(folder.path()).unwrap();
     let points = &source.capture.points.positions;
     assert!(source.format == "colmap without points" && points.len() > 2000);
-    // The city is 220 m wide: of its true points most have a made one near.
+    // The city is 220 m wide: of its true points nearly all have a made one near.
     let near = true_points.iter().filter(|p| points.iter().any(|q| p.distance(*q) < 8.0)).count();
-    assert!(near as f64 > 0.7 * true_points.len() as f64, "{near} of {}", true_points.len());
+    assert!(near as f64 > 0.9 * true_points.len() as f64, "{near} of {}", true_points.len());
 }
 
 #[test]
