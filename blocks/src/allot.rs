@@ -14,6 +14,9 @@ use crate::shown::Shown;
 pub(crate) const INNER_BUDGET_RATIO: f64 = 1.0 / 2.5;
 /// Splats that a task gets at least, where the whole budget allows it.
 const MIN_BUDGET: u32 = 500;
+/// What one block may have of splats. In a scene of more a step is counted as in a scene of so many: along a street, what a view
+/// has ahead of it to the city's end grows with the city, and a tree need not pay for it.
+pub(crate) const BLOCK_SPLATS: u32 = 100_000;
 /// What a height sees again counts this much of what it is the first to see.
 const SEEN_AGAIN: f64 = 0.05;
 /// What is seen above the leaves counts this many times: all below it starts from there.
@@ -117,7 +120,7 @@ pub(crate) fn set_means(
     let standings = standings(tasks, needs);
     set_budgets(tasks, &standings, settings);
     set_drawn(tasks, capture, ground);
-    let mut whole = [Task { budget: settings.budget, ..whole }];
+    let mut whole = [Task { budget: settings.budget.min(BLOCK_SPLATS), ..whole }];
     set_drawn(&mut whole, capture, ground);
     set_steps(tasks, &whole[0], &standings, capture, settings);
     set_memory(tasks, settings);

@@ -41,7 +41,8 @@ pub struct PlanSettings {
     pub levels: Option<u8>,
     /// Seeds every random number of the job.
     pub seed: u64,
-    /// Steps of full images of the whole scene; plans of all modes cost about this much.
+    /// Steps of full images of the whole scene; plans of all modes cost about this much. Trees of a scene too large for one block
+    /// (100,000 splats) cost what these steps do on so much of it, so that cost grows with the scene and not with its square.
     pub steps: u32,
     /// Splats of the merged model.
     pub budget: u32,

@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use scene::{ArtefactId, BlockId, Capture};
 
-use crate::allot::{Needs, set_means};
+use crate::allot::{BLOCK_SPLATS, Needs, set_means};
 use crate::ground::{Ground, quantile};
 use crate::lod::{context_of, finished_neighbours, training_order};
 use crate::plan::{MAX_LEVELS, Mode, Plan, PlanError, PlanSettings, Task, VERSION};
@@ -25,9 +25,7 @@ const MIN_COVERED: f64 = 0.9;
 /// Leaves that could do with fewer levels are not for less than this share of pixels that nobody saw before: where every view
 /// looks at all of them, as along a road, they cost several times what they are worth ...
 const MIN_FIRST_SEEN: f64 = 1.0 / 3.0;
-/// ... unless there is too much for one block, of splats ...
-const BLOCK_SPLATS: u64 = 200_000;
-/// ... or of pixels.
+/// ... unless there is too much for one block, of splats ([`BLOCK_SPLATS`]) or of pixels.
 const BLOCK_PIXELS: u64 = 500_000_000;
 /// A leaf is split once more where it holds this many times the points of the median leaf ...
 const CROWDED: f64 = 4.0;
@@ -199,7 +197,7 @@ impl Survey<'_> {
         let blocks = parents.len().max(1) as u64;
         let pixels: u64 = self.capture.views.iter().map(|view| view.camera.full().area()).sum();
         shown.first(&before, 0.0) >= MIN_FIRST_SEEN * shown.in_windows() as f64
-            || u64::from(budget) > BLOCK_SPLATS * blocks
+            || u64::from(budget) > u64::from(BLOCK_SPLATS) * blocks
             || pixels > BLOCK_PIXELS * blocks
     }
 
@@ -373,6 +371,22 @@ mod tests {
             let ratio = work(&plan) / work(&whole) * if is_tree { CHEAPER } else { 1.0 };
             assert!((0.95..1.10).contains(&ratio), "{mode:?} {levels}: {ratio}");
         }
+    }
+
+    #[test]
+    fn splats_beyond_a_blocks_worth_do_not_raise_the_work() {
+        let capture = aerial(8, 300.0, 8000);
+        let visits = |budget: u32| -> f64 {
+            let settings = PlanSettings { budget, ..settings(Mode::Tree, Some(2)) };
+            let plan = plan(&capture, ArtefactId::of(b"capture"), &settings, "cpu").unwrap();
+            let cost = |t: &Task| {
+                let has_children = plan.tasks.iter().any(|child| child.parent == Some(t.block));
+                f64::from(t.steps) / t.views.len() as f64 * cost_of_visits(t, has_children)
+            };
+            plan.tasks.iter().map(cost).sum()
+        };
+        let [few, many, more] = [BLOCK_SPLATS / 4, BLOCK_SPLATS, 4 * BLOCK_SPLATS].map(visits);
+        assert!(many > 1.5 * few && (0.95..1.05).contains(&(more / many)), "{few} {many} {more}");
     }
 
     #[test]

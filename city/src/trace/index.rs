@@ -5,11 +5,13 @@ use obvhs::{
     BvhBuildParams,
     aabb::Aabb,
     cwbvh::{CwBvh, builder::build_cwbvh},
-    ray::RayHit,
 };
 use scene::Rigid;
 
-use super::world::{Hit, Meets, Ray};
+use super::{
+    walk::{Boxes, walk},
+    world::{Hit, Meets, Ray},
+};
 use crate::{Material, Mesh};
 
 /// Marks a triangle that light goes through, in [`Triangle::row`].
@@ -67,7 +69,7 @@ impl Solid {
     /// The nearest triangle along a ray given in the mesh's own frame: its distance, its place in the order and the
     /// shares of its corners.
     #[inline(always)]
-    pub(super) fn cast(
+    pub(super) fn cast<B: Boxes>(
         &self,
         origin: Vec3,
         direction: Vec3,
@@ -75,19 +77,17 @@ impl Solid {
         to: f32,
         meets: Meets,
     ) -> Option<(f32, usize, Vec2)> {
-        let (mut nearest, mut found) = (to, None);
-        let unused = &mut RayHit::none();
-        self.bvh.ray_traverse(outer(origin, direction, to), unused, |_, i| {
+        let mut found = None;
+        let mut outer = outer(origin, direction, to);
+        walk!(B, self.bvh, outer, i => {
             let triangle = &self.triangles[i];
-            match triangle.meet(origin, direction) {
-                Some((t, u, v))
-                    if t > ray.from && t < nearest && !(meets == Meets::Opaque && triangle.row & CLEAR != 0) =>
-                {
-                    nearest = t;
-                    found = Some((t, i, Vec2::new(u, v)));
-                    t
-                }
-                _ => f32::INFINITY,
+            if let Some((t, u, v)) = triangle.meet(origin, direction)
+                && t > ray.from
+                && t < outer.tmax
+                && !(meets == Meets::Opaque && triangle.row & CLEAR != 0)
+            {
+                outer.tmax = t;
+                found = Some((t, i, Vec2::new(u, v)));
             }
         });
         found
@@ -95,14 +95,21 @@ impl Solid {
 
     /// Whether an opaque triangle lies on a ray given in the mesh's own frame.
     #[inline(always)]
-    pub(super) fn blocks(&self, origin: Vec3, direction: Vec3, ray: &Ray) -> bool {
-        !self.bvh.ray_traverse_miss(outer(origin, direction, ray.to), |_, i| {
-            let triangle = &self.triangles[i];
-            match triangle.meet(origin, direction) {
-                Some((t, ..)) if t > ray.from && t < ray.to && triangle.row & CLEAR == 0 => t,
-                _ => f32::INFINITY,
-            }
-        })
+    pub(super) fn blocks<B: Boxes>(&self, origin: Vec3, direction: Vec3, ray: &Ray) -> bool {
+        let outer = outer(origin, direction, ray.to);
+        'met: {
+            walk!(B, self.bvh, outer, i => {
+                let triangle = &self.triangles[i];
+                if let Some((t, ..)) = triangle.meet(origin, direction)
+                    && t > ray.from
+                    && t < ray.to
+                    && triangle.row & CLEAR == 0
+                {
+                    break 'met true;
+                }
+            });
+            false
+        }
     }
 }
 
@@ -179,21 +186,21 @@ impl Level {
         Self { bvh, places }
     }
 
-    pub(super) fn cast(&self, solids: &[Solid], ray: &Ray, meets: Meets) -> Option<Hit> {
+    #[inline(always)]
+    pub(super) fn cast<B: Boxes>(&self, solids: &[Solid], ray: &Ray, meets: Meets) -> Option<Hit> {
         let mut found: Option<(usize, usize, Vec2)> = None;
-        let mut nearest = ray.to;
-        let unused = &mut RayHit::none();
-        self.bvh.ray_traverse(outer(ray.origin, ray.direction, nearest), unused, |_, i| {
+        let mut outer = outer(ray.origin, ray.direction, ray.to);
+        walk!(B, self.bvh, outer, i => {
             let place = &self.places[i];
             let (origin, direction) = place.inside(ray);
             if let Some((t, triangle, corners)) =
-                solids[place.solid as usize].cast(origin, direction, ray, nearest, meets)
+                solids[place.solid as usize].cast::<B>(origin, direction, ray, outer.tmax, meets)
             {
-                nearest = t;
+                outer.tmax = t;
                 found = Some((i, triangle, corners));
             }
-            nearest
         });
+        let nearest = outer.tmax;
         let (place, triangle, corners) = found?;
         let place = &self.places[place];
         let met = &solids[place.solid as usize].triangles[triangle];
@@ -209,12 +216,19 @@ impl Level {
         })
     }
 
-    pub(super) fn blocks(&self, solids: &[Solid], ray: &Ray) -> bool {
-        !self.bvh.ray_traverse_miss(outer(ray.origin, ray.direction, ray.to), |_, i| {
-            let place = &self.places[i];
-            let (origin, direction) = place.inside(ray);
-            if solids[place.solid as usize].blocks(origin, direction, ray) { ray.from } else { f32::INFINITY }
-        })
+    #[inline(always)]
+    pub(super) fn blocks<B: Boxes>(&self, solids: &[Solid], ray: &Ray) -> bool {
+        let outer = outer(ray.origin, ray.direction, ray.to);
+        'met: {
+            walk!(B, self.bvh, outer, i => {
+                let place = &self.places[i];
+                let (origin, direction) = place.inside(ray);
+                if solids[place.solid as usize].blocks::<B>(origin, direction, ray) {
+                    break 'met true;
+                }
+            });
+            false
+        }
     }
 }
 

@@ -15,6 +15,7 @@ pub(crate) mod pattern;
 pub mod shade;
 #[cfg(test)]
 mod tests;
+mod walk;
 pub mod world;
 
 pub use frame::{Frame, FrameError, Layer, Options, frame};

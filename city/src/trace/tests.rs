@@ -3,8 +3,9 @@ use scene::Camera;
 
 use super::{frame::NOTHING, *};
 use crate::{
-    City, Class,
+    City, CitySettings, Class,
     faults::{self, Fault, Kind},
+    random::Random,
     sense::{Shot, looking, pinhole},
     stage,
 };
@@ -52,6 +53,27 @@ fn rays_meet_boxes_where_arithmetic_says() {
         world.at(seconds).cast(&ray, Meets::Everything).unwrap().distance
     };
     assert!((at(0.0) - 17.75).abs() < 1e-4 && (at(3.0) - 47.75).abs() < 1e-4 && (at(100.0) - 77.75).abs() < 1e-4);
+}
+
+#[test]
+fn every_instruction_set_meets_the_same() {
+    let city = City::generate(&CitySettings { area_km2: 0.05, ..CitySettings::default() }).unwrap();
+    let world = World::new(&city).unwrap();
+    let moment = world.at(3.0);
+    let mut random = Random::new(5);
+    let mut met = 0;
+    for i in 0..20_000 {
+        let origin = vec3(random.range(-120.0, 120.0), random.range(-120.0, 120.0), random.range(0.5, 60.0));
+        let direction = vec3(random.normal(), random.normal(), random.normal() - 0.5).normalize_or(Vec3::Z);
+        let ray = Ray { to: if i % 3 == 0 { 4.0 } else { f32::INFINITY }, ..Ray::new(origin, direction) };
+        let hit = moment.cast(&ray, Meets::Opaque);
+        assert_eq!(hit, moment.cast_by::<walk::Portable>(&ray, Meets::Opaque), "{ray:?}");
+        let blocked = moment.is_blocked(&ray);
+        assert_eq!(blocked, moment.is_blocked_by::<walk::Portable>(&ray), "{ray:?}");
+        assert_eq!(blocked, hit.is_some(), "{ray:?}");
+        met += u32::from(blocked);
+    }
+    assert!((5_000..19_000).contains(&met), "{met}");
 }
 
 #[test]

@@ -9,10 +9,13 @@ use obvhs::BvhBuildParams;
 use rayon::prelude::*;
 use scene::Rigid;
 
+#[cfg(target_arch = "x86_64")]
+use super::walk::Avx2;
 use super::{
     index::{CLEAR, Level, Place, SHARED, Solid, Triangle, local, rotation, turned},
     lamps::Lamps,
     motion,
+    walk::{Boxes, Portable},
 };
 use crate::{Actor, Asset, City, Class, Material, Mesh};
 
@@ -139,8 +142,9 @@ impl<'a> World<'a> {
         self.city
     }
 
-    fn ground_hit(&self, ray: &Ray, meets: Meets) -> Option<Hit> {
-        let (distance, i, corners) = self.ground.cast(ray.origin, ray.direction, ray, ray.to, meets)?;
+    #[inline(always)]
+    fn ground_hit<B: Boxes>(&self, ray: &Ray, meets: Meets) -> Option<Hit> {
+        let (distance, i, corners) = self.ground.cast::<B>(ray.origin, ray.direction, ray, ray.to, meets)?;
         let met = &self.ground.triangles[i];
         let (actor, triangle) = self.owners[(met.row & !CLEAR) as usize];
         let normal = turned(met.second.cross(met.third).normalize_or_zero(), ray.direction);
@@ -167,22 +171,54 @@ impl<'a> Moment<'a> {
 
     /// The first surface along a ray.
     pub fn cast(&self, ray: &Ray, meets: Meets) -> Option<Hit> {
-        let world = self.world;
-        let ground = world.ground_hit(ray, meets);
-        let shorter = |hit: Option<Hit>| Ray { to: hit.map_or(ray.to, |hit| hit.distance), ..*ray };
-        let still = world.standing.cast(&world.solids, &shorter(ground), meets).or(ground);
-        if self.moving.places.is_empty() {
-            return still;
+        #[cfg(target_arch = "x86_64")]
+        {
+            #[target_feature(enable = "avx2,bmi1,bmi2,lzcnt,popcnt")]
+            fn avx2(moment: &Moment, ray: &Ray, meets: Meets) -> Option<Hit> {
+                moment.cast_by::<Avx2>(ray, meets)
+            }
+            if is_wide() {
+                // SAFETY: the instructions are there.
+                return unsafe { avx2(self, ray, meets) };
+            }
         }
-        self.moving.cast(&world.solids, &shorter(still), meets).or(still)
+        self.cast_by::<Portable>(ray, meets)
     }
 
     /// True where something opaque lies on the ray: its light does not arrive.
     pub fn is_blocked(&self, ray: &Ray) -> bool {
+        #[cfg(target_arch = "x86_64")]
+        {
+            #[target_feature(enable = "avx2,bmi1,bmi2,lzcnt,popcnt")]
+            fn avx2(moment: &Moment, ray: &Ray) -> bool {
+                moment.is_blocked_by::<Avx2>(ray)
+            }
+            if is_wide() {
+                // SAFETY: the instructions are there.
+                return unsafe { avx2(self, ray) };
+            }
+        }
+        self.is_blocked_by::<Portable>(ray)
+    }
+
+    #[inline(always)]
+    pub(super) fn cast_by<B: Boxes>(&self, ray: &Ray, meets: Meets) -> Option<Hit> {
+        let world = self.world;
+        let ground = world.ground_hit::<B>(ray, meets);
+        let until = |hit: &Option<Hit>| Ray { to: hit.map_or(ray.to, |hit| hit.distance), ..*ray };
+        let still = world.standing.cast::<B>(&world.solids, &until(&ground), meets).or(ground);
+        if self.moving.places.is_empty() {
+            return still;
+        }
+        self.moving.cast::<B>(&world.solids, &until(&still), meets).or(still)
+    }
+
+    #[inline(always)]
+    pub(super) fn is_blocked_by<B: Boxes>(&self, ray: &Ray) -> bool {
         let World { solids, ground, standing, .. } = self.world;
-        standing.blocks(solids, ray)
-            || (!self.moving.places.is_empty() && self.moving.blocks(solids, ray))
-            || ground.blocks(ray.origin, ray.direction, ray)
+        standing.blocks::<B>(solids, ray)
+            || (!self.moving.places.is_empty() && self.moving.blocks::<B>(solids, ray))
+            || ground.blocks::<B>(ray.origin, ray.direction, ray)
     }
 
     /// What shines at night.
@@ -210,6 +246,18 @@ impl<'a> Moment<'a> {
         let row = self.mesh(hit).materials[hit.triangle as usize];
         (row, &self.world.city.materials[usize::from(row)])
     }
+}
+
+/// Whether this machine has the instructions of [`Avx2`].
+#[cfg(target_arch = "x86_64")]
+#[inline(always)]
+fn is_wide() -> bool {
+    // Each is one bit of a word that is read from memory; all five came with one generation.
+    is_x86_feature_detected!("avx2")
+        && is_x86_feature_detected!("bmi1")
+        && is_x86_feature_detected!("bmi2")
+        && is_x86_feature_detected!("lzcnt")
+        && is_x86_feature_detected!("popcnt")
 }
 
 /// Which assets more than one actor has, or one that moves.
