@@ -177,6 +177,12 @@ impl Ground {
         world.is_finite() && self.halo(block).contains(self.from_world(world).truncate())
     }
 
+    /// How far a place is from the block's nominal core, metres along the ground; 0 inside.
+    pub fn metres_from_core(&self, block: BlockId, world: DVec3) -> f64 {
+        let (core, at) = (self.core(block), self.from_world(world).truncate());
+        (core.min - at).max(at - core.max).max(DVec2::ZERO).length()
+    }
+
     /// The blocks of `level` in whose halo this place lies: one to four.
     pub fn halos_at(&self, level: u8, world: DVec3) -> impl Iterator<Item = BlockId> {
         let edge = self.core_edge_metres(level);

@@ -1,11 +1,12 @@
 //! The plan: an immutable, hashed list of what to do.
 
+use glam::DVec3;
 use scene::frame::{self, Kind};
 use scene::{ArtefactId, BlockId, CodecError, Rect};
 use serde::{Deserialize, Serialize};
 
 use crate::allot::first_splats;
-use crate::ground::Ground;
+use crate::ground::{Ground, HALO_SCALE};
 use crate::lod::{Cut, training_order};
 
 /// The version of [`Plan`] that this program writes and reads.
@@ -127,6 +128,23 @@ impl Task {
     /// Pixels of all training windows.
     pub fn window_pixels(&self) -> u64 {
         self.views.iter().map(|v| v.window.area()).sum()
+    }
+
+    /// The finished neighbour whose splats this place of the block's own core starts from, if not from the parent's: the nearest of
+    /// those in whose halo's inner half it lies. What a neighbour has there was trained together with what stays frozen on its side of
+    /// the face; the outer half it saw too little of.
+    pub fn lender(&self, ground: &Ground, place: DVec3) -> Option<BlockId> {
+        const INNER: f64 = 0.25 * (HALO_SCALE - 1.0);
+        if !ground.owns(self.block, place) || ground.is_far(place) {
+            return None;
+        }
+        let reach = INNER * ground.core_edge_metres(self.block.level);
+        (self.context.iter())
+            .filter(|neighbour| neighbour.level == self.block.level)
+            .map(|&neighbour| (ground.metres_from_core(neighbour, place), neighbour))
+            .filter(|&(metres, _)| metres <= reach)
+            .min_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)))
+            .map(|(_, neighbour)| neighbour)
     }
 
     /// The already trained cut of the tree around (and, as the parent, under) the block.

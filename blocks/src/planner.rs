@@ -374,6 +374,30 @@ mod tests {
     }
 
     #[test]
+    fn finished_neighbours_lend_what_lies_along_their_faces() {
+        let plan = plan_of(&aerial(8, 300.0, 8000), Mode::Tree, Some(1));
+        let ground = &plan.ground;
+        let block = |x, y| BlockId { level: 1, x, y };
+        let lender = |of: BlockId, x: f64, y: f64| {
+            // From the middle of the root, in edges of its children.
+            let at = ground.core(BlockId::ROOT).centre() + glam::DVec2::new(x, y) * ground.core_edge_metres(1);
+            plan.task(of).unwrap().lender(ground, ground.to_world(at.extend(0.0)))
+        };
+        let last = block(1, 1);
+        assert_eq!(lender(last, 0.05, 0.5), Some(block(0, 1)));
+        assert_eq!(lender(last, 0.5, 0.05), Some(block(1, 0)));
+        assert_eq!(lender(last, 0.05, 0.08), Some(block(0, 1)), "the nearer one");
+        for (x, y) in [(0.11, 0.5), (0.5, 0.11), (0.9, 0.9), (-0.05, 0.5), (0.5, -0.05), (f64::NAN, 0.5)] {
+            assert_eq!(lender(last, x, y), None, "{x} {y}");
+        }
+        // The second sweep has one finished neighbour beside it, and the first none.
+        assert_eq!(lender(block(1, 0), 0.05, -0.5), Some(block(0, 0)));
+        assert_eq!(lender(block(1, 0), 0.5, -0.05), None);
+        assert_eq!(lender(block(0, 0), -0.05, -0.5), None);
+        assert_eq!(lender(BlockId::ROOT, 0.05, 0.5), None);
+    }
+
+    #[test]
     fn splats_beyond_a_blocks_worth_do_not_raise_the_work() {
         let capture = aerial(8, 300.0, 8000);
         let visits = |budget: u32| -> f64 {

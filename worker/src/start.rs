@@ -1,8 +1,9 @@
-//! What a block's training starts from: its parent's splats and its neighbours', or points and a backdrop.
+//! What a block's training starts from: its parent's splats and, along the faces, its neighbours'; or points and a backdrop.
 
 use std::collections::BTreeMap;
 
 use blocks::Mode;
+use glam::Vec3;
 use rayon::prelude::*;
 use scene::{BlockId, SparsePoints, Splats};
 use train::{Recipe, TrainView};
@@ -47,13 +48,15 @@ impl Block<'_> {
         let cut = task.context_cut();
         let mut initial = Splats::new(sh_degree);
         let mut context = Splats::new(sh_degree);
+        let lender = |place: Vec3| task.lender(&plan.ground, place.as_dvec3());
         for (block, mut splats) in results {
             if !plan.settings.antialiased {
                 train::blur::from_full_images(&mut splats, views);
             }
+            initial.append(&splats.filter(|i| lender(splats.mean(i)) == Some(block)));
             let splats = cut.keep(&splats, &plan.ground, block);
             let inside = |i: usize| self.trains(&cut, splats.mean(i).as_dvec3());
-            initial.append(&splats.filter(inside));
+            initial.append(&splats.filter(|i| inside(i) && lender(splats.mean(i)).is_none()));
             // Only what a window can show is worth keeping in memory.
             let shown: Vec<bool> = (0..splats.len())
                 .into_par_iter()
