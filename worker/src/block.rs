@@ -16,7 +16,7 @@ use crate::cap::{Cap, Limit};
 use crate::clock::Stopwatch;
 use crate::execute::{BlockTrainer, Shared, failed};
 use crate::memory::Memory;
-use crate::merged::Judge;
+use crate::merged::{Judge, is_look};
 use crate::refine::{self, Start};
 use crate::{ExecuteError, Flow, Report, TaskOrder};
 
@@ -128,8 +128,9 @@ impl Block<'_> {
         let (mut cancelled, mut late) = (false, false);
         // Reports a step if one is due; whether to go on.
         let mut tell = |step: u32, loss: f64, splats: &Splats, last: bool| -> bool {
-            let evaluate = last || (eval_every > 0 && step.is_multiple_of(eval_every));
-            if !evaluate && !step.is_multiple_of(REPORT_EVERY) {
+            let evaluate =
+                (last && is_look(plan, self.order.task)) || (eval_every > 0 && step.is_multiple_of(eval_every));
+            if !evaluate && !last && !step.is_multiple_of(REPORT_EVERY) {
                 return true;
             }
             let (cpu_seconds, wall_seconds) = (stopwatch.cpu_seconds(), stopwatch.wall_seconds());

@@ -21,7 +21,7 @@ use crate::block::{Block, Trained};
 use crate::cap::Cap;
 use crate::clock::Stopwatch;
 use crate::memory::Memory;
-use crate::merged::{Finished, Judge};
+use crate::merged::{Finished, Judge, is_look};
 use crate::{Execute, ExecuteError, Flow, Report, TaskOrder};
 
 /// What a worker may use, and what it is asked to measure.
@@ -99,6 +99,7 @@ impl Execute for BlockTrainer {
                 let finished = &self.shared.finished;
                 finished.learn(order.plan, &plan, &results);
                 finished.insert(order.plan, &plan, task.block, &splats);
+                is_look(&plan, order.task).then_some(())?;
                 let merged = finished.with(order.plan, &plan, task.block, &splats);
                 judge.psnr(&merged).map(|psnr| (psnr, merged.len() as u64))
             });

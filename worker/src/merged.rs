@@ -16,6 +16,9 @@ use train::metrics;
 
 /// Photos are compared at the finest mip of at most this many pixels, which bounds the memory that it takes.
 const PIXELS_LIMIT: u64 = 4 << 20;
+/// The ends of tasks at which a plan's merged model is measured, about: at every one it would cost a city of many blocks more
+/// than their training.
+const LOOKS: usize = 16;
 /// Photos kept decoded.
 const CACHE_BYTES: usize = 32 << 20;
 
@@ -66,6 +69,12 @@ impl Finished {
         }
         f(&mut parts.1)
     }
+}
+
+/// Whether the merged model is measured when this row of the plan's tasks has ended; after the last it is.
+pub(crate) fn is_look(plan: &Plan, task: u32) -> bool {
+    let (done, all) = (task as usize + 1, plan.tasks.len());
+    done == all || done.is_multiple_of(all.div_ceil(LOOKS).max(1))
 }
 
 /// Who owns what among some blocks of a plan, as [`Plan::leaves`] says of all.
@@ -171,6 +180,32 @@ mod tests {
         assert_eq!(sizes(&finished.with(id, &plan, a, &four(4.0))), [1, 1, 1, 4]);
         // Another job starts anew.
         assert_eq!(sizes(&finished.with(ArtefactId([3; 32]), &plan, b, &four(3.0))), [3]);
+    }
+
+    #[test]
+    fn large_plans_are_looked_at_now_and_then_and_at_their_end() {
+        let mut plan = plan(Mode::Tree);
+        let mut looks = |count: usize| {
+            let task = blocks::Task {
+                block: BlockId::ROOT,
+                parent: None,
+                context: Vec::new(),
+                views: Vec::new(),
+                test_views: Vec::new(),
+                points: 0,
+                budget: 1,
+                drawn: 0,
+                steps: 1,
+                rho_metres: 1.0,
+                memory_bytes: 0,
+            };
+            plan.tasks = vec![task; count];
+            (0..count as u32).filter(|&i| is_look(&plan, i)).collect::<Vec<u32>>()
+        };
+        assert_eq!(looks(5), [0, 1, 2, 3, 4]);
+        assert_eq!(looks(21).len(), 11);
+        let many = looks(1365);
+        assert!(many.len() <= LOOKS + 1 && many.last() == Some(&1364), "{many:?}");
     }
 
     #[test]
