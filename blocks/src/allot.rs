@@ -23,10 +23,11 @@ const SEEN_AGAIN: f64 = 0.05;
 const INNER_COUNTS: f64 = 2.0;
 /// A block that keeps this share of its own need, because too few of its children have a task, is worked on as a leaf.
 const KEEPS_MUCH: f64 = 0.25;
-/// A step costs its pixels and this many for each splat that its window shows (as `worker`'s estimate was fitted) ...
-const PIXELS_PER_SHOWN: f64 = 10.0;
+/// A step costs its pixels and this many for each splat that its window shows (as `worker`'s estimate was fitted, at the mean
+/// resolution and number of splats of a block's schedule) ...
+const PIXELS_PER_SHOWN: f64 = 1.0;
 /// ... and for each splat at all.
-const PIXELS_PER_SPLAT: f64 = 2.3;
+const PIXELS_PER_SPLAT: f64 = 2.0;
 /// A step of a tree takes this much of what is counted, against a step on the whole scene: its blocks begin with fewer of their
 /// splats, and with coarser pixels for longer (0.81 to 1.0 on the bench's five scenes).
 pub(crate) const CHEAPER: f64 = 0.9;

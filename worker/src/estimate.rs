@@ -10,20 +10,20 @@ use std::collections::BTreeSet;
 use blocks::{Plan, Task};
 use scene::BlockId;
 use serde::Serialize;
-use train::prune;
+use train::prune::{self, Pruning};
 
 use crate::block::recipe_of;
 
 /// CPU seconds of a pixel in a step.
-const PER_PIXEL: f64 = 0.092e-6;
+const PER_PIXEL: f64 = 0.2e-6;
 /// CPU seconds of a splat that is shown in a step.
-const PER_SHOWN: f64 = 0.95e-6;
+const PER_SHOWN: f64 = 0.1e-6;
 /// CPU seconds of a splat in a step, shown or not.
-const PER_SPLAT: f64 = 0.21e-6;
+const PER_SPLAT: f64 = 0.22e-6;
 /// CPU seconds of reading a pixel of a window the first time.
-const PER_READ_PIXEL: f64 = 0.31e-6;
-/// Steps' worth of measuring, for each view of a block that is pruned.
-const MEASURING: f64 = 8.0;
+const PER_READ_PIXEL: f64 = 0.16e-6;
+/// Drawing a window without training on it, against a step.
+const LOOKING: f64 = 0.45;
 /// Splats on the way through pruning, against those before.
 const PRUNED: f64 = 0.75;
 /// Splats that a parent leaves where a child starts, against the child's budget.
@@ -94,6 +94,7 @@ pub(crate) fn cpu_seconds(plan: &Plan, task: &Task, leaf: bool) -> f64 {
         return read + f64::from(task.steps) * step;
     }
     let trained = f64::from(prune::steps_before(task.steps));
-    let healing = f64::from(task.steps) - trained + MEASURING * task.views.len() as f64;
+    let looks = Pruning::within(settings.tolerance_db).looks(task.steps, task.views.len());
+    let healing = f64::from(task.steps) - trained + LOOKING * looks as f64;
     read + trained * step + healing * (PER_PIXEL * pixels + (shown + all) * PRUNED)
 }
