@@ -30,8 +30,10 @@ pub fn merge(parts: impl IntoIterator<Item = (BlockId, Splats)>) -> Splats {
     let mut parts: Vec<(BlockId, Splats)> = parts.into_iter().collect();
     parts.sort_by_key(|(block, _)| *block);
     let mut merged = Splats::new(parts.iter().map(|(_, splats)| splats.sh_degree()).max().unwrap_or(0));
-    for (_, splats) in &parts {
-        merged.append(splats);
+    merged.reserve(parts.iter().map(|(_, splats)| splats.len()).sum());
+    // Each part is gone once it is sewn on.
+    for (_, splats) in parts {
+        merged.append(&splats);
     }
     merged
 }

@@ -409,7 +409,7 @@ mod tests {
             };
             plan.tasks.iter().map(cost).sum()
         };
-        let [few, many, more] = [BLOCK_SPLATS / 4, BLOCK_SPLATS, 4 * BLOCK_SPLATS].map(visits);
+        let [few, many, more] = [BLOCK_SPLATS / 16, BLOCK_SPLATS, 4 * BLOCK_SPLATS].map(visits);
         assert!(many > 1.5 * few && (0.95..1.05).contains(&(more / many)), "{few} {many} {more}");
     }
 

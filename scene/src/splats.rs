@@ -145,6 +145,11 @@ impl Splats {
         }
     }
 
+    /// Makes room for so many more rows, and no more than that.
+    pub fn reserve(&mut self, rows: usize) {
+        self.columns.iter_mut().for_each(|column| column.reserve_exact(rows));
+    }
+
     /// The rows with these indices, in that order.
     pub fn select(&self, rows: &[u32]) -> Self {
         let pick = |column: &Vec<f32>| rows.iter().map(|&i| column[i as usize]).collect();

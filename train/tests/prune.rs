@@ -100,7 +100,7 @@ fn with_job<R>(
         counts,
         keeps: &|_| true,
         budget: initial.len(),
-        steps: 400,
+        steps: 1400,
         antialiased: false,
         seed: 3,
         size_bounds_metres: [1e-3, 2.0],

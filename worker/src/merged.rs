@@ -36,8 +36,15 @@ impl Finished {
         self.parts(id, |parts| {
             let cut = cut_of(plan, parts.keys().copied().chain([block]));
             parts.insert(block, Splats::new(plan.settings.sh_degree));
+            let tree = plan.settings.mode == Mode::Tree;
             for (&of, part) in parts.iter_mut() {
-                *part = cut.keep(if of == block { splats } else { part }, &plan.ground, of);
+                // In a tree it takes from those above it alone.
+                let touched = !tree || (of.level < block.level && block.ancestor(of.level) == of);
+                if of == block {
+                    *part = cut.keep(splats, &plan.ground, of);
+                } else if touched {
+                    *part = cut.keep(part, &plan.ground, of);
+                }
             }
         });
     }
@@ -55,9 +62,13 @@ impl Finished {
     pub(crate) fn with(&self, id: ArtefactId, plan: &Plan, block: BlockId, splats: &Splats) -> Splats {
         self.parts(id, |parts| {
             let cut = cut_of(plan, parts.keys().copied().chain([block]));
-            let others = parts.iter().filter(|(of, _)| **of != block).map(|(&of, part)| (of, part));
-            let all = others.chain([(block, splats)]);
-            blocks::merge(all.map(|(of, part)| (of, cut.keep(part, &plan.ground, of))))
+            let mut all: BTreeMap<BlockId, &Splats> = parts.iter().map(|(&of, part)| (of, part)).collect();
+            all.insert(block, splats);
+            let mut merged = Splats::new(plan.settings.sh_degree);
+            merged.reserve(all.values().map(|part| part.len()).sum());
+            // One copy at a time.
+            all.into_iter().for_each(|(of, part)| merged.append(&cut.keep(part, &plan.ground, of)));
+            merged
         })
     }
 

@@ -199,6 +199,30 @@ fn project_lanes<L: Lanes>(
     }
 }
 
+/// Which of sixteen splats may touch the image, at a fraction of what knowing costs: as far as opaque balls of their largest
+/// scale reach. Splats near in space are near in memory, so that most groups beside a window end here.
+#[inline(always)]
+fn near_image<L: Lanes>(splats: &Splats, i: usize, view: &View, p: [L; 3]) -> u16 {
+    /// √(2 ln(1 / ALPHA_MIN)), and that times √BLUR, with a little to spare for rounding.
+    const SIGMAS: f32 = 3.34;
+    const BLUR_PIXELS: f32 = 1.9;
+    let log_scale = each!(c in [0, 1, 2] => L::load_from(splats.col(column::LOG_SCALE + c), i, 0.0));
+    let largest = log_scale[0].max(log_scale[1]).max(log_scale[2]);
+    let reach = (largest * L::splat(std::f32::consts::LOG2_E)).exp2() * L::splat(SIGMAS);
+    let inv_z = L::splat(1.0) / p[2].max(L::splat(NEAR_METRES));
+    let mut near = u16::MAX;
+    for d in 0..2 {
+        let ratio = p[d] * inv_z;
+        let u = ratio.max(L::splat(view.cone_min[d])).min(L::splat(view.cone_max[d]));
+        let focal = L::splat(view.focal[d]);
+        // A row of `J W` is f/z √(1 + u²) long.
+        let half = (focal * inv_z * reach).fma(L::splat(1.0) + u.abs(), L::splat(BLUR_PIXELS));
+        let centre = focal.fma(ratio, L::splat(view.principal[d]));
+        near &= (centre - half).le(L::splat(view.size[d])) & L::zero().le(centre + half);
+    }
+    near
+}
+
 #[inline(always)]
 fn project_group<L: Lanes>(
     splats: &Splats,
@@ -211,7 +235,7 @@ fn project_group<L: Lanes>(
     let lanes_in_use = if out.len() >= LANES { u16::MAX } else { (1 << out.len()) - 1 };
     let p = camera_point::<L>(splats, i, view);
     let in_front = L::splat(NEAR_METRES).lt(p[2]) & p[2].lt(L::splat(f32::MAX)) & lanes_in_use;
-    if in_front == 0 {
+    if in_front == 0 || in_front & near_image(splats, i, view, p) == 0 {
         return 0;
     }
     let e = ewa(splats, i, view, p);
