@@ -286,7 +286,7 @@ fn measurements_are_kept_as_lines() {
 
     std::fs::write(at.join("net.onnx"), squares(2)).unwrap();
     let pareto = ["bench", "pareto", "--label", "l", "--scene", "s", "--results", "results", "--lpips", "net.onnx"];
-    let train = ["--out", "o", "city", "--steps", "20", "--budget", "800", "--levels", "1", "--eval-every", "10"];
+    let train = ["--out", "o", "city", "--steps", "40", "--budget", "800", "--levels", "1", "--eval-every", "10"];
     let run = done(at, &[&pareto[..], &train].concat());
     assert!(
         run["lpips"].is_f64() && run["bytes_moved"].is_u64() && run["curve"].as_array().unwrap().len() > 4,
