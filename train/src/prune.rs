@@ -48,7 +48,7 @@ pub struct Pruning {
     pub order: Order,
     /// Rounds of healing before the first cut.
     pub warm_up: u32,
-    /// Rounds of cut and healing at most, before the last one.
+    /// Rounds of cut and healing at most, before the last one: fewer and longer where they would be of under 80 steps.
     pub rounds: u32,
     /// Steps of healing in a round, as a share of those of the job.
     pub healing: f32,

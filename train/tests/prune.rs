@@ -100,6 +100,7 @@ fn with_job<R>(
         counts,
         keeps: &|_| true,
         budget: initial.len(),
+        // Enough for every round: shorter jobs cut less often.
         steps: 1400,
         antialiased: false,
         seed: 3,

@@ -82,7 +82,7 @@ pub(crate) struct BenchPruneArgs {
     /// Rounds of cut and healing at most; by default as plat prune
     #[arg(long, value_name = "N")]
     pub(crate) rounds: Option<u32>,
-    /// Steps of healing in a round, as a share of the model's; by default as plat prune
+    /// Steps of healing in a round, as a share of the model's; by default as plat prune. Rounds of under 80 steps become fewer and longer
     #[arg(long, value_name = "F", value_parser = healing)]
     pub(crate) healing: Option<f32>,
     /// How far below the floor the first cut goes, dB; by default as plat prune
