@@ -39,6 +39,18 @@ pub struct Kernels {
     pub height: u32,
     /// Pairs of splat and tile.
     pub pairs: u64,
+    /// Blocks of 4×4 pixels that the rasterizer visited, each for one splat.
+    #[serde(default)]
+    pub visits: u64,
+    /// What one core can do, measured beside: fused multiply-adds, 10⁹ operations a second, a fused one counted as two.
+    #[serde(default)]
+    pub ceiling_gflops: Option<f64>,
+    /// What one core can move between memory and registers: 10⁹ bytes a second of a sum of two long arrays into a third.
+    #[serde(default)]
+    pub ceiling_gbytes: Option<f64>,
+    /// The stages.
+    #[serde(default)]
+    pub stages: Vec<StageTime>,
     /// CPU time, milliseconds.
     pub forward_cpu_millis: f64,
     /// CPU time, milliseconds.
@@ -49,6 +61,22 @@ pub struct Kernels {
     pub backward_wall_millis: f64,
     /// The command that made the line.
     pub command: String,
+}
+
+/// How long a stage takes, and how much it does in that time.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct StageTime {
+    /// Its name.
+    pub stage: String,
+    /// CPU time, milliseconds: median.
+    pub cpu_millis: f64,
+    /// Arithmetic by the count of the stage's inner loop, 10⁹ operations a second and core; null where it is not what the
+    /// stage is about.
+    pub gflops: Option<f64>,
+    /// Bytes that it must read and write at least, 10⁹ a second and core; null likewise.
+    pub gbytes: Option<f64>,
+    /// The larger of the two over its ceiling.
+    pub of_ceiling: Option<f64>,
 }
 
 /// What an ingest into an empty store took.
@@ -170,9 +198,13 @@ impl PartLine {
     fn is_finite(&self) -> bool {
         match self {
             Self::Kernels(line) => {
-                [line.forward_cpu_millis, line.backward_cpu_millis, line.forward_wall_millis, line.backward_wall_millis]
-                    .iter()
-                    .all(|millis| millis.is_finite())
+                let passes = [line.forward_cpu_millis, line.backward_cpu_millis];
+                let walls = [line.forward_wall_millis, line.backward_wall_millis];
+                let of_stages = line.stages.iter().flat_map(|stage| {
+                    [Some(stage.cpu_millis), stage.gflops, stage.gbytes, stage.of_ceiling].into_iter().flatten()
+                });
+                let ceilings = [line.ceiling_gflops, line.ceiling_gbytes].into_iter().flatten();
+                passes.into_iter().chain(walls).chain(of_stages).chain(ceilings).all(f64::is_finite)
             }
             Self::Prune(line) => (line.held_in_psnr.iter().chain(&line.held_out_psnr))
                 .chain([&line.cpu_seconds])

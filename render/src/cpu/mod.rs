@@ -8,6 +8,7 @@
 //! Every reduction runs in the order of the data, not of the threads, so results do not depend on their number.
 
 mod bin;
+pub mod ceiling;
 mod contribute;
 mod project;
 mod project_backward;
@@ -22,11 +23,24 @@ use crate::{Contributions, Frame, Gradients, Options, Upstream};
 use bin::{Bins, SortScratch, TILE};
 use project::{Projected, View};
 use project_backward::Sink;
-use rasterize::{BackwardBand, Band, Moments, TileInput};
+use rasterize::{BackwardBand, Band, Moments, TileInput, Visited};
 pub use simd::Isa;
 
 /// Splats per parallel chunk; a multiple of the lanes.
 const CHUNK: usize = 1024;
+
+/// What a pass is made of, see the [module](self).
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[allow(missing_docs)]
+pub enum Stage {
+    Project,
+    Sort,
+    Bin,
+    Rasterize,
+    RasterizeBackward,
+    Reduce,
+    ProjectBackward,
+}
 
 /// A renderer with its buffers, which it keeps from view to view.
 #[derive(Debug)]
@@ -38,8 +52,7 @@ pub struct Renderer {
     sort: SortScratch,
     ranked: Vec<Projected>,
     bins: Bins,
-    /// Pairs visited before each tile was finished.
-    visited: Vec<u32>,
+    visited: Vec<Visited>,
     moments: Vec<Moments>,
     /// Rank of each splat in depth order; only those of seen splats mean anything.
     rank: Vec<u32>,
@@ -86,16 +99,32 @@ impl Renderer {
 
     /// Draws the trainable splats and, with them, a frozen context.
     pub fn forward(&mut self, splats: &Splats, context: Option<&Splats>, camera: &Camera, options: &Options) -> &Frame {
+        self.forward_watched(splats, context, camera, options, &mut |_| ())
+    }
+
+    /// As [`forward`](Self::forward); `done` is called after each stage, for whoever has a clock.
+    pub fn forward_watched(
+        &mut self,
+        splats: &Splats,
+        context: Option<&Splats>,
+        camera: &Camera,
+        options: &Options,
+        done: &mut dyn FnMut(Stage),
+    ) -> &Frame {
         let options = Options { sh_degree: options.sh_degree.min(splats.sh_degree()), ..*options };
         let view = View::new(camera);
         self.drawn = Some((view, options, splats.len()));
         self.project(splats, context, &view, &options);
+        done(Stage::Project);
         bin::sort_by_depth(&self.records, &self.seen, &mut self.order, &mut self.sort);
         self.ranked.clear();
         self.ranked.extend(self.order.iter().map(|&i| self.records[i as usize]));
+        done(Stage::Sort);
         let (width, height) = (camera.pinhole.width as usize, camera.pinhole.height as usize);
         bin::bin(self.isa, &self.ranked, width, height, &mut self.bins);
+        done(Stage::Bin);
         self.rasterize(width, height, &options);
+        done(Stage::Rasterize);
         &self.frame
     }
 
@@ -110,11 +139,27 @@ impl Renderer {
     /// # Panics
     /// Without a forward pass before, or with another number of splats: both are errors of the caller.
     pub fn backward(&mut self, splats: &Splats, upstream: &Upstream) -> &mut Gradients {
+        self.backward_watched(splats, upstream, &mut |_| ())
+    }
+
+    /// As [`backward`](Self::backward); `done` is called after each stage, for whoever has a clock.
+    ///
+    /// # Panics
+    /// As `backward`.
+    pub fn backward_watched(
+        &mut self,
+        splats: &Splats,
+        upstream: &Upstream,
+        done: &mut dyn FnMut(Stage),
+    ) -> &mut Gradients {
         let (view, options, count) = self.drawn.expect("backward follows forward");
         assert_eq!(count, splats.len(), "backward needs the splats that forward drew");
         self.rasterize_backward(upstream);
+        done(Stage::RasterizeBackward);
         self.reduce(count);
+        done(Stage::Reduce);
         self.project_backward(splats, &view, &options);
+        done(Stage::ProjectBackward);
         &mut self.gradients
     }
 
@@ -123,9 +168,10 @@ impl Renderer {
         self.bins.pairs.len()
     }
 
-    /// Blocks of sixteen pixels that those pairs touch: an upper bound of what the rasterizer visits.
-    pub fn blocks(&self) -> usize {
-        self.bins.pairs.iter().map(|pair| pair.blocks.count_ones() as usize).sum()
+    /// Blocks of 4×4 pixels that the rasterizer visited in the last view, each for one splat: what its arithmetic is
+    /// proportional to. The backward pass visits the same.
+    pub fn visits(&self) -> u64 {
+        self.visited.iter().map(|tile| u64::from(tile.blocks)).sum()
     }
 
     fn project(&mut self, splats: &Splats, context: Option<&Splats>, view: &View, options: &Options) {
@@ -169,7 +215,7 @@ impl Renderer {
         let (red, green, blue) = (next_colour(), next_colour(), next_colour());
         let mut depth = frame.depth.chunks_mut(rows);
         let mut own = frame.own.chunks_mut(rows);
-        self.visited.resize(self.bins.tiles_x * self.bins.tiles_y, 0);
+        self.visited.resize(self.bins.tiles_x * self.bins.tiles_y, Visited::default());
         let bands: Vec<_> = (red.zip(green).zip(blue).zip(frame.transmittance.chunks_mut(rows)))
             .map(|(((red, green), blue), transmittance)| Band {
                 colour: [red, green, blue],
@@ -283,7 +329,7 @@ impl Bins {
     fn for_each_tile(
         &self,
         ranked: &[Projected],
-        visited: &[u32],
+        visited: &[Visited],
         moments: &mut Vec<Moments>,
         width: usize,
         height: usize,
@@ -305,7 +351,7 @@ impl Bins {
                 let pairs = &self.pairs[self.start[tile] as usize..self.start[tile + 1] as usize];
                 let (out, after) = std::mem::take(&mut moments).split_at_mut(pairs.len());
                 moments = after;
-                let (out, unseen) = out.split_at_mut(visited[tile] as usize);
+                let (out, unseen) = out.split_at_mut(visited[tile].pairs as usize);
                 unseen.fill(Moments::default());
                 let pairs = &pairs[..out.len()];
                 let input = TileInput { ranked, pairs, x: column * TILE, y: row * TILE, width, height };

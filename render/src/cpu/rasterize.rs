@@ -103,6 +103,15 @@ impl TileInput<'_> {
     }
 }
 
+/// What a tile's pixels took before all of them were finished.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct Visited {
+    /// Pairs.
+    pub(crate) pairs: u32,
+    /// Blocks of pixels, each for one pair.
+    pub(crate) blocks: u32,
+}
+
 /// α of sixteen pixels under a splat, zero where it is skipped; dx, dy from its mean; and the lanes where α is clamped.
 pub(crate) struct Alpha<L> {
     pub(crate) alpha: L,
@@ -156,13 +165,13 @@ pub(crate) fn lane_offsets<L: Lanes>() -> (L, L) {
 }
 
 kernel!(
-    /// Draws a tile into its band; returns how many of its pairs were visited before all pixels were finished.
-    pub(crate) fn rasterize(tile: &TileInput, background: &[f32; 3], extras: bool, band: &mut Band) -> u32
+    /// Draws a tile into its band.
+    pub(crate) fn rasterize(tile: &TileInput, background: &[f32; 3], extras: bool, band: &mut Band) -> Visited
         = rasterize_lanes
 );
 
 #[inline(always)]
-fn rasterize_lanes<L: Lanes>(tile: &TileInput, background: &[f32; 3], extras: bool, band: &mut Band) -> u32 {
+fn rasterize_lanes<L: Lanes>(tile: &TileInput, background: &[f32; 3], extras: bool, band: &mut Band) -> Visited {
     if extras {
         rasterize_tile::<L, true>(tile, background, band)
     } else {
@@ -171,7 +180,7 @@ fn rasterize_lanes<L: Lanes>(tile: &TileInput, background: &[f32; 3], extras: bo
 }
 
 #[inline(always)]
-fn rasterize_tile<L: Lanes, const EXTRAS: bool>(tile: &TileInput, background: &[f32; 3], band: &mut Band) -> u32 {
+fn rasterize_tile<L: Lanes, const EXTRAS: bool>(tile: &TileInput, background: &[f32; 3], band: &mut Band) -> Visited {
     let (mut live, mut alive) = tile.start();
     let mut last: Plane = live; // the transmittance that is kept once a pixel is finished
     let mut colour = [[[0.0; 16]; BLOCKS]; 3];
@@ -179,13 +188,14 @@ fn rasterize_tile<L: Lanes, const EXTRAS: bool>(tile: &TileInput, background: &[
     let mut own: Plane = [[0.0; 16]; BLOCKS];
     let (lane_x, lane_y) = lane_offsets::<L>();
 
-    let mut visited = 0;
+    let mut visited = Visited::default();
     for pair in tile.pairs {
         if alive == 0 {
             break;
         }
-        visited += 1;
+        visited.pairs += 1;
         let mut blocks = u32::from(pair.blocks) & alive;
+        visited.blocks += blocks.count_ones();
         if blocks == 0 {
             continue;
         }
