@@ -1,7 +1,8 @@
 //! The differentiable splat renderer: colour, depth and transmittance of a view, and the gradient of every parameter.
 //!
 //! The stages have the same names in every backend: project, sort, bin, rasterize, rasterize_backward, reduce,
-//! project_backward. [`cpu`] is a first-class backend (SIMD and rayon), not a mirror of another.
+//! project_backward. [`cpu`] is a first-class backend (SIMD and rayon), not a mirror of another; `gpu` (feature `gpu`) is
+//! wgpu; [`Stages`] are for comparing them.
 //!
 //! Conventions are gsplat's (DESIGN section 4): EWA projection with 0.3 px² added to the 2D covariance, pixel centres at
 //! `+½`, `α = min(0.999, o·exp(-½ dᵀΣ'⁻¹d))`, skipped under 1/255, front to back until `T·(1-α) ≤ 1e-4`,
@@ -11,6 +12,8 @@
 //! number of threads.
 
 pub mod cpu;
+#[cfg(feature = "gpu")]
+pub mod gpu;
 
 /// Nearest depth that is drawn, metres.
 pub const NEAR_METRES: f32 = 0.01;
@@ -69,6 +72,20 @@ pub struct Upstream {
     pub transmittance: Vec<f32>,
     /// dL/d depth (Σ αTz).
     pub depth: Vec<f32>,
+}
+
+/// What the stages before `rasterize` came to, in the same form from every backend: for comparing them stage by stage.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Stages {
+    /// Indices of the splats that were drawn, nearest first; those of the context follow on those of the trainable ones.
+    pub order: Vec<u32>,
+    /// For each of them, in this order: mean x, y (pixels); a, b, c, log2 opacity with
+    /// `α = 2^(log2 opacity - (a dx + b dy)² - (c dy)²)`; red, green, blue; depth (metres); half extents x, y (pixels).
+    pub records: Vec<[f32; 12]>,
+    /// `pairs[start[t] .. start[t + 1]]` belong to tile `t` of 16×16 pixels (row-major).
+    pub start: Vec<u32>,
+    /// Places in `order`, front to back within a tile.
+    pub pairs: Vec<u32>,
 }
 
 /// The gradient of a loss with respect to the trainable splats, and what growth and pruning want to know.

@@ -19,7 +19,7 @@ pub mod simd;
 use rayon::prelude::*;
 use scene::{Camera, Splats};
 
-use crate::{Contributions, Frame, Gradients, Options, Upstream};
+use crate::{Contributions, Frame, Gradients, Options, Stages, Upstream};
 use bin::{Bins, SortScratch, TILE};
 use project::{Projected, View};
 use project_backward::Sink;
@@ -166,6 +166,22 @@ impl Renderer {
     /// Pairs of splat and tile in the last view: what the rasterizer's time is proportional to.
     pub fn pairs(&self) -> usize {
         self.bins.pairs.len()
+    }
+
+    /// What the stages before `rasterize` came to in the last view.
+    pub fn stages(&self) -> Stages {
+        let own = self.drawn.map_or(0, |(.., own)| own as u32);
+        let first_context = own.next_multiple_of(simd::LANES as u32);
+        let record = |Projected(r): &Projected| {
+            use project::at::{A, B, BLUE, C, GREEN, HALF_HEIGHT, HALF_WIDTH, LOG2_OPACITY, RED, X, Y, Z};
+            [X, Y, A, B, C, LOG2_OPACITY, RED, GREEN, BLUE, Z, HALF_WIDTH, HALF_HEIGHT].map(|k| r[k])
+        };
+        Stages {
+            order: self.order.iter().map(|&i| if i < own { i } else { i - first_context + own }).collect(),
+            records: self.ranked.iter().map(record).collect(),
+            start: self.bins.start.clone(),
+            pairs: self.bins.pairs.iter().map(|pair| pair.rank).collect(),
+        }
     }
 
     /// Blocks of 4×4 pixels that the rasterizer visited in the last view, each for one splat: what its arithmetic is

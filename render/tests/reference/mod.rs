@@ -7,6 +7,9 @@
 
 #![allow(dead_code)] // each test program uses a part
 
+pub(crate) mod mixture;
+pub(crate) mod tensors;
+
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use render::{ALPHA_MAX, ALPHA_MIN, BLUR, NEAR_METRES, Options, TRANSMITTANCE_MIN};
 use scene::{Camera, Pinhole, Rigid, Splat, Splats, column};

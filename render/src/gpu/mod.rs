@@ -1,0 +1,365 @@
+//! The GPU backend: wgpu over Vulkan, Metal or DirectX 12; the stages are the WGSL of the crate `shaders`.
+//!
+//! Data flow of a view, one buffer a stage, no read-back between:
+//! ```text
+//! splats ─project→ records ─compact→ visible ─sort by depth→ order ─emit→ pairs ─sort by tile→ ranges ─rasterize→ frame
+//! upstream ─rasterize_backward→ moments per pair ─reduce→ sums per splat ─project_backward→ gradients
+//! ```
+//! How many splats are visible and how many pairs they make only the device knows: stage `plan` writes the sizes of the
+//! dispatches that follow. Pairs have room for so many; a view with more sets a flag that stays, and nothing is drawn or
+//! trained until the host has seen it and made room ([`GpuRenderer::recover`]).
+//!
+//! No float is ever added atomically: the same adapter gives the same bits.
+
+mod access;
+mod device;
+mod error;
+mod sort;
+mod splats;
+
+use std::sync::Arc;
+
+use scene::Camera;
+use shaders::{GROUP, MOMENTS, REDUCE_SPLATS, SCAN_BLOCK, Set, Status, TILE, View, args, slot};
+
+pub use device::{Gpu, Growing, Kernel};
+pub use error::GpuError;
+pub use splats::{Columns, GpuSplats};
+
+use crate::{Frame, Gradients, Options};
+use access::set_of;
+use sort::{Groups, Sides, Sorted, Sorter};
+
+/// Pairs for which there is room at first.
+const FIRST_PAIRS: usize = 1 << 18;
+
+/// Which planes of the upstream gradient mean anything; those that do not are taken as zero. Colour always does.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct UpstreamPlanes {
+    /// dL/d transmittance.
+    pub transmittance: bool,
+    /// dL/d depth.
+    pub depth: bool,
+}
+
+/// A renderer with its buffers, which it keeps from view to view.
+#[derive(Debug)]
+pub struct GpuRenderer {
+    gpu: Arc<Gpu>,
+    kernels: Kernels,
+    sorter: Sorter,
+    view: wgpu::Buffer,
+    status: wgpu::Buffer,
+    args: wgpu::Buffer,
+    of_splats: OfSplats,
+    of_pairs: OfPairs,
+    pair_capacity: usize,
+    tile_ranges: Growing,
+    last: Growing,
+    frame: Growing,
+    upstream: Growing,
+    sums: Growing,
+    gradients: Columns,
+    statistics: Growing,
+    drawn: Option<Drawn>,
+}
+
+/// What the last `forward` drew.
+#[derive(Debug, Clone, Copy)]
+struct Drawn {
+    view: View,
+    set: Set,
+    /// Side of the sorted pairs.
+    side: usize,
+}
+
+/// Buffers with an entry for each splat, own and context.
+#[derive(Debug)]
+struct OfSplats {
+    records: Growing,
+    seen: Growing,
+    sums: Growing,
+    tiles: Growing,
+    first: Growing,
+    visible: Growing,
+    sides: Sides,
+}
+
+/// Buffers with an entry for each pair.
+#[derive(Debug)]
+struct OfPairs {
+    splat: Growing,
+    sides: Sides,
+    moments: Growing,
+}
+
+#[derive(Debug)]
+struct Kernels {
+    plan_start: Kernel,
+    plan_visible: Kernel,
+    plan_pairs: Kernel,
+    project: Kernel,
+    compact: Kernel,
+    gather: Kernel,
+    emit: Kernel,
+    ranges: Kernel,
+    rasterize: Kernel,
+    rasterize_backward: Kernel,
+    reduce: Kernel,
+    project_backward: Kernel,
+}
+
+impl GpuRenderer {
+    /// A renderer on this device.
+    ///
+    /// # Errors
+    /// Where the driver refuses a stage or a buffer.
+    pub fn new(gpu: Arc<Gpu>) -> Result<Self, GpuError> {
+        let g = &*gpu;
+        let kernels = Kernels {
+            plan_start: g.kernel(&shaders::PLAN, "plan_start")?,
+            plan_visible: g.kernel(&shaders::PLAN, "plan_visible")?,
+            plan_pairs: g.kernel(&shaders::PLAN, "plan_pairs")?,
+            project: g.kernel(&shaders::PROJECT, "project")?,
+            compact: g.kernel(&shaders::COMPACT, "compact")?,
+            gather: g.kernel(&shaders::GATHER, "gather")?,
+            emit: g.kernel(&shaders::EMIT, "emit")?,
+            ranges: g.kernel(&shaders::RANGES, "ranges")?,
+            rasterize: g.kernel(&shaders::RASTERIZE, "rasterize")?,
+            rasterize_backward: g.kernel(&shaders::RASTERIZE_BACKWARD, "rasterize_backward")?,
+            reduce: g.kernel(&shaders::REDUCE, "reduce")?,
+            project_backward: g.kernel(&shaders::PROJECT_BACKWARD, "project_backward")?,
+        };
+        let of_splats = OfSplats {
+            records: Growing::new(g, "records")?,
+            seen: Growing::new(g, "seen")?,
+            sums: Growing::new(g, "sums")?,
+            tiles: Growing::new(g, "tiles")?,
+            first: Growing::new(g, "first pairs")?,
+            visible: Growing::new(g, "visible")?,
+            sides: Sides::new(g)?,
+        };
+        let of_pairs =
+            OfPairs { splat: Growing::new(g, "pairs")?, sides: Sides::new(g)?, moments: Growing::new(g, "moments")? };
+        Ok(Self {
+            kernels,
+            sorter: Sorter::new(g)?,
+            view: g.constants("view", size_of::<View>()),
+            status: g.buffer("status", size_of::<Status>() as u64)?,
+            args: g.buffer("args", 12 * args::COUNT)?,
+            of_splats,
+            of_pairs,
+            pair_capacity: FIRST_PAIRS,
+            tile_ranges: Growing::new(g, "ranges")?,
+            last: Growing::new(g, "last pairs")?,
+            frame: Growing::new(g, "frame")?,
+            upstream: Growing::new(g, "upstream")?,
+            sums: Growing::new(g, "splats' sums")?,
+            gradients: Columns::new(g, "gradients", 0, 0)?,
+            statistics: Growing::new(g, "statistics")?,
+            drawn: None,
+            gpu,
+        })
+    }
+
+    /// As [`Gpu::name`].
+    pub fn name(&self) -> String {
+        self.gpu.name().to_string()
+    }
+
+    /// Draws the trainable splats and, with them, a frozen context, into [`frame`](Self::frame).
+    ///
+    /// # Errors
+    /// Where buffers do not fit. What fails later is told by whoever submits or waits.
+    pub fn forward(
+        &mut self,
+        encoder: &mut wgpu::CommandEncoder,
+        splats: &GpuSplats,
+        context: Option<&GpuSplats>,
+        camera: &Camera,
+        options: &Options,
+    ) -> Result<(), GpuError> {
+        let others = context.map_or(0, GpuSplats::len);
+        let view = self.view_of(camera, options, splats.len(), others);
+        let sh_degree = options.sh_degree.min(splats.sh_degree());
+        let set = set_of(splats, 0, sh_degree);
+        self.drawn = None;
+        self.fit(&view, splats)?;
+        let gpu = &*self.gpu;
+        gpu.write(encoder, &self.view, 0, &[view]);
+        let tiles = (view.tiles[0] * view.tiles[1]) as usize;
+        encoder.clear_buffer(&self.tile_ranges, 0, Some(8 * tiles as u64));
+
+        let pass = &mut encoder.begin_compute_pass(&wgpu::ComputePassDescriptor::default());
+        let (kernels, status, args) = (&self.kernels, &self.status, &self.args);
+        let OfSplats { records, seen, sums, tiles: tile_counts, first, visible, sides } = &self.of_splats;
+        let plan: [(u32, &wgpu::Buffer); 4] = [(0, &self.view), (1, status), (2, sums), (3, args)];
+        kernels.plan_start.run(gpu, pass, &plan[..3], 1);
+        // The context is finished: it is drawn in full, whatever degree the trainable splats have reached.
+        let frozen = context.map(|context| (context, set_of(context, splats.len(), context.sh_degree())));
+        for (splats, set) in [Some((splats, set)), frozen].into_iter().flatten() {
+            let uniform = gpu.uniform(&set);
+            let [a, b, c, d] = splats.columns().banks();
+            let bindings = [
+                (0, a),
+                (1, b),
+                (2, c),
+                (3, d),
+                (4, &self.view),
+                (5, &uniform),
+                (6, records),
+                (7, seen),
+                (8, sums),
+                (9, tile_counts),
+            ];
+            if set.count > 0 {
+                kernels.project.run(gpu, pass, &bindings, set.count.div_ceil(GROUP));
+            }
+        }
+        let groups = Groups::Direct((view.total + 1).div_ceil(SCAN_BLOCK));
+        self.sorter.scan(gpu, pass, sums, status, slot::SPLAT_SLOTS, groups);
+        kernels.plan_visible.run(gpu, pass, &plan, 1);
+        let bindings = [(0, &self.view), (1, seen), (2, sums), (3, records), (4, visible), (5, &*sides.keys[0])];
+        kernels.compact.run(gpu, pass, &bindings, view.total.div_ceil(GROUP));
+
+        let side = self.sorter.sort(gpu, pass, sides, Some(visible), 32, (status, args), Sorted::Splats);
+        let order = &*sides.values[side];
+        let bindings = [(0, status), (1, order), (2, tile_counts), (3, sums)];
+        kernels.gather.run_indirect(gpu, pass, &bindings, args, args::VISIBLE);
+        let groups = Groups::Indirect(args, args::VISIBLE_SLOTS);
+        self.sorter.scan(gpu, pass, sums, status, slot::VISIBLE_SLOTS, groups);
+        kernels.plan_pairs.run(gpu, pass, &plan, 1);
+
+        let pairs = &self.of_pairs;
+        let bindings = [
+            (0, &self.view),
+            (1, status),
+            (2, records),
+            (3, order),
+            (4, sums),
+            (5, first),
+            (6, &*pairs.splat),
+            (7, &*pairs.sides.keys[0]),
+            (8, &*pairs.sides.values[0]),
+        ];
+        kernels.emit.run_indirect(gpu, pass, &bindings, args, args::VISIBLE);
+        let bits = 32 - (tiles as u32).saturating_sub(1).leading_zeros();
+        let side = self.sorter.sort(gpu, pass, &pairs.sides, None, bits, (status, args), Sorted::Pairs);
+        let bindings = [(0, status), (1, &*pairs.sides.keys[side]), (2, &*self.tile_ranges)];
+        kernels.ranges.run_indirect(gpu, pass, &bindings, args, args::PAIRS);
+        let bindings = [
+            (0, &self.view),
+            (1, &*self.tile_ranges),
+            (2, &*pairs.sides.values[side]),
+            (3, &*pairs.splat),
+            (4, records),
+            (5, &*self.frame),
+            (6, &*self.last),
+        ];
+        kernels.rasterize.run(gpu, pass, &bindings, tiles as u32);
+        self.drawn = Some(Drawn { view, set, side });
+        Ok(())
+    }
+
+    /// Gradients of the trainable splats of the last [`forward`](Self::forward), whose splats must be passed again
+    /// unchanged, from what lies in [`upstream`](Self::upstream). The pose has none here.
+    ///
+    /// # Errors
+    /// Without a forward pass before, or with another number of splats; and as `forward`.
+    pub fn backward(
+        &mut self,
+        encoder: &mut wgpu::CommandEncoder,
+        splats: &GpuSplats,
+        planes: UpstreamPlanes,
+    ) -> Result<(), GpuError> {
+        let Some(Drawn { view, set, side }) = self.drawn.filter(|drawn| drawn.set.count as usize == splats.len())
+        else {
+            return Err(GpuError::Failed("backward needs the splats that forward drew".into()));
+        };
+        if planes.depth && view.extras == 0 {
+            return Err(GpuError::Failed("a gradient of depth needs a forward pass with extras".into()));
+        }
+        let gpu = &*self.gpu;
+        let (kernels, status, args, pairs) = (&self.kernels, &self.status, &self.args, &self.of_pairs);
+        let OfSplats { records, tiles: tile_counts, first, visible, .. } = &self.of_splats;
+        let pass = &mut encoder.begin_compute_pass(&wgpu::ComputePassDescriptor::default());
+        let planes = gpu.uniform(&shaders::Planes {
+            transmittance: planes.transmittance.into(),
+            depth: planes.depth.into(),
+            padding: [0; 2],
+        });
+        let bindings = [
+            (0, &self.view),
+            (1, &*self.tile_ranges),
+            (2, &*pairs.sides.values[side]),
+            (3, &*pairs.splat),
+            (4, records),
+            (5, &*self.frame),
+            (6, &*self.last),
+            (7, &*self.upstream),
+            (8, &planes),
+            (9, &*pairs.moments),
+        ];
+        kernels.rasterize_backward.run(gpu, pass, &bindings, view.tiles[0] * view.tiles[1]);
+        let bindings: [(u32, &wgpu::Buffer); 6] =
+            [(0, status), (1, visible), (2, first), (3, tile_counts), (4, &pairs.moments), (5, &self.sums)];
+        kernels.reduce.run_indirect(gpu, pass, &bindings, args, args::SEEN_REDUCE);
+        let set = gpu.uniform(&set);
+        let [a, b, c, d] = splats.columns().banks();
+        let [out_a, out_b, out_c, out_d] = self.gradients.banks();
+        let bindings = [
+            (0, a),
+            (1, b),
+            (2, c),
+            (3, d),
+            (4, &self.view),
+            (5, &set),
+            (6, status),
+            (7, visible),
+            (8, &*self.sums),
+            (9, out_a),
+            (10, out_b),
+            (11, out_c),
+            (12, out_d),
+            (13, &*self.statistics),
+        ];
+        kernels.project_backward.run_indirect(gpu, pass, &bindings, args, args::SEEN);
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A device; `None`, and a line that says so, where there is none and `PLAT_GPU` does not require one.
+    pub(super) fn gpu() -> Option<Arc<Gpu>> {
+        let required = std::env::var("PLAT_GPU").is_ok_and(|value| value == "required");
+        match Gpu::open() {
+            Ok(gpu) => Some(gpu),
+            Err(e) if required => panic!("PLAT_GPU=required, but {e}"),
+            Err(_) => {
+                println!("skipped: no adapter");
+                None
+            }
+        }
+    }
+
+    #[test]
+    fn constants_are_those_of_this_crate() {
+        for (name, expected) in [
+            ("NEAR_METRES", crate::NEAR_METRES),
+            ("BLUR", crate::BLUR),
+            ("ALPHA_MIN", crate::ALPHA_MIN),
+            ("ALPHA_MAX", crate::ALPHA_MAX),
+            ("TRANSMITTANCE_MIN", crate::TRANSMITTANCE_MIN),
+            ("SH_C0", scene::splats::SH_C0),
+            ("LOG2_E", std::f32::consts::LOG2_E),
+            ("LN_2", std::f32::consts::LN_2),
+        ] {
+            let start = format!("const {name}: f32 = ");
+            let line = shaders::VIEW.lines().find_map(|line| line.strip_prefix(&start)).expect(name);
+            assert_eq!(line.trim_end_matches(';').parse(), Ok(expected), "{name}");
+        }
+    }
+}

@@ -1,0 +1,227 @@
+//! The stages of the GPU backend as WGSL text, and the layouts that they share with Rust.
+//!
+//! A [`Stage`] is one file of `wgsl/` with the snippets that it uses before it; several entry points may share a file.
+//! A test parses every stage with naga and compares every structure with its Rust twin.
+//!
+//! Architecture invariant: text and layouts only; nothing here knows a device.
+
+use bytemuck::{Pod, Zeroable};
+
+/// Threads of a workgroup, everywhere.
+pub const GROUP: u32 = 256;
+/// Entries that one workgroup of `scan` adds up.
+pub const SCAN_BLOCK: u32 = 1024;
+/// Entries that one workgroup of `radix` sorts.
+pub const RADIX_BLOCK: u32 = 4096;
+/// Values of a radix digit.
+pub const DIGITS: u32 = 256;
+/// Side of a tile in pixels.
+pub const TILE: u32 = 16;
+/// Sums that a pair of splat and tile hands to its splat; see `rasterize_backward.wgsl` for their order.
+pub const MOMENTS: u32 = 13;
+/// Splats of one workgroup of `reduce`.
+pub const REDUCE_SPLATS: u32 = 16;
+
+/// The text of a module and the names of its entry points.
+#[derive(Debug, Clone, Copy)]
+pub struct Stage {
+    /// The file's name, and the stage's in every backend.
+    pub name: &'static str,
+    parts: &'static [&'static str],
+    /// Compute entry points.
+    pub entries: &'static [&'static str],
+}
+
+impl Stage {
+    /// A stage from snippets and its own text, concatenated in this order.
+    pub const fn new(name: &'static str, parts: &'static [&'static str], entries: &'static [&'static str]) -> Self {
+        Self { name, parts, entries }
+    }
+
+    /// The module's text.
+    pub fn source(&self) -> String {
+        self.parts.concat()
+    }
+}
+
+/// The view, the record of a projected splat, the renderer's status and its constants.
+pub const VIEW: &str = include_str!("../wgsl/view.wgsl");
+/// Columns of splats in four banks, their EWA projection and their colour's basis.
+const SPLAT: &str = include_str!("../wgsl/splat.wgsl");
+/// Which tiles an ellipse touches.
+const TILES: &str = include_str!("../wgsl/tiles.wgsl");
+/// A splat's opacity at a pixel.
+const BLEND: &str = include_str!("../wgsl/blend.wgsl");
+
+macro_rules! stages {
+    ($($constant:ident $name:literal [$($part:expr),*] $entries:expr;)*) => {
+        $(
+            #[doc = concat!("`", $name, ".wgsl`")]
+            pub const $constant: Stage =
+                Stage::new($name, &[$($part,)* include_str!(concat!("../wgsl/", $name, ".wgsl"))], &$entries);
+        )*
+        /// Every stage of the renderer.
+        pub const STAGES: &[Stage] = &[$($constant),*];
+    };
+}
+
+stages! {
+    PLAN "plan" [VIEW] ["plan_start", "plan_visible", "plan_pairs"];
+    PROJECT "project" [VIEW, SPLAT, TILES] ["project"];
+    SCAN "scan" [] ["scan_blocks", "scan_sums", "scan_apply"];
+    COMPACT "compact" [VIEW] ["compact"];
+    RADIX "radix" [] ["radix_count", "radix_scatter"];
+    GATHER "gather" [VIEW] ["gather"];
+    EMIT "emit" [VIEW, TILES] ["emit"];
+    RANGES "ranges" [VIEW] ["ranges"];
+    RASTERIZE "rasterize" [VIEW, BLEND] ["rasterize"];
+    RASTERIZE_BACKWARD "rasterize_backward" [VIEW, BLEND] ["rasterize_backward"];
+    REDUCE "reduce" [VIEW] ["reduce"];
+    PROJECT_BACKWARD "project_backward" [VIEW, SPLAT] ["project_backward"];
+}
+
+/// A camera in single precision with what the stages want of it, and the sizes of what it draws. Uniform.
+#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
+#[repr(C)]
+pub struct View {
+    /// Rows of the rotation from world to camera, each with its component of the translation.
+    pub rows: [[f32; 4]; 3],
+    /// Optical centre in the world; the last entry is not used.
+    pub centre: [f32; 4],
+    /// Colour behind everything; the last entry is not used.
+    pub background: [f32; 4],
+    /// Focal lengths, pixels.
+    pub focal: [f32; 2],
+    /// Principal point, pixels.
+    pub principal: [f32; 2],
+    /// Bounds of x/z and y/z within which the Jacobian is taken.
+    pub cone_min: [f32; 2],
+    /// See `cone_min`.
+    pub cone_max: [f32; 2],
+    /// Width and height.
+    pub pixels: [u32; 2],
+    /// Width and height in tiles.
+    pub tiles: [u32; 2],
+    /// Trainable splats.
+    pub own: u32,
+    /// Trainable splats and context.
+    pub total: u32,
+    /// Pairs of splat and tile for which there is room.
+    pub pair_capacity: u32,
+    /// 1: opacity compensated for the blur.
+    pub antialiased: u32,
+    /// 1: depth and own are wanted.
+    pub extras: u32,
+    /// Not used.
+    pub padding: u32,
+    /// Not used.
+    pub more_padding: [u32; 2],
+}
+
+/// The splats that a dispatch works on. Uniform.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
+#[repr(C)]
+pub struct Set {
+    /// Place of the first among all splats of the view.
+    pub first: u32,
+    /// Their number.
+    pub count: u32,
+    /// Entries from a column to the next.
+    pub stride: u32,
+    /// SH degree in use.
+    pub sh_degree: u32,
+}
+
+/// Which planes of the upstream gradient mean anything. Uniform.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
+#[repr(C)]
+pub struct Planes {
+    /// 1: dL/d transmittance is read, else taken as zero.
+    pub transmittance: u32,
+    /// 1: dL/d depth is read, else taken as zero.
+    pub depth: u32,
+    /// Not used.
+    pub padding: [u32; 2],
+}
+
+/// One pass of `radix`, or one `scan`. Uniform.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
+#[repr(C)]
+pub struct Pass {
+    /// Which word of [`Status`] says how many entries there are.
+    pub slot: u32,
+    /// Lowest bit of the digit; of `scan` not used.
+    pub shift: u32,
+    /// Not used.
+    pub padding: [u32; 2],
+}
+
+/// What the device knows of a view and the host only when it asks.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Pod, Zeroable)]
+#[repr(C)]
+pub struct Status {
+    /// 1: a view had more pairs than there is room for. Stays until the host clears it; until then nothing is drawn, and
+    /// no gradient is made.
+    pub overflow: u32,
+    /// 1: the device counted a splat's tiles once so and once otherwise. Never seen; an error if it is.
+    pub fault: u32,
+    /// Pairs of the last view that was drawn.
+    pub pairs: u32,
+    /// Most pairs of a view, drawn or not, since the host cleared it.
+    pub most_pairs: u32,
+    /// Splats of the last view, own and context.
+    pub visible: u32,
+    /// Trainable splats of the last view.
+    pub seen: u32,
+    /// All splats and one: entries of the first scan.
+    pub splat_slots: u32,
+    /// Visible splats and one: entries of the second scan.
+    pub visible_slots: u32,
+    /// Entries of the histogram of visible splats.
+    pub visible_digits: u32,
+    /// Entries of the histogram of pairs.
+    pub pair_digits: u32,
+}
+
+/// Places of the indirect dispatches in the renderer's `args` buffer, three words each.
+pub mod args {
+    /// A thread for each visible splat.
+    pub const VISIBLE: u64 = 0;
+    /// A workgroup of `radix` for each block of visible splats.
+    pub const VISIBLE_SORT: u64 = 1;
+    /// A workgroup of `scan` for each block of their histogram.
+    pub const VISIBLE_DIGITS: u64 = 2;
+    /// A workgroup of `scan` for each block of their tile counts.
+    pub const VISIBLE_SLOTS: u64 = 3;
+    /// A thread for each pair.
+    pub const PAIRS: u64 = 4;
+    /// A workgroup of `radix` for each block of pairs.
+    pub const PAIR_SORT: u64 = 5;
+    /// A workgroup of `scan` for each block of their histogram.
+    pub const PAIR_DIGITS: u64 = 6;
+    /// A thread for each trainable splat that was seen.
+    pub const SEEN: u64 = 7;
+    /// A workgroup of `reduce` for each sixteen of them.
+    pub const SEEN_REDUCE: u64 = 8;
+    /// How many there are.
+    pub const COUNT: u64 = 9;
+}
+
+/// A word of [`Status`] as a slot of [`Pass`].
+pub mod slot {
+    use super::Status;
+    use std::mem::offset_of;
+
+    /// Pairs.
+    pub const PAIRS: u32 = (offset_of!(Status, pairs) / 4) as u32;
+    /// Visible splats.
+    pub const VISIBLE: u32 = (offset_of!(Status, visible) / 4) as u32;
+    /// All splats and one.
+    pub const SPLAT_SLOTS: u32 = (offset_of!(Status, splat_slots) / 4) as u32;
+    /// Visible splats and one.
+    pub const VISIBLE_SLOTS: u32 = (offset_of!(Status, visible_slots) / 4) as u32;
+    /// Histogram of visible splats.
+    pub const VISIBLE_DIGITS: u32 = (offset_of!(Status, visible_digits) / 4) as u32;
+    /// Histogram of pairs.
+    pub const PAIR_DIGITS: u32 = (offset_of!(Status, pair_digits) / 4) as u32;
+}

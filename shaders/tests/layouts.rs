@@ -1,0 +1,119 @@
+//! Every stage is valid WGSL, and its structures lie in memory as their Rust twins do.
+
+use std::collections::BTreeMap;
+use std::mem::offset_of;
+
+use naga::valid::{Capabilities, ValidationFlags, Validator};
+use naga::{Module, TypeInner};
+use shaders::{Pass, Planes, STAGES, Set, Status, View};
+
+/// Name and byte offset of each member, and the size of the whole.
+type Layout = (Vec<(String, usize)>, usize);
+
+macro_rules! layout {
+    ($type:ident: $($member:ident),*) => {
+        (stringify!($type), (vec![$((stringify!($member).to_string(), offset_of!($type, $member))),*], size_of::<$type>()))
+    };
+}
+
+fn twins() -> BTreeMap<&'static str, Layout> {
+    [
+        layout!(View: rows, centre, background, focal, principal, cone_min, cone_max, pixels, tiles, own, total,
+            pair_capacity, antialiased, extras, padding, more_padding),
+        layout!(Set: first, count, stride, sh_degree),
+        layout!(Planes: transmittance, depth, padding),
+        layout!(Pass: slot, shift, padding),
+        layout!(Status: overflow, fault, pairs, most_pairs, visible, seen, splat_slots, visible_slots, visible_digits,
+            pair_digits),
+    ]
+    .into()
+}
+
+/// The structures of a module by name.
+fn structures(module: &Module) -> BTreeMap<String, Layout> {
+    (module.types.iter())
+        .filter_map(|(_, kind)| match &kind.inner {
+            TypeInner::Struct { members, span } => {
+                let members = members.iter().map(|m| (m.name.clone().unwrap_or_default(), m.offset as usize)).collect();
+                Some((kind.name.clone()?, (members, *span as usize)))
+            }
+            _ => None,
+        })
+        .collect()
+}
+
+fn parse(name: &str, source: &str) -> Result<Module, String> {
+    let module = naga::front::wgsl::parse_str(source).map_err(|e| format!("{name}: {}", e.emit_to_string(source)))?;
+    let mut validator = Validator::new(ValidationFlags::all(), Capabilities::empty());
+    validator.validate(&module).map_err(|e| format!("{name}: {}", e.emit_to_string(source)))?;
+    Ok(module)
+}
+
+#[test]
+fn stages_are_valid_and_agree_with_their_twins() {
+    let twins = twins();
+    let mut compared: BTreeMap<&str, usize> = BTreeMap::new();
+    for stage in STAGES {
+        let module = parse(stage.name, &stage.source()).unwrap_or_else(|e| panic!("{e}"));
+        let entries: Vec<&str> = module.entry_points.iter().map(|entry| entry.name.as_str()).collect();
+        assert_eq!(entries, stage.entries, "entry points of {}", stage.name);
+        for entry in &module.entry_points {
+            let threads: u32 = entry.workgroup_size.iter().product();
+            assert!(threads == shaders::GROUP || threads == 1, "{} has {threads} threads", entry.name);
+        }
+        for (name, layout) in structures(&module) {
+            if let Some((&twin, expected)) = twins.get_key_value(name.as_str()) {
+                assert_eq!(&layout, expected, "{name} in {}", stage.name);
+                *compared.entry(twin).or_default() += 1;
+            }
+        }
+    }
+    for name in twins.keys() {
+        assert!(compared.contains_key(name), "no stage has a structure {name}");
+    }
+}
+
+#[test]
+fn a_wrong_layout_and_a_wrong_stage_are_seen() {
+    let moved = "struct Set { count: u32, first: u32, stride: u32, sh_degree: u32, }
+        @group(0) @binding(0) var<uniform> s: Set;
+        @compute @workgroup_size(1) fn main() { let x = s.count; }";
+    let module = parse("moved", moved).unwrap_or_else(|e| panic!("{e}"));
+    assert_ne!(structures(&module)["Set"], twins()["Set"]);
+    assert!(parse("untyped", "fn f() -> u32 { return 1.5; }").is_err());
+}
+
+/// `const NAME: type = value;` lines of all stages agree with the Rust constants of the same name.
+#[test]
+fn constants_agree() {
+    let expected: BTreeMap<&str, u32> = [
+        ("GROUP", shaders::GROUP),
+        ("TILE", shaders::TILE),
+        ("MOMENTS", shaders::MOMENTS),
+        ("SCAN_BLOCK", shaders::SCAN_BLOCK),
+        ("RADIX_BLOCK", shaders::RADIX_BLOCK),
+        ("DIGITS", shaders::DIGITS),
+        ("REDUCE_SPLATS", shaders::REDUCE_SPLATS),
+    ]
+    .into();
+    let mut found = BTreeMap::new();
+    for stage in STAGES {
+        for line in stage.source().lines() {
+            let Some((name, value)) = line.strip_prefix("const ").and_then(|line| line.split_once(": u32 = ")) else {
+                continue;
+            };
+            let value: u32 = value.split(['u', ';']).next().unwrap_or_default().parse().unwrap_or_default();
+            // `scan` and `radix` call theirs BLOCK.
+            let name = match (stage.name, name) {
+                ("scan", "BLOCK") => "SCAN_BLOCK",
+                ("radix", "BLOCK") => "RADIX_BLOCK",
+                _ => name,
+            };
+            if let Some((&name, expected)) = expected.get_key_value(name) {
+                assert_eq!(value, *expected, "{name} in {}", stage.name);
+                found.insert(name, value);
+            }
+        }
+    }
+    assert_eq!(found, expected, "constants that no stage has");
+}

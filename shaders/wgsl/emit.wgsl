@@ -1,0 +1,46 @@
+// Stage `emit`: the pairs of splat and tile, in the order of depth and then of tiles; a thread a visible splat.
+
+@group(0) @binding(0) var<uniform> view: View;
+@group(0) @binding(1) var<storage, read_write> status: Status;
+@group(0) @binding(2) var<storage, read> records: array<Record>;
+@group(0) @binding(3) var<storage, read> order: array<u32>;
+// Exclusive sums of the tiles of the splats in this order.
+@group(0) @binding(4) var<storage, read> sums: array<u32>;
+@group(0) @binding(5) var<storage, read_write> first: array<u32>;
+@group(0) @binding(6) var<storage, read_write> pair_splat: array<u32>;
+@group(0) @binding(7) var<storage, read_write> keys: array<u32>;
+@group(0) @binding(8) var<storage, read_write> values: array<u32>;
+
+@compute @workgroup_size(256)
+fn emit(
+    @builtin(workgroup_id) group: vec3<u32>,
+    @builtin(num_workgroups) groups: vec3<u32>,
+    @builtin(local_invocation_index) local: u32,
+) {
+    let rank = linear(group, groups, local);
+    if rank >= status.visible || status.pairs == 0u {
+        return;
+    }
+    let i = order[rank];
+    var pair = sums[rank];
+    let end = sums[rank + 1u];
+    first[i] = pair;
+    let r = records[i];
+    let box = span(r, view.tiles);
+    let e = ellipse(r);
+    for (var y = box.first.y; y < box.end.y; y++) {
+        for (var x = box.first.x; x < box.end.x; x++) {
+            if touches(e, vec2<u32>(x, y)) {
+                if pair < end {
+                    pair_splat[pair] = i;
+                    keys[pair] = y * view.tiles.x + x;
+                    values[pair] = pair;
+                }
+                pair++;
+            }
+        }
+    }
+    if pair != end {
+        status.fault = 1u; // whoever finds it writes the same
+    }
+}

@@ -1,0 +1,99 @@
+// Stage `project`: splats in the world become ellipses in the view; a thread a splat.
+
+@group(0) @binding(6) var<storage, read_write> records: array<Record>;
+@group(0) @binding(7) var<storage, read_write> seen: array<u32>;
+// The same as `seen`, to be summed up.
+@group(0) @binding(8) var<storage, read_write> sums: array<u32>;
+@group(0) @binding(9) var<storage, read_write> tiles: array<u32>;
+
+@compute @workgroup_size(256)
+fn project(
+    @builtin(workgroup_id) group: vec3<u32>,
+    @builtin(num_workgroups) groups: vec3<u32>,
+    @builtin(local_invocation_index) local: u32,
+) {
+    let i = linear(group, groups, local);
+    if i >= splats.count {
+        return;
+    }
+    let n = splats.first + i;
+    var record: Record;
+    let drawn = project_splat(i, &record);
+    seen[n] = u32(drawn);
+    sums[n] = u32(drawn);
+    if drawn {
+        records[n] = record;
+        tiles[n] = count_tiles(record);
+    }
+}
+
+// Whether the splat may touch the image, at a fraction of what knowing costs: as far as an opaque ball of its largest scale
+// reaches.
+fn near_image(i: u32, p: vec3<f32>) -> bool {
+    // sqrt(2 ln 255), and that times sqrt(BLUR), with a little to spare for rounding.
+    let scales = column3(3u, i);
+    let reach = exp2(max(scales.x, max(scales.y, scales.z)) * LOG2_E) * 3.34;
+    let inv_z = 1.0 / max(p.z, NEAR_METRES);
+    let ratio = p.xy * inv_z;
+    let u = min(max(ratio, view.cone_min), view.cone_max);
+    // A row of J W is f/z sqrt(1 + u^2) long.
+    let half = fma(view.focal * inv_z * reach, 1.0 + abs(u), vec2<f32>(1.9));
+    let centre = fma(view.focal, ratio, view.principal);
+    return all(centre - half <= vec2<f32>(view.pixels)) && all(vec2<f32>(0.0) <= centre + half);
+}
+
+fn project_splat(i: u32, record: ptr<function, Record>) -> bool {
+    let mean = column3(0u, i);
+    let p = camera_point(mean);
+    if !(is_finite(p.x) && is_finite(p.y) && is_finite(p.z)) || !(p.z > NEAR_METRES) || !near_image(i, p) {
+        return false;
+    }
+    let logit = column(10u, i);
+    if !(is_finite(column(3u, i)) && is_finite(column(4u, i)) && is_finite(column(5u, i)) && is_finite(logit)) {
+        return false;
+    }
+    let e = ewa(i, p);
+    let inv_det = 1.0 / e.det1;
+    var o = opacity(i);
+    if view.antialiased != 0u {
+        o *= sqrt(e.det0 * inv_det);
+    }
+    // The squared radius in sigmas at which alpha falls to 1/255.
+    let reach = 2.0 * log(o * 255.0);
+    let variance = e.cov.xz + BLUR;
+    let half = sqrt(max(reach * variance, vec2<f32>(0.0)));
+    let centre = view.focal * p.xy * e.inv_z + view.principal;
+    // A pixel is touched when its centre lies in the box.
+    let size = vec2<f32>(view.pixels);
+    let sane = is_finite(half.x + half.y) && is_finite(centre.x + centre.y) && is_finite(reach) && is_finite(e.det1)
+        && is_finite(inv_det);
+    let inside = reach > 0.0 && e.det1 > 0.0 && all(centre - half <= size - 0.5) && all(vec2<f32>(0.5) <= centre + half)
+        && half.x + half.y < 1e7;
+    if !sane || !inside {
+        return false;
+    }
+
+    let raw = colour(i, direction(mean).xyz);
+    // Colours that are not finite, or absurd, would poison whole pixels: such splats are not drawn.
+    if !(is_finite(raw.x) && is_finite(raw.y) && is_finite(raw.z)) || !all(abs(raw) < vec3<f32>(1e6)) {
+        return false;
+    }
+    let inv_std_y = sqrt(0.5 * LOG2_E / variance.y);
+    let inv_std_x = sqrt(0.5 * LOG2_E * variance.y * inv_det); // of x given y
+    (*record).place = vec4<f32>(centre, inv_std_x, -(inv_std_x * e.cov.y / variance.y));
+    (*record).reach = vec4<f32>(inv_std_y, log2(o), half);
+    (*record).look = vec4<f32>(max(raw, vec3<f32>(0.0)), p.z);
+    return true;
+}
+
+fn count_tiles(r: Record) -> u32 {
+    let box = span(r, view.tiles);
+    let e = ellipse(r);
+    var count = 0u;
+    for (var y = box.first.y; y < box.end.y; y++) {
+        for (var x = box.first.x; x < box.end.x; x++) {
+            count += u32(touches(e, vec2<u32>(x, y)));
+        }
+    }
+    return count;
+}

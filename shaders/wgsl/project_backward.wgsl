@@ -1,0 +1,188 @@
+// Stage `project_backward`: from a splat's sums in the view to the gradient of its parameters; a thread a trainable splat
+// that was seen. The chain of `project` in reverse, recomputed from the parameters instead of stored.
+
+@group(0) @binding(6) var<storage, read> status: Status;
+@group(0) @binding(7) var<storage, read> visible: array<u32>;
+@group(0) @binding(8) var<storage, read> sums: array<f32>;
+// Banks as the splats'.
+@group(0) @binding(9) var<storage, read_write> out_a: array<f32>;
+@group(0) @binding(10) var<storage, read_write> out_b: array<f32>;
+@group(0) @binding(11) var<storage, read_write> out_c: array<f32>;
+@group(0) @binding(12) var<storage, read_write> out_d: array<f32>;
+// Columns: length of the mean's gradient in pixels, the same summed without cancellation, sum of alpha T.
+@group(0) @binding(13) var<storage, read_write> statistics: array<f32>;
+
+fn put(k: u32, i: u32, value: f32) {
+    out_a[k * splats.stride + i] = value;
+}
+
+fn put3(k: u32, i: u32, value: vec3<f32>) {
+    put(k, i, value.x);
+    put(k + 1u, i, value.y);
+    put(k + 2u, i, value.z);
+}
+
+// One basis function of coefficient b: writes its gradient; returns what the colour changes by along it.
+fn put_coefficient(b: u32, i: u32, basis: f32, d_colour: vec3<f32>) -> f32 {
+    let n = splats.stride;
+    let d = d_colour * basis;
+    if b < 6u {
+        let k = (3u * b - 3u) * n + i;
+        out_b[k] = d.x;
+        out_b[k + n] = d.y;
+        out_b[k + 2u * n] = d.z;
+    } else if b < 11u {
+        let k = (3u * b - 18u) * n + i;
+        out_c[k] = d.x;
+        out_c[k + n] = d.y;
+        out_c[k + 2u * n] = d.z;
+    } else {
+        let k = (3u * b - 33u) * n + i;
+        out_d[k] = d.x;
+        out_d[k + n] = d.y;
+        out_d[k + 2u * n] = d.z;
+    }
+    return dot3(d_colour, coefficient(b, i));
+}
+
+@compute @workgroup_size(256)
+fn project_backward(
+    @builtin(workgroup_id) group: vec3<u32>,
+    @builtin(num_workgroups) groups: vec3<u32>,
+    @builtin(local_invocation_index) local: u32,
+) {
+    let place = linear(group, groups, local);
+    if place >= status.seen {
+        return;
+    }
+    let i = visible[place];
+    let s = place * MOMENTS;
+    let mean = column3(0u, i);
+    let p = camera_point(mean);
+    let e = ewa(i, p);
+
+    // The conic, and what follows from the moments.
+    let inv_det = 1.0 / e.det1;
+    let conic = vec3<f32>(e.cov.z + BLUR, -e.cov.y, e.cov.x + BLUR) * inv_det;
+    let d_mean = vec2<f32>(
+        fma(conic.x, sums[s + 1u], conic.y * sums[s + 2u]),
+        fma(conic.y, sums[s + 1u], conic.z * sums[s + 2u]),
+    );
+    let along = vec2<f32>(sums[s + 11u], sums[s + 12u]);
+    statistics[i] = sqrt(d_mean.x * d_mean.x + d_mean.y * d_mean.y);
+    statistics[splats.stride + i] = sqrt(along.x * along.x + along.y * along.y);
+    statistics[2u * splats.stride + i] = sums[s + 10u];
+
+    // dcovariance' = -K G K with G the symmetric gradient of the conic K.
+    let g = -0.5 * vec3<f32>(sums[s + 3u], sums[s + 4u], sums[s + 5u]);
+    let kg0 = vec2<f32>(conic.x * g.x + conic.y * g.y, conic.x * g.y + conic.y * g.z);
+    let kg1 = vec2<f32>(conic.y * g.x + conic.z * g.y, conic.y * g.y + conic.z * g.z);
+    var d_cov = -vec3<f32>(
+        kg0.x * conic.x + kg0.y * conic.y,
+        kg0.x * conic.y + kg0.y * conic.z,
+        kg1.x * conic.y + kg1.y * conic.z,
+    );
+
+    // Opacity: the sum of v is o_eff dL/do_eff, and o_eff = o sqrt(det0 / det1) in anti-aliased mode.
+    put(10u, i, sums[s] * (1.0 - opacity(i)));
+    if view.antialiased != 0u {
+        let ratio = e.det0 * inv_det;
+        let d_ratio = 0.5 * sums[s] / max(ratio, 1e-12);
+        d_cov.x += d_ratio * (e.cov.z * inv_det - ratio * conic.x);
+        d_cov.y -= d_ratio * (e.cov.y * inv_det + ratio * conic.y);
+        d_cov.z += d_ratio * (e.cov.x * inv_det - ratio * conic.z);
+    }
+
+    // Through A = T axes.
+    let d_a0 = 2.0 * (d_cov.x * e.a0 + d_cov.y * e.a1);
+    let d_a1 = 2.0 * (d_cov.y * e.a0 + d_cov.z * e.a1);
+    let d_t0 = e.axes * d_a0;
+    let d_t1 = e.axes * d_a1;
+    let d_axis0 = fma(e.t0, vec3<f32>(d_a0.x), e.t1 * d_a1.x);
+    let d_axis1 = fma(e.t0, vec3<f32>(d_a0.y), e.t1 * d_a1.y);
+    let d_axis2 = fma(e.t0, vec3<f32>(d_a0.z), e.t1 * d_a1.z);
+    put3(3u, i, vec3<f32>(dot3(d_axis0, e.axes[0]), dot3(d_axis1, e.axes[1]), dot3(d_axis2, e.axes[2])));
+    let r0 = d_axis0 * e.scale.x; // the rotation's gradient, by columns
+    let r1 = d_axis1 * e.scale.y;
+    let r2 = d_axis2 * e.scale.z;
+    let w = e.quat.x;
+    let x = e.quat.y;
+    let y = e.quat.z;
+    let z = e.quat.w;
+    let d_unit = vec4<f32>(
+        2.0 * (x * (r1.z - r2.y) + y * (r2.x - r0.z) + z * (r0.y - r1.x)),
+        2.0 * (y * (r1.x + r0.y) + z * (r2.x + r0.z) + w * (r1.z - r2.y)) - 4.0 * x * (r1.y + r2.z),
+        2.0 * (x * (r1.x + r0.y) + z * (r2.y + r1.z) + w * (r2.x - r0.z)) - 4.0 * y * (r0.x + r2.z),
+        2.0 * (x * (r2.x + r0.z) + y * (r2.y + r1.z) + w * (r0.y - r1.x)) - 4.0 * z * (r0.x + r1.y),
+    );
+    let d_quat = (d_unit - e.quat * dot(e.quat, d_unit)) * e.inv_norm;
+    put3(6u, i, d_quat.xyz);
+    put(9u, i, d_quat.w);
+
+    // Through T = J W and the projection of the centre.
+    var d_p = vec3<f32>(0.0, 0.0, sums[s + 9u]);
+    let third = view.rows[2].xyz;
+    let d_t = array<vec3<f32>, 2>(d_t0, d_t1);
+    for (var r = 0u; r < 2u; r++) {
+        let f_z = view.focal[r] * e.inv_z;
+        let d_j0 = dot3(d_t[r], view.rows[r].xyz);
+        let d_j2 = dot3(d_t[r], third);
+        d_p.z += f_z * e.inv_z * (e.u[r] * d_j2 - d_j0);
+        // The ratio p_r / z, of the centre and (unless clamped) of the Jacobian.
+        let d_ratio = select(0.0, -(f_z * d_j2), e.free[r]) + view.focal[r] * d_mean[r];
+        d_p[r] = d_ratio * e.inv_z;
+        d_p.z -= d_ratio * p[r] * e.inv_z * e.inv_z;
+    }
+    var d_world = fma(view.rows[0].xyz, vec3<f32>(d_p.x), fma(view.rows[1].xyz, vec3<f32>(d_p.y), third * d_p.z));
+
+    // Colour; where it is clamped at zero there is no gradient.
+    let to_splat = direction(mean);
+    let d = to_splat.xyz;
+    let shown = colour(i, d) > vec3<f32>(0.0);
+    let d_colour = select(vec3<f32>(0.0), vec3<f32>(sums[s + 6u], sums[s + 7u], sums[s + 8u]), shown);
+    put3(11u, i, d_colour * SH_C0);
+    var d_direction = vec3<f32>(0.0);
+    if splats.sh_degree >= 1u {
+        let b = basis1(d);
+        let s1 = put_coefficient(1u, i, b[0], d_colour);
+        let s2 = put_coefficient(2u, i, b[1], d_colour);
+        let s3 = put_coefficient(3u, i, b[2], d_colour);
+        d_direction = C1 * vec3<f32>(-s3, -s1, s2);
+    }
+    if splats.sh_degree >= 2u {
+        let b = basis2(d);
+        let s4 = C2A * put_coefficient(4u, i, b[0], d_colour);
+        let s5 = -C2A * put_coefficient(5u, i, b[1], d_colour);
+        let s6 = 2.0 * C2B * put_coefficient(6u, i, b[2], d_colour);
+        let s7 = -C2A * put_coefficient(7u, i, b[3], d_colour);
+        let s8 = 2.0 * C2C * put_coefficient(8u, i, b[4], d_colour);
+        d_direction += vec3<f32>(
+            s4 * d.y - s6 * d.x + s7 * d.z + s8 * d.x,
+            s4 * d.x + s5 * d.z - s6 * d.y - s8 * d.y,
+            s5 * d.y + 2.0 * s6 * d.z + s7 * d.x,
+        );
+    }
+    if splats.sh_degree >= 3u {
+        let b = basis3(d);
+        let s9 = C3A * put_coefficient(9u, i, b[0], d_colour);
+        let s10 = C3B * put_coefficient(10u, i, b[1], d_colour);
+        let s11 = C3C * put_coefficient(11u, i, b[2], d_colour);
+        let s12 = C3D * put_coefficient(12u, i, b[3], d_colour);
+        let s13 = C3C * put_coefficient(13u, i, b[4], d_colour);
+        let s14 = C3E * put_coefficient(14u, i, b[5], d_colour);
+        let s15 = C3A * put_coefficient(15u, i, b[6], d_colour);
+        let q = d * d;
+        let xy = d.x * d.y;
+        let xz = d.x * d.z;
+        let yz = d.y * d.z;
+        d_direction += vec3<f32>(
+            6.0 * s9 * xy + s10 * yz - 2.0 * s11 * xy - 6.0 * s12 * xz + s13 * (4.0 * q.z - 3.0 * q.x - q.y)
+                + 2.0 * s14 * xz + 3.0 * s15 * (q.x - q.y),
+            3.0 * s9 * (q.x - q.y) + s10 * xz + s11 * (4.0 * q.z - q.x - 3.0 * q.y) - 6.0 * s12 * yz - 2.0 * s13 * xy
+                - 2.0 * s14 * yz - 6.0 * s15 * xy,
+            s10 * xy + 8.0 * s11 * yz + s12 * (6.0 * q.z - 3.0 * (q.x + q.y)) + 8.0 * s13 * xz + s14 * (q.x - q.y),
+        );
+    }
+    d_world += (d_direction - d * dot3(d_direction, d)) * to_splat.w;
+    put3(0u, i, d_world);
+}

@@ -1,0 +1,102 @@
+// Stage `radix`: one pass of a stable sort of keys with values, by eight bits. `radix_count` counts the digits of each
+// block of 4096 entries, `scan` turns the counts (digit by digit, block by block) into places, `radix_scatter` goes there.
+
+struct Pass {
+    slot: u32,
+    shift: u32,
+    padding: vec2<u32>,
+}
+
+@group(0) @binding(0) var<storage, read> keys: array<u32>;
+@group(0) @binding(1) var<storage, read> values: array<u32>;
+@group(0) @binding(2) var<storage, read_write> keys_out: array<u32>;
+@group(0) @binding(3) var<storage, read_write> values_out: array<u32>;
+@group(0) @binding(4) var<storage, read_write> histogram: array<u32>;
+@group(0) @binding(5) var<storage, read> status: array<u32>;
+@group(0) @binding(6) var<uniform> pass_: Pass;
+
+const BLOCK: u32 = 4096u;
+const ROUNDS: u32 = 16u;
+
+var<workgroup> counts: array<atomic<u32>, 256>;
+// Bit t % 32 of word t / 32 of a digit: thread t has it in this round.
+var<workgroup> holders: array<atomic<u32>, 2048>;
+var<workgroup> next: array<u32, 256>;
+
+fn block_of(group: vec3<u32>, groups: vec3<u32>) -> u32 {
+    return group.y * groups.x + group.x;
+}
+
+@compute @workgroup_size(256)
+fn radix_count(
+    @builtin(workgroup_id) group: vec3<u32>,
+    @builtin(num_workgroups) groups: vec3<u32>,
+    @builtin(local_invocation_index) local: u32,
+) {
+    let count = status[pass_.slot];
+    let block = block_of(group, groups);
+    atomicStore(&counts[local], 0u);
+    workgroupBarrier();
+    for (var round = 0u; round < ROUNDS; round++) {
+        let at = block * BLOCK + round * 256u + local;
+        if at < count {
+            atomicAdd(&counts[(keys[at] >> pass_.shift) & 255u], 1u);
+        }
+    }
+    workgroupBarrier();
+    let blocks = count / BLOCK + select(0u, 1u, count % BLOCK != 0u);
+    if block < blocks {
+        histogram[local * blocks + block] = atomicLoad(&counts[local]);
+    }
+}
+
+@compute @workgroup_size(256)
+fn radix_scatter(
+    @builtin(workgroup_id) group: vec3<u32>,
+    @builtin(num_workgroups) groups: vec3<u32>,
+    @builtin(local_invocation_index) local: u32,
+) {
+    let count = status[pass_.slot];
+    let block = block_of(group, groups);
+    let blocks = count / BLOCK + select(0u, 1u, count % BLOCK != 0u);
+    var start = 0u;
+    if block < blocks {
+        start = histogram[local * blocks + block];
+    }
+    next[local] = start;
+    for (var word = 0u; word < 8u; word++) {
+        atomicStore(&holders[word * 256u + local], 0u);
+    }
+    workgroupBarrier();
+    let word = local / 32u;
+    let bit = 1u << (local % 32u);
+    for (var round = 0u; round < ROUNDS; round++) {
+        let at = block * BLOCK + round * 256u + local;
+        var key = 0u;
+        var digit = 0u;
+        if at < count {
+            key = keys[at];
+            digit = (key >> pass_.shift) & 255u;
+            // Which threads have which digit: the order in which they say so does not matter.
+            atomicOr(&holders[word * 256u + digit], bit);
+        }
+        workgroupBarrier();
+        if at < count {
+            var rank = countOneBits(atomicLoad(&holders[word * 256u + digit]) & (bit - 1u));
+            for (var before = 0u; before < word; before++) {
+                rank += countOneBits(atomicLoad(&holders[before * 256u + digit]));
+            }
+            let to = next[digit] + rank;
+            keys_out[to] = key;
+            values_out[to] = values[at];
+        }
+        workgroupBarrier();
+        var found = 0u;
+        for (var each = 0u; each < 8u; each++) {
+            found += countOneBits(atomicLoad(&holders[each * 256u + local]));
+            atomicStore(&holders[each * 256u + local], 0u);
+        }
+        next[local] += found;
+        workgroupBarrier();
+    }
+}

@@ -1,0 +1,105 @@
+// Stage `rasterize`: a workgroup draws a tile, a thread a pixel, front to back until every pixel is finished.
+
+@group(0) @binding(0) var<uniform> view: View;
+@group(0) @binding(1) var<storage, read> tile_ranges: array<vec2<u32>>;
+@group(0) @binding(2) var<storage, read> sorted: array<u32>;
+@group(0) @binding(3) var<storage, read> pair_splat: array<u32>;
+@group(0) @binding(4) var<storage, read> records: array<Record>;
+// Planes: red, green, blue, transmittance and, with extras, depth and own.
+@group(0) @binding(5) var<storage, read_write> frame: array<f32>;
+// For each pixel the end of what was blended there: one past its last pair, 0 if there was none.
+@group(0) @binding(6) var<storage, read_write> last: array<u32>;
+
+const BATCH: u32 = 256u;
+
+var<workgroup> places: array<vec4<f32>, BATCH>;
+var<workgroup> reaches: array<vec2<f32>, BATCH>;
+var<workgroup> looks: array<vec4<f32>, BATCH>;
+var<workgroup> owns: array<f32, BATCH>;
+var<workgroup> alive: atomic<u32>;
+var<workgroup> alive_now: u32;
+
+@compute @workgroup_size(256)
+fn rasterize(
+    @builtin(workgroup_id) group: vec3<u32>,
+    @builtin(num_workgroups) groups: vec3<u32>,
+    @builtin(local_invocation_index) local: u32,
+) {
+    // More workgroups than tiles: the last ones find no pair and no pixel.
+    let tile = group.y * groups.x + group.x;
+    let exists = tile < view.tiles.x * view.tiles.y;
+    var range = vec2<u32>(0u);
+    if exists {
+        range = tile_ranges[tile];
+    }
+    let corner = vec2<u32>(tile % view.tiles.x, tile / view.tiles.x) * TILE;
+    let at = corner + vec2<u32>(local % TILE, local / TILE);
+    let inside = exists && all(at < view.pixels);
+    let pixel = vec2<f32>(at) + 0.5;
+
+    var transmittance = 1.0;
+    var finished = !inside;
+    var colour = vec3<f32>(0.0);
+    var depth = 0.0;
+    var own = 0.0;
+    var end = 0u;
+    for (var first = range.x; first < range.y; first += BATCH) {
+        if local == 0u {
+            atomicStore(&alive, 0u);
+        }
+        workgroupBarrier();
+        if !finished {
+            atomicOr(&alive, 1u);
+        }
+        workgroupBarrier();
+        if local == 0u {
+            alive_now = atomicLoad(&alive);
+        }
+        if workgroupUniformLoad(&alive_now) == 0u {
+            break;
+        }
+        let count = min(BATCH, range.y - first);
+        if local < count {
+            let i = pair_splat[sorted[first + local]];
+            let record = records[i];
+            places[local] = record.place;
+            reaches[local] = record.reach.xy;
+            looks[local] = record.look;
+            owns[local] = f32(i < view.own);
+        }
+        workgroupBarrier();
+        for (var k = 0u; k < count && !finished; k++) {
+            let touched = touch(places[k], reaches[k].x, reaches[k].y, pixel);
+            if touched.alpha < ALPHA_MIN {
+                continue;
+            }
+            let weight = min(touched.alpha, ALPHA_MAX) * transmittance;
+            let rest = transmittance - weight;
+            if rest <= TRANSMITTANCE_MIN {
+                finished = true;
+                break;
+            }
+            let look = looks[k];
+            colour = fma(vec3<f32>(weight), look.xyz, colour);
+            depth = fma(weight, look.w, depth);
+            own = fma(weight, owns[k], own);
+            transmittance = rest;
+            end = first + k + 1u;
+        }
+    }
+
+    if inside {
+        let area = view.pixels.x * view.pixels.y;
+        let to = at.y * view.pixels.x + at.x;
+        colour = fma(vec3<f32>(transmittance), view.background.xyz, colour);
+        frame[to] = colour.x;
+        frame[area + to] = colour.y;
+        frame[2u * area + to] = colour.z;
+        frame[3u * area + to] = transmittance;
+        if view.extras != 0u {
+            frame[4u * area + to] = depth;
+            frame[5u * area + to] = own;
+        }
+        last[to] = end;
+    }
+}

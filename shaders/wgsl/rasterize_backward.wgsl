@@ -1,0 +1,217 @@
+// Stage `rasterize_backward`: the gradient of each pair of a trainable splat and a tile, as sums over the tile's pixels.
+//
+// A workgroup walks its tile's pairs front to back, as `rasterize` does, eight at a time, in two steps. First a thread is a
+// pixel: it replays its eight opacities, knows the colour behind each as "final minus seen so far", and leaves
+// v = alpha dL/dalpha and w = alpha T in workgroup memory. Then 32 threads are a pair: each adds up eight pixels of one
+// column, so that most moments need only the sums of v, v dy and v dy^2; 32 such sums are added in order. No atomics
+// on floats: the same bits every time.
+
+@group(0) @binding(0) var<uniform> view: View;
+@group(0) @binding(1) var<storage, read> tile_ranges: array<vec2<u32>>;
+@group(0) @binding(2) var<storage, read> sorted: array<u32>;
+@group(0) @binding(3) var<storage, read> pair_splat: array<u32>;
+@group(0) @binding(4) var<storage, read> records: array<Record>;
+@group(0) @binding(5) var<storage, read> frame: array<f32>;
+@group(0) @binding(6) var<storage, read> last: array<u32>;
+// Planes: dL/d red, green, blue and, where `planes` says so, transmittance and depth.
+@group(0) @binding(7) var<storage, read> upstream: array<f32>;
+@group(0) @binding(8) var<uniform> planes: Planes;
+// MOMENTS floats a pair: v, v dx, v dy, v dx^2, v dx dy, v dy^2, w red, w green, w blue, w depth, w, |x|, |y|; the three
+// colours and depth stand for the upstream gradients, |x| and |y| for the mean's gradient summed without cancellation.
+@group(0) @binding(9) var<storage, read_write> moments: array<f32>;
+
+const PAIRS: u32 = 8u; // at a time
+const PARTS: u32 = 32u; // threads of a pair
+const PIXELS: u32 = 8u; // of a part
+const STRIDE: u32 = 33u; // not 32: threads that add up different moments read different memory banks
+
+var<workgroup> places: array<vec4<f32>, PAIRS>;
+var<workgroup> reaches: array<vec2<f32>, PAIRS>;
+var<workgroup> looks: array<vec4<f32>, PAIRS>;
+var<workgroup> pairs: array<u32, PAIRS>;
+var<workgroup> owns: array<u32, PAIRS>;
+// dL/d colour and depth of each pixel.
+var<workgroup> wanted: array<vec4<f32>, 256>;
+// v of pair k and pixel p at 256 k + p, w 2048 later; then the parts of the moments.
+var<workgroup> shared_: array<f32, 4096>;
+// Bit k: some pixel blended pair k.
+var<workgroup> blended: atomic<u32>;
+var<workgroup> end_of_tile: atomic<u32>;
+var<workgroup> end_now: u32;
+
+@compute @workgroup_size(256)
+fn rasterize_backward(
+    @builtin(workgroup_id) group: vec3<u32>,
+    @builtin(num_workgroups) groups: vec3<u32>,
+    @builtin(local_invocation_index) local: u32,
+) {
+    let tile = group.y * groups.x + group.x;
+    let exists = tile < view.tiles.x * view.tiles.y;
+    var range = vec2<u32>(0u);
+    if exists {
+        range = tile_ranges[tile];
+    }
+    let corner = vec2<u32>(tile % view.tiles.x, tile / view.tiles.x) * TILE;
+    let at = corner + vec2<u32>(local % TILE, local / TILE);
+    let area = view.pixels.x * view.pixels.y;
+    let here = at.y * view.pixels.x + at.x;
+
+    // Of this thread's pixel: the upstream gradient, the end of what was blended, and what lies behind the splats seen so
+    // far, weighted by the gradient; at first all of it.
+    var gradient = vec4<f32>(0.0);
+    var end = 0u;
+    var behind = 0.0;
+    if exists && all(at < view.pixels) {
+        gradient = vec4<f32>(upstream[here], upstream[area + here], upstream[2u * area + here], 0.0);
+        let colour = vec3<f32>(frame[here], frame[area + here], frame[2u * area + here]);
+        behind = fma(colour.x, gradient.x, fma(colour.y, gradient.y, colour.z * gradient.z));
+        if planes.transmittance != 0u {
+            behind = fma(frame[3u * area + here], upstream[3u * area + here], behind);
+        }
+        if planes.depth != 0u {
+            gradient.w = upstream[4u * area + here];
+            behind = fma(frame[4u * area + here], gradient.w, behind);
+        }
+        end = last[here];
+    }
+    wanted[local] = gradient;
+    if local == 0u {
+        atomicStore(&end_of_tile, range.x);
+    }
+    workgroupBarrier();
+    atomicMax(&end_of_tile, end);
+    workgroupBarrier();
+    if local == 0u {
+        end_now = atomicLoad(&end_of_tile);
+    }
+    let stop = workgroupUniformLoad(&end_now);
+
+    let pixel = vec2<f32>(at) + 0.5;
+    var transmittance = 1.0;
+    for (var first = range.x; first < stop; first += PAIRS) {
+        let count = min(PAIRS, range.y - first);
+        if local < count {
+            let pair = sorted[first + local];
+            let i = pair_splat[pair];
+            let record = records[i];
+            places[local] = record.place;
+            reaches[local] = record.reach.xy;
+            looks[local] = record.look;
+            pairs[local] = pair;
+            owns[local] = u32(i < view.own);
+        }
+        if local == 0u {
+            atomicStore(&blended, 0u);
+        }
+        workgroupBarrier();
+
+        var mine = 0u;
+        for (var k = 0u; k < count; k++) {
+            var v = 0.0;
+            var w = 0.0;
+            if first + k < end {
+                let touched = touch(places[k], reaches[k].x, reaches[k].y, pixel);
+                if touched.alpha >= ALPHA_MIN {
+                    let alpha = min(touched.alpha, ALPHA_MAX);
+                    w = alpha * transmittance;
+                    let look = looks[k];
+                    let along = fma(gradient.x, look.x, fma(gradient.y, look.y, fma(gradient.z, look.z, gradient.w * look.w)));
+                    behind = fma(-w, along, behind);
+                    // alpha dL/dalpha = alpha (T along - behind / (1 - alpha)); zero where clamped.
+                    if touched.alpha < ALPHA_MAX {
+                        v = alpha * (transmittance * along - behind / (1.0 - alpha));
+                    }
+                    transmittance -= w;
+                    mine |= 1u << k;
+                }
+            }
+            shared_[256u * k + local] = v;
+            shared_[2048u + 256u * k + local] = w;
+        }
+        if mine != 0u {
+            atomicOr(&blended, mine);
+        }
+        workgroupBarrier();
+
+        let k = local / PARTS;
+        let part = local % PARTS;
+        var sums = Sums(0.0, 0.0, 0.0, vec4<f32>(0.0), 0.0, vec2<f32>(0.0));
+        let any = ((atomicLoad(&blended) >> k) & 1u) != 0u;
+        let dx = f32(corner.x + part % TILE) + 0.5 - places[k].x;
+        if k < count && any && owns[k] != 0u {
+            sums = add_up(k, part, dx, f32(corner.y + part / TILE) + 0.5 - places[k].y);
+        }
+        workgroupBarrier();
+        if k < count {
+            let to = k * MOMENTS * STRIDE + part;
+            shared_[to] = sums.v;
+            shared_[to + STRIDE] = sums.v * dx;
+            shared_[to + 2u * STRIDE] = sums.vy;
+            shared_[to + 3u * STRIDE] = sums.v * dx * dx;
+            shared_[to + 4u * STRIDE] = sums.vy * dx;
+            shared_[to + 5u * STRIDE] = sums.vyy;
+            shared_[to + 6u * STRIDE] = sums.look.x;
+            shared_[to + 7u * STRIDE] = sums.look.y;
+            shared_[to + 8u * STRIDE] = sums.look.z;
+            shared_[to + 9u * STRIDE] = sums.look.w;
+            shared_[to + 10u * STRIDE] = sums.w;
+            shared_[to + 11u * STRIDE] = sums.along.x;
+            shared_[to + 12u * STRIDE] = sums.along.y;
+        }
+        workgroupBarrier();
+        if local < count * MOMENTS && owns[local / MOMENTS] != 0u {
+            var total = 0.0;
+            for (var p = 0u; p < PARTS; p++) {
+                total += shared_[local * STRIDE + p];
+            }
+            moments[pairs[local / MOMENTS] * MOMENTS + local % MOMENTS] = total;
+        }
+        workgroupBarrier();
+    }
+
+    // Pairs behind the last one that any pixel blended.
+    var rest = max(stop, range.x);
+    if stop > range.x {
+        // The loop above went to the end of a group of eight.
+        rest = min(range.x + (stop - range.x + PAIRS - 1u) / PAIRS * PAIRS, range.y);
+    }
+    let words = (range.y - rest) * MOMENTS;
+    for (var word = local; word < words; word += 256u) {
+        moments[sorted[rest + word / MOMENTS] * MOMENTS + word % MOMENTS] = 0.0;
+    }
+}
+
+struct Sums {
+    v: f32,
+    vy: f32,
+    vyy: f32,
+    look: vec4<f32>,
+    w: f32,
+    along: vec2<f32>,
+}
+
+// The sums over the eight pixels of a part: column part % 16, every second row from part / 16; dx and dy of the first.
+fn add_up(k: u32, part: u32, dx: f32, dy: f32) -> Sums {
+    let a = places[k].z;
+    let b = places[k].w;
+    let c = reaches[k].x;
+    // dalpha/d(mean) / alpha: the exponent's derivative in natural units.
+    let aa = 2.0 * LN_2 * a * a;
+    let ab = 2.0 * LN_2 * a * b;
+    let bc = 2.0 * LN_2 * fma(b, b, c * c);
+    var sums = Sums(0.0, 0.0, 0.0, vec4<f32>(0.0), 0.0, vec2<f32>(0.0));
+    for (var n = 0u; n < PIXELS; n++) {
+        let p = part + PARTS * n;
+        let v = shared_[256u * k + p];
+        let w = shared_[2048u + 256u * k + p];
+        let y = dy + f32(2u * n);
+        let vy = v * y;
+        sums.v += v;
+        sums.vy += vy;
+        sums.vyy = fma(vy, y, sums.vyy);
+        sums.look = fma(vec4<f32>(w), wanted[p], sums.look);
+        sums.w += w;
+        sums.along += abs(v) * abs(vec2<f32>(fma(aa, dx, ab * y), fma(bc, y, ab * dx)));
+    }
+    return sums;
+}

@@ -1,0 +1,111 @@
+// Stage `scan`: exclusive sums in place, in three dispatches: of each block, over the blocks, within each block. Sums
+// that would not fit stay at the largest number, so that whoever compares them with a limit cannot be fooled.
+
+struct Pass {
+    slot: u32,
+    shift: u32,
+    padding: vec2<u32>,
+}
+
+@group(0) @binding(0) var<storage, read_write> data: array<u32>;
+@group(0) @binding(1) var<storage, read_write> block_sums: array<u32>;
+@group(0) @binding(2) var<storage, read> status: array<u32>;
+@group(0) @binding(3) var<uniform> pass_: Pass;
+
+const BLOCK: u32 = 1024u; // four entries a thread
+
+var<workgroup> partial: array<u32, 256>;
+
+fn add(a: u32, b: u32) -> u32 {
+    let sum = a + b;
+    return select(sum, 0xffffffffu, sum < a);
+}
+
+fn block_of(group: vec3<u32>, groups: vec3<u32>) -> u32 {
+    return group.y * groups.x + group.x;
+}
+
+fn load(at: u32, count: u32) -> u32 {
+    if at < count {
+        return data[at];
+    }
+    return 0u;
+}
+
+// The sum of `value` over the threads before this one; all threads must come here. `partial[255]` is the sum of all.
+fn exclusive(value: u32, local: u32) -> u32 {
+    partial[local] = value;
+    workgroupBarrier();
+    for (var reach = 1u; reach < 256u; reach *= 2u) {
+        var before = 0u;
+        if local >= reach {
+            before = partial[local - reach];
+        }
+        workgroupBarrier();
+        partial[local] = add(before, partial[local]);
+        workgroupBarrier();
+    }
+    if local == 0u {
+        return 0u;
+    }
+    return partial[local - 1u];
+}
+
+@compute @workgroup_size(256)
+fn scan_blocks(
+    @builtin(workgroup_id) group: vec3<u32>,
+    @builtin(num_workgroups) groups: vec3<u32>,
+    @builtin(local_invocation_index) local: u32,
+) {
+    let count = status[pass_.slot];
+    let block = block_of(group, groups);
+    let at = block * BLOCK + 4u * local;
+    let sum = add(add(load(at, count), load(at + 1u, count)), add(load(at + 2u, count), load(at + 3u, count)));
+    exclusive(sum, local);
+    if local == 0u && block * BLOCK < count {
+        block_sums[block] = partial[255];
+    }
+}
+
+@compute @workgroup_size(256)
+fn scan_sums(@builtin(local_invocation_index) local: u32) {
+    let count = status[pass_.slot];
+    let blocks = count / BLOCK + select(0u, 1u, count % BLOCK != 0u);
+    var carry = 0u;
+    for (var first = 0u; first < blocks; first += 256u) {
+        let at = first + local;
+        var value = 0u;
+        if at < blocks {
+            value = block_sums[at];
+        }
+        let before = exclusive(value, local);
+        if at < blocks {
+            block_sums[at] = add(carry, before);
+        }
+        carry = add(carry, partial[255]);
+        workgroupBarrier();
+    }
+}
+
+@compute @workgroup_size(256)
+fn scan_apply(
+    @builtin(workgroup_id) group: vec3<u32>,
+    @builtin(num_workgroups) groups: vec3<u32>,
+    @builtin(local_invocation_index) local: u32,
+) {
+    let count = status[pass_.slot];
+    let block = block_of(group, groups);
+    let at = block * BLOCK + 4u * local;
+    var values = array<u32, 4>(load(at, count), load(at + 1u, count), load(at + 2u, count), load(at + 3u, count));
+    let before = exclusive(add(add(values[0], values[1]), add(values[2], values[3])), local);
+    if block * BLOCK >= count {
+        return;
+    }
+    var sum = add(block_sums[block], before);
+    for (var k = 0u; k < 4u; k++) {
+        if at + k < count {
+            data[at + k] = sum;
+        }
+        sum = add(sum, values[k]);
+    }
+}

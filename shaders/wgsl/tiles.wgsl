@@ -1,0 +1,49 @@
+// Which tiles the ellipse of a record at alpha = 1/255 touches. `project` counts them and `emit` lists them: both must
+// find the same ones, so nothing here leaves a compiler a choice of how to round (fma where a product is added).
+
+struct Span {
+    first: vec2<u32>,
+    end: vec2<u32>,
+}
+
+// The tiles of the ellipse's box; extents are below 1e7.
+fn span(r: Record, tiles: vec2<u32>) -> Span {
+    let low = max((r.place.xy - r.reach.zw - 0.5) * 0.0625, vec2<f32>(0.0));
+    let high = max((r.place.xy + r.reach.zw - 0.5) * 0.0625, vec2<f32>(0.0));
+    return Span(vec2<u32>(low), min(vec2<u32>(high) + 1u, tiles));
+}
+
+struct Ellipse {
+    mean: vec2<f32>,
+    a: f32,
+    b: f32,
+    c: f32,
+    // Where the exponent is largest on a vertical (times x) and on a horizontal line (times y).
+    on_column: f32,
+    on_row: f32,
+    // What the squares may come to.
+    reach: f32,
+}
+
+fn ellipse(r: Record) -> Ellipse {
+    let a = r.place.z;
+    let b = r.place.w;
+    let c = r.reach.x;
+    // log2(1/255) is -7.9943534; a little slack, as the rasterizer tests each pixel anyway.
+    return Ellipse(r.place.xy, a, b, c, -(a * b) / fma(b, b, c * c), -b / a, r.reach.y + 7.9953534);
+}
+
+fn touches(e: Ellipse, tile: vec2<u32>) -> bool {
+    // Pixel centres of the tile's corners, from the mean.
+    let low = vec2<f32>(tile * TILE) + 0.5 - e.mean;
+    let high = low + 15.0;
+    let near = max(low, min(vec2<f32>(0.0), high));
+    // The largest exponent over a tile lies on the vertical or horizontal line nearest to the mean.
+    let y = min(max(e.on_column * near.x, low.y), high.y);
+    let u0 = fma(e.a, near.x, e.b * y);
+    let v0 = e.c * y;
+    let x = min(max(e.on_row * near.y, low.x), high.x);
+    let u1 = fma(e.a, x, e.b * near.y);
+    let v1 = e.c * near.y;
+    return min(fma(u0, u0, v0 * v0), fma(u1, u1, v1 * v1)) <= e.reach;
+}

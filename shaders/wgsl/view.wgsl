@@ -1,0 +1,80 @@
+// What all stages share: constants (those of `render`, which a test there compares), the view and its status.
+
+const GROUP: u32 = 256u;
+const TILE: u32 = 16u;
+const MOMENTS: u32 = 13u;
+
+const NEAR_METRES: f32 = 0.01;
+const BLUR: f32 = 0.3;
+const ALPHA_MIN: f32 = 0.003921569;
+const ALPHA_MAX: f32 = 0.999;
+const TRANSMITTANCE_MIN: f32 = 1e-4;
+const SH_C0: f32 = 0.28209479;
+const LOG2_E: f32 = 1.4426950;
+const LN_2: f32 = 0.6931472;
+
+struct View {
+    rows: array<vec4<f32>, 3>,
+    centre: vec4<f32>,
+    background: vec4<f32>,
+    focal: vec2<f32>,
+    principal: vec2<f32>,
+    cone_min: vec2<f32>,
+    cone_max: vec2<f32>,
+    pixels: vec2<u32>,
+    tiles: vec2<u32>,
+    own: u32,
+    total: u32,
+    pair_capacity: u32,
+    antialiased: u32,
+    extras: u32,
+    padding: u32,
+    more_padding: vec2<u32>,
+}
+
+struct Set {
+    first: u32,
+    count: u32,
+    stride: u32,
+    sh_degree: u32,
+}
+
+struct Planes {
+    transmittance: u32,
+    depth: u32,
+    padding: vec2<u32>,
+}
+
+struct Status {
+    overflow: u32,
+    fault: u32,
+    pairs: u32,
+    most_pairs: u32,
+    visible: u32,
+    seen: u32,
+    splat_slots: u32,
+    visible_slots: u32,
+    visible_digits: u32,
+    pair_digits: u32,
+}
+
+// A splat in the view. The ellipse is the conic's Cholesky factor for exponents of two:
+// alpha = 2^(log2_opacity - (a dx + b dy)^2 - (c dy)^2); the conic itself would cancel along needles.
+struct Record {
+    // Mean in pixels, a, b.
+    place: vec4<f32>,
+    // c, log2 of the opacity, half extents in pixels of the ellipse at alpha = 1/255.
+    reach: vec4<f32>,
+    // Colour, clamped from below at 0; depth in metres.
+    look: vec4<f32>,
+}
+
+// The number of a thread in a dispatch of one or two dimensions of workgroups.
+fn linear(group: vec3<u32>, groups: vec3<u32>, local: u32) -> u32 {
+    return (group.y * groups.x + group.x) * GROUP + local;
+}
+
+// By bits: compilers may take comparisons for granted that only NaN fails.
+fn is_finite(x: f32) -> bool {
+    return (bitcast<u32>(x) & 0x7f800000u) != 0x7f800000u;
+}
