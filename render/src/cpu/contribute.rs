@@ -120,10 +120,10 @@ fn contribute_lanes<L: Lanes>(tile: &TileInput, band: &Band, out: &mut [Moments]
             let t = L::load(&live[b]);
             let weight = alpha * t;
             let next = t - weight;
-            let finished = next.le(L::splat(TRANSMITTANCE_MIN));
-            let weight = L::select(finished, L::zero(), weight);
-            L::select(finished, L::zero(), next).store(&mut live[b]);
-            if finished == u16::MAX {
+            let end = L::splat(TRANSMITTANCE_MIN);
+            let weight = weight.unless_le(next, end);
+            next.unless_le(next, end).store(&mut live[b]);
+            if next.all_le(end) {
                 alive &= !(1 << b);
             }
             let rest = each!(c in [0, 1, 2] => {
@@ -136,9 +136,8 @@ fn contribute_lanes<L: Lanes>(tile: &TileInput, band: &Band, out: &mut [Moments]
             }
             // The pixel's change with α, and without the splat.
             let open = (L::splat(1.0) - alpha).recip();
-            let drawn = !finished & L::zero().lt(alpha);
             let d = each!(c in [0, 1, 2] => {
-                L::select(drawn, t * L::splat(r[at::RED + c]) - rest[c] * open, L::zero())
+                (t * L::splat(r[at::RED + c]) - rest[c] * open).unless_le(next, end).unless_le(alpha, L::zero())
             });
             let count = L::load(&weights[b]);
             let d2 = count * d[0].fma(d[0], d[1].fma(d[1], d[2] * d[2]));

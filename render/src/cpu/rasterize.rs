@@ -112,12 +112,12 @@ pub(crate) struct Visited {
     pub(crate) blocks: u32,
 }
 
-/// α of sixteen pixels under a splat, zero where it is skipped; dx, dy from its mean; and the lanes where α is clamped.
+/// α of sixteen pixels under a splat, zero where it is skipped; dx, dy from its mean; and α before it was clamped or skipped.
 pub(crate) struct Alpha<L> {
     pub(crate) alpha: L,
     pub(crate) dx: L,
     pub(crate) dy: L,
-    pub(crate) clamped: u16,
+    pub(crate) raw: L,
 }
 
 /// A splat's record spread over lanes.
@@ -151,10 +151,8 @@ impl<L: Lanes> Spread<L> {
         let (u, v) = (self.a.fma(dx, self.b * dy), self.c * dy);
         let exponent = (-u).fma(u, (-v).fma(v, self.log2_opacity));
         let raw = exponent.exp2();
-        let drawn = L::splat(ALPHA_MIN).le(raw);
-        let clamped = L::splat(ALPHA_MAX).le(raw);
-        let alpha = L::select(drawn, raw.min(L::splat(ALPHA_MAX)), L::zero());
-        Alpha { alpha, dx, dy, clamped }
+        let alpha = raw.min(L::splat(ALPHA_MAX)).where_le(L::splat(ALPHA_MIN), raw);
+        Alpha { alpha, dx, dy, raw }
     }
 }
 
@@ -208,10 +206,9 @@ fn rasterize_tile<L: Lanes, const EXTRAS: bool>(tile: &TileInput, background: &[
             let t = L::load(&live[b]);
             let weight = alpha * t;
             let next = t - weight;
-            let finished = next.le(L::splat(TRANSMITTANCE_MIN));
-            let weight = L::select(finished, L::zero(), weight);
-            let next = L::select(finished, L::zero(), next);
-            next.store(&mut live[b]);
+            let end = L::splat(TRANSMITTANCE_MIN);
+            let weight = weight.unless_le(next, end);
+            next.unless_le(next, end).store(&mut live[b]);
             (L::load(&last[b]) - weight).store(&mut last[b]);
             for c in 0..3 {
                 weight.fma(L::splat(r[at::RED + c]), L::load(&colour[c][b])).store(&mut colour[c][b]);
@@ -220,7 +217,7 @@ fn rasterize_tile<L: Lanes, const EXTRAS: bool>(tile: &TileInput, background: &[
                 weight.fma(L::splat(r[at::Z]), L::load(&depth[b])).store(&mut depth[b]);
                 weight.fma(L::splat(r[at::OWN]), L::load(&own[b])).store(&mut own[b]);
             }
-            if finished == u16::MAX {
+            if next.all_le(end) {
                 alive &= !(1 << b);
             }
         }
@@ -332,14 +329,14 @@ fn rasterize_backward_tile<L: Lanes, const DEPTH: bool>(tile: &TileInput, band: 
         while blocks != 0 {
             let b = blocks.trailing_zeros() as usize & (BLOCKS - 1);
             blocks &= blocks - 1;
-            let Alpha { alpha, dx, dy, clamped } = spread.alpha(b, lane_x, lane_y);
+            let Alpha { alpha, dx, dy, raw } = spread.alpha(b, lane_x, lane_y);
             let t = L::load(&live[b]);
             let weight = alpha * t;
             let next = t - weight;
-            let finished = next.le(L::splat(TRANSMITTANCE_MIN));
-            let weight = L::select(finished, L::zero(), weight);
-            L::select(finished, L::zero(), next).store(&mut live[b]);
-            if finished == u16::MAX {
+            let end = L::splat(TRANSMITTANCE_MIN);
+            let weight = weight.unless_le(next, end);
+            next.unless_le(next, end).store(&mut live[b]);
+            if next.all_le(end) {
                 alive &= !(1 << b);
             }
             let gradient = each!(c in [0, 1, 2] => L::load(&d_colour[c][b]));
@@ -358,7 +355,7 @@ fn rasterize_backward_tile<L: Lanes, const DEPTH: bool>(tile: &TileInput, band: 
             }
             // α dL/dα = α (T·along - rest / (1 - α)); zero where clamped, finished or skipped.
             let d_alpha = t * along - rest * (L::splat(1.0) - alpha).recip();
-            let v = L::select(finished | clamped, L::zero(), alpha * d_alpha);
+            let v = (alpha * d_alpha).unless_le(next, end).unless_le(L::splat(ALPHA_MAX), raw);
             let (vx, vy) = (v * dx, v * dy);
             sums[moment::V] = sums[moment::V] + v;
             sums[moment::VX] = sums[moment::VX] + vx;

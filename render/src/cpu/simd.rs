@@ -138,6 +138,21 @@ pub trait Lanes:
     fn le(self, b: Self) -> u16;
     /// Lanes of `a` where the mask is set, of `b` elsewhere.
     fn select(mask: u16, a: Self, b: Self) -> Self;
+    /// `self` where `a <= b`, zero elsewhere (and where one of them is NaN).
+    #[inline(always)]
+    fn where_le(self, a: Self, b: Self) -> Self {
+        Self::select(a.le(b), self, Self::zero())
+    }
+    /// Zero where `a <= b`, `self` elsewhere (and where one of them is NaN).
+    #[inline(always)]
+    fn unless_le(self, a: Self, b: Self) -> Self {
+        Self::select(a.le(b), Self::zero(), self)
+    }
+    /// `self <= b` in every lane.
+    #[inline(always)]
+    fn all_le(self, b: Self) -> bool {
+        self.le(b) == u16::MAX
+    }
     /// 2^self, relative error below 3e-7 for exponents in -126 ..= 126; clamped outside.
     fn exp2(self) -> Self;
     /// 1 / self, relative error below 2e-7, for normal numbers.
@@ -566,6 +581,28 @@ mod x86 {
                 Self(_mm256_blendv_ps(b.0, a.0, Self::mask(mask)), _mm256_blendv_ps(b.1, a.1, Self::mask(mask >> 8)))
             }
         }
+        // Comparisons are vectors here: through sixteen bits and back takes longer than all else in a rasterizer's loop.
+        #[inline(always)]
+        fn where_le(self, a: Self, b: Self) -> Self {
+            unsafe {
+                let (lo, hi) = (_mm256_cmp_ps::<_CMP_LE_OQ>(a.0, b.0), _mm256_cmp_ps::<_CMP_LE_OQ>(a.1, b.1));
+                Self(_mm256_and_ps(lo, self.0), _mm256_and_ps(hi, self.1))
+            }
+        }
+        #[inline(always)]
+        fn unless_le(self, a: Self, b: Self) -> Self {
+            unsafe {
+                let (lo, hi) = (_mm256_cmp_ps::<_CMP_LE_OQ>(a.0, b.0), _mm256_cmp_ps::<_CMP_LE_OQ>(a.1, b.1));
+                Self(_mm256_andnot_ps(lo, self.0), _mm256_andnot_ps(hi, self.1))
+            }
+        }
+        #[inline(always)]
+        fn all_le(self, b: Self) -> bool {
+            unsafe {
+                let (lo, hi) = (_mm256_cmp_ps::<_CMP_LE_OQ>(self.0, b.0), _mm256_cmp_ps::<_CMP_LE_OQ>(self.1, b.1));
+                _mm256_movemask_ps(_mm256_and_ps(lo, hi)) == 0xff
+            }
+        }
         #[inline(always)]
         fn exp2(self) -> Self {
             let x = self.max(Self::splat(-126.0)).min(Self::splat(126.0));
@@ -643,6 +680,12 @@ mod tests {
             L::select(mask, a, b),
             L::select(b.le(a), a, b),
             L::sums(&sums),
+            a.where_le(b, a),
+            a.unless_le(b, a),
+            a.where_le(L::splat(f32::NAN), b),
+            a.unless_le(L::splat(f32::NAN), b),
+            L::splat(if a.all_le(b) { 1.0 } else { 0.0 }),
+            L::splat(if a.min(b).all_le(b) { 1.0 } else { 0.0 }),
         ] {
             out.push(v.to_array());
         }
@@ -671,6 +714,9 @@ mod tests {
             assert!(close(out[10][i] / x[i].exp2(), 1.0));
             assert!(close(out[11][i], 1.0 / y[i].abs()));
             assert_eq!(out[12][i], if x[i] < y[i] { x[i] } else { y[i] });
+            assert_eq!([out[15][i], out[16][i]], if y[i] <= x[i] { [x[i], 0.0] } else { [0.0, x[i]] });
+            assert_eq!([out[17][i], out[18][i]], [0.0, x[i]]);
+            assert_eq!([out[19][i], out[20][i]], [0.0, 1.0]);
             let sum: f32 = (0..16).map(|l| x[l] * i as f32 + y[l]).sum();
             assert!((out[14][i] - sum).abs() < 1e-3);
         }
