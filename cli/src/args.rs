@@ -134,11 +134,11 @@ pub(crate) enum Blocks {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub(crate) enum Backend {
-    /// The fastest there is
+    /// A GPU where there is one that is not software, else the CPU
     Auto,
     /// SIMD and threads
     Cpu,
-    /// Not in this version
+    /// Vulkan, Metal or DirectX 12; PLAT_GPU_ADAPTER chooses an adapter by a part of its name
     Gpu,
 }
 

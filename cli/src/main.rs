@@ -26,6 +26,7 @@ use output::Output;
 
 fn main() -> ExitCode {
     give_buffers_back();
+    leave_adapters_to_us();
     let cli = match config::parse(std::env::args_os().collect()) {
         Ok(cli) => cli,
         Err(config::Stop::Shown(text)) => {
@@ -72,5 +73,14 @@ fn give_buffers_back() {
     // SAFETY: it sets a number of the allocator, before there is another thread.
     unsafe {
         libc::mallopt(libc::M_MMAP_THRESHOLD, 1 << 20);
+    }
+}
+
+/// Mesa's layer that puts the display's adapter first looks for a display, and complains on stderr where there is none.
+fn leave_adapters_to_us() {
+    #[cfg(target_os = "linux")]
+    // SAFETY: there is no other thread yet that could read the environment.
+    unsafe {
+        std::env::set_var("NODEVICE_SELECT", "1");
     }
 }

@@ -37,7 +37,6 @@ fn bad_usage_and_bad_input_exit_with_2_and_one_line() {
     refused(at, &["train", "city"], "--out");
     refused(at, &["train", "missing", "--out", "o"], "missing");
     refused(at, &["train", "empty", "--out", "o"], "empty");
-    refused(at, &["train", "city", "--out", "o", "--backend", "gpu"], "--backend");
     refused(at, &["train", "city", "--out", "o", "--steps", "0"], "--steps");
     refused(at, &["train", "city", "--out", "o", "--downscale", "40"], "--downscale");
     refused(at, &["train", "city", "--out", "o", "--store", "ftp://x"], "ftp");

@@ -5,6 +5,8 @@
 //!
 //! Architecture invariant: text and layouts only; nothing here knows a device.
 
+pub mod train;
+
 use bytemuck::{Pod, Zeroable};
 
 /// Threads of a workgroup, everywhere.

@@ -5,6 +5,7 @@ use std::mem::offset_of;
 
 use naga::valid::{Capabilities, ValidationFlags, Validator};
 use naga::{Module, TypeInner};
+use shaders::train::{self, Books, Rates, Window};
 use shaders::{Pass, Planes, STAGES, Set, Status, View};
 
 /// Name and byte offset of each member, and the size of the whole.
@@ -25,6 +26,10 @@ fn twins() -> BTreeMap<&'static str, Layout> {
         layout!(Pass: slot, shift, padding),
         layout!(Status: overflow, fault, pairs, most_pairs, visible, seen, splat_slots, visible_slots, visible_digits,
             pair_digits),
+        layout!(Books: done, adam_steps, skipped, count, sum, loss, good, l1_scale, ssim_scale),
+        layout!(Window: width, height, tiles_x, tiles_y, lambda, masked, by_share, padding),
+        layout!(Rates: mean, log_scale, quat, opacity, sh_dc, sh_rest, beta2, opacity_pull, needle_pull, log_scale_min,
+            log_scale_max, columns, stride, pixels, padding),
     ]
     .into()
 }
@@ -53,7 +58,7 @@ fn parse(name: &str, source: &str) -> Result<Module, String> {
 fn stages_are_valid_and_agree_with_their_twins() {
     let twins = twins();
     let mut compared: BTreeMap<&str, usize> = BTreeMap::new();
-    for stage in STAGES {
+    for stage in STAGES.iter().chain(train::STAGES) {
         let module = parse(stage.name, &stage.source()).unwrap_or_else(|e| panic!("{e}"));
         let entries: Vec<&str> = module.entry_points.iter().map(|entry| entry.name.as_str()).collect();
         assert_eq!(entries, stage.entries, "entry points of {}", stage.name);
@@ -97,7 +102,7 @@ fn constants_agree() {
     ]
     .into();
     let mut found = BTreeMap::new();
-    for stage in STAGES {
+    for stage in STAGES.iter().chain(train::STAGES) {
         for line in stage.source().lines() {
             let Some((name, value)) = line.strip_prefix("const ").and_then(|line| line.split_once(": u32 = ")) else {
                 continue;

@@ -7,7 +7,7 @@ use glam::{DMat3, DQuat, DVec3, Vec3};
 use render::Options;
 use render::cpu::{Isa, Renderer};
 use scene::{Camera, Pinhole, Pixels, Rect, Rigid, Splat, Splats};
-use train::{Flow, Job, Recipe, TrainView, WindowSource, random, train};
+use train::{Backend, Flow, Job, Recipe, TrainView, WindowSource, random, train};
 
 const WIDTH: u32 = 96;
 const HEIGHT: u32 = 72;
@@ -57,6 +57,7 @@ fn steps() -> Splats {
         trains_exposures: false,
         recipe: &recipe,
         source: &photos,
+        backend: &Backend::Cpu,
     };
     train(job, &mut |_| Flow::Continue).expect("the views see the splats")
 }

@@ -30,6 +30,8 @@ pub struct State {
     pub(crate) evidence: Evidence,
     /// Where exposures are trained.
     pub(crate) exposures: Option<ExposureTraining>,
+    /// Of the last step, for whoever watches: nothing depends on it, and no checkpoint holds it.
+    pub(crate) loss: f64,
 }
 
 #[derive(Serialize, Deserialize)]
@@ -133,6 +135,7 @@ impl State {
             adam: Adam::from_parts(Isa::detect(), header.adam_step, first, second),
             evidence: Evidence { error: floats(part(0)), weight: floats(part(1)), views: whole(part(2)) },
             exposures: header.exposed.map(|_| exposures()),
+            loss: f64::NAN,
         })
     }
 }
@@ -161,7 +164,8 @@ mod tests {
         for (evidence, exposures) in [(evidence, None), (Evidence::default(), Some(exposures))] {
             let adam = Adam::from_parts(Isa::detect(), 41, moments(0.5), moments(2.0));
             let (splats, need) = (splats.clone(), Need::default());
-            let state = State { step: 40, skipped: 1, start_count: 7, need, splats, adam, evidence, exposures };
+            let loss = f64::NAN;
+            let state = State { step: 40, skipped: 1, start_count: 7, need, splats, adam, evidence, exposures, loss };
             let bytes = state.to_frame();
             let read = State::from_frame(&bytes).unwrap();
             assert_eq!((read.step, read.skipped, read.start_count), (40, 1, 7));

@@ -16,9 +16,11 @@ pub mod need;
 pub mod optimiser;
 pub mod prune;
 pub mod random;
+mod side;
 pub mod source;
 pub mod trainer;
 
 pub use checkpoint::State;
+pub use side::Backend;
 pub use source::WindowSource;
 pub use trainer::{Flow, Job, Progress, Recipe, TrainError, TrainView, train, train_on};

@@ -55,6 +55,21 @@ pub fn detail(views: &[TrainView], source: &dyn WindowSource, coarser: u8) -> Re
     Ok(if count > 0.0 { sum / count } else { f64::INFINITY })
 }
 
+/// Errors of an epoch's steps.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+pub(crate) struct Tally {
+    pub(crate) sum: f64,
+    /// Steps that are in it.
+    pub(crate) count: u32,
+}
+
+impl Tally {
+    pub(crate) fn add(&mut self, error: f64) {
+        self.sum += error;
+        self.count += 1;
+    }
+}
+
 /// What the steps so far say.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Need {
@@ -62,25 +77,17 @@ pub(crate) struct Need {
     pub(crate) stage: u8,
     /// Step at which the present one began.
     pub(crate) since: u32,
-    /// Of the epoch under way: Σ of errors, and steps.
-    sum: f64,
-    count: u32,
+    /// Of the epoch under way.
+    pub(crate) tally: Tally,
     /// Of the epochs of this stage: splats at the end, and the mean error in dB.
     epochs: Vec<(u32, f32)>,
 }
 
 impl Need {
-    /// Notes a step's error; `last` is the last step of an epoch. The epoch's mean, if this ends a full one.
-    pub(crate) fn note(&mut self, error: Option<f64>, splats: usize, epoch: u32, last: bool) -> Option<f64> {
-        if let Some(error) = error {
-            self.sum += error;
-            self.count += 1;
-        }
-        if !last {
-            return None;
-        }
-        let (mean, full) = (self.sum / f64::from(self.count.max(1)), self.count == epoch);
-        (self.sum, self.count) = (0.0, 0);
+    /// Ends an epoch of so many steps: its mean error, if none was left out.
+    pub(crate) fn end_epoch(&mut self, splats: usize, epoch: u32) -> Option<f64> {
+        let Tally { sum, count } = std::mem::take(&mut self.tally);
+        let (mean, full) = (sum / f64::from(count.max(1)), count == epoch);
         if full {
             self.epochs.push((splats as u32, (-20.0 * mean.max(1e-9).log10()) as f32));
         }
@@ -90,7 +97,7 @@ impl Need {
     /// Begins the next stage: errors at another mip cannot be compared.
     pub(crate) fn look_closer(&mut self, step: u32) {
         (self.stage, self.since) = (self.stage + 1, step);
-        (self.sum, self.count) = (0.0, 0);
+        self.tally = Tally::default();
         self.epochs.clear();
     }
 
@@ -144,7 +151,8 @@ mod tests {
     fn growth_is_judged_by_whole_epochs_of_one_stage() {
         let mut need = Need::default();
         let epoch = |need: &mut Need, error: f64, splats: usize| -> Option<f64> {
-            (0..4).filter_map(|i| need.note(Some(error), splats, 4, i == 3)).last()
+            (0..4).for_each(|_| need.tally.add(error));
+            need.end_epoch(splats, 4)
         };
         assert_eq!(epoch(&mut need, 0.1, 1000), Some(0.1));
         assert_eq!(epoch(&mut need, 0.0999, 1100), Some(0.0999));
@@ -156,6 +164,7 @@ mod tests {
         assert_eq!((need.stage, need.since), (1, 40));
         assert!(epoch(&mut need, 0.2, 2000).is_some() && !need.gains_less_than(0.02));
         // A step that was left out makes an epoch that says nothing.
-        assert_eq!((need.note(None, 9, 4, false), need.note(Some(1.0), 9, 4, true)), (None, None));
+        need.tally.add(1.0);
+        assert_eq!(need.end_epoch(9, 4), None);
     }
 }

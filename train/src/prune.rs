@@ -15,7 +15,7 @@ use glam::Vec3;
 use scene::Splats;
 
 use crate::importance::{Order, Shares, Views};
-use crate::{Flow, Job, Recipe, TrainError, TrainView, random, train};
+use crate::{Flow, Job, Progress, Recipe, TrainError, TrainView, random, train};
 
 /// Views that a result is measured on: of more, evenly many.
 const MEASURED_VIEWS: Looks = Looks { least: 8, most: 32, per_step: 0.5 };
@@ -128,16 +128,13 @@ impl Pruning {
 }
 
 /// Where pruning stands.
-#[derive(Debug, Clone, Copy)]
 pub struct PruneProgress<'a> {
     /// Steps of healing done, rounds that were not needed included.
     pub step: u32,
     /// Steps of healing in all, at most.
     pub steps: u32,
-    /// Of the last step.
-    pub loss: f64,
-    /// The splats now.
-    pub splats: &'a Splats,
+    /// The healing under way.
+    pub healing: Progress<'a>,
 }
 
 /// Is called after every step of healing; may stop the work, and then what was reached is the result.
@@ -374,7 +371,7 @@ impl<'a> Pruner<'a> {
         let mut stopped = false;
         let healed = train(job, &mut |now| {
             let (step, steps) = (round * steps + now.step, self.pruning.parts() * steps);
-            let flow = report(PruneProgress { step, steps, loss: now.loss, splats: now.splats });
+            let flow = report(PruneProgress { step, steps, healing: now });
             stopped |= flow == Flow::Stop;
             flow
         })?;

@@ -5,16 +5,16 @@
 //! a frozen context, and a pixel counts by the share of it that the block's own splats explain.
 
 use glam::Vec3;
-use render::cpu::{Isa, Renderer};
-use render::{Options, Upstream};
-use scene::{Camera, Exposures, Pixels, Rect, Splats};
+use render::Options;
+use render::cpu::Isa;
+use scene::{Camera, Exposures, Rect, Splats};
 use serde::{Deserialize, Serialize};
 
-use crate::exposure::{ExposureTraining, expose, expose_backward};
+use crate::exposure::ExposureTraining;
 use crate::growth::{self, Evidence, Growth};
-use crate::loss::Photometric;
 use crate::need::{self, Need};
 use crate::optimiser::{Adam, Rates};
+use crate::side::{Backend, Part, Side, Step};
 use crate::{State, WindowSource, random};
 
 /// How a block is trained. Shares are of the number of steps; rates are per step of Adam.
@@ -134,7 +134,7 @@ impl TrainView {
     }
 }
 
-/// What to train.
+/// What to train, and on what.
 pub struct Job<'a> {
     /// The first splats.
     pub initial: Splats,
@@ -164,23 +164,57 @@ pub struct Job<'a> {
     pub recipe: &'a Recipe,
     /// Pixels.
     pub source: &'a dyn WindowSource,
+    /// What computes the steps.
+    pub backend: &'a Backend,
 }
 
-/// Where training stands.
-#[derive(Debug)]
+/// Where training stands. What its methods say is brought from where the training happens when they are asked, which changes
+/// nothing in its course. They say nothing where that fails, and then training ends with the error.
 pub struct Progress<'a> {
     /// Steps done.
     pub step: u32,
     /// Steps in all.
     pub steps: u32,
+    now: &'a mut State,
+    side: &'a mut dyn Side,
+    failed: &'a mut Option<TrainError>,
+}
+
+impl Progress<'_> {
     /// Loss of the last window.
-    pub loss: f64,
+    pub fn loss(&mut self) -> Option<f64> {
+        self.fetched(Part::Tally).map(|now| now.loss)
+    }
+
+    /// Steps whose loss was not finite; such a step is left out.
+    pub fn skipped(&mut self) -> Option<u32> {
+        self.fetched(Part::Tally).map(|now| now.skipped)
+    }
+
+    /// The number of splats now.
+    pub fn count(&self) -> usize {
+        self.now.splats.len()
+    }
+
     /// The splats now.
-    pub splats: &'a Splats,
-    /// Steps whose gradient was not finite; such a step is left out.
-    pub skipped: u32,
+    pub fn splats(&mut self) -> Option<&Splats> {
+        self.fetched(Part::Splats).map(|now| &now.splats)
+    }
+
     /// From which training can go on.
-    pub state: &'a State,
+    pub fn state(&mut self) -> Option<&State> {
+        self.fetched(Part::All)
+    }
+
+    fn fetched(&mut self, part: Part) -> Option<&State> {
+        match self.side.fetch(self.now, part) {
+            Ok(()) => Some(self.now),
+            Err(error) => {
+                self.failed.get_or_insert(error);
+                None
+            }
+        }
+    }
 }
 
 /// Should training go on?
@@ -201,6 +235,12 @@ pub enum TrainError {
     /// A window could not be read.
     #[error("{0}")]
     Source(String),
+    /// The device failed.
+    #[error("{0}")]
+    Device(String),
+    /// Exposures are the CPU's alone.
+    #[error("exposures are not trained on a GPU: use --backend cpu, or leave --exposure")]
+    Exposures,
     /// All splats were removed.
     #[error("every splat was removed after {0} steps: the views and the points do not agree, or poses are wrong")]
     Empty(u32),
@@ -228,23 +268,24 @@ pub fn train_on(
     if views.is_empty() {
         return Err(TrainError::NoViews);
     }
-    let isa = Isa::detect();
-    let mut renderer = Renderer::new(isa);
-    let mut loss = Photometric::new(isa, recipe.lambda);
-    let mut upstream = Upstream::default();
-    let mut exposed = Vec::new();
-    let mut weights = Vec::new();
+    if matches!(job.backend, Backend::Gpu(_)) && (job.trains_exposures || job.exposures.is_some()) {
+        return Err(TrainError::Exposures);
+    }
     let initial = std::mem::replace(&mut job.initial, Splats::new(0));
     let mut now = from.unwrap_or_else(|| State {
         step: 0,
         skipped: 0,
         start_count: (0..initial.len()).filter(|&i| counts(initial.mean(i))).count(),
         need: Need::default(),
-        adam: Adam::new(isa, &initial),
+        adam: Adam::new(Isa::detect(), &initial),
         evidence: Evidence::default(),
         exposures: job.trains_exposures.then(|| ExposureTraining::new(views)),
         splats: initial,
+        loss: f64::NAN,
     });
+    // Nothing is to be moved to where nothing is to be done.
+    let backend = if now.step < steps { job.backend } else { &Backend::Cpu };
+    let mut side = backend.side(&now, recipe.lambda, context)?;
     let log_scale_bounds = job.size_bounds_metres.map(f32::ln);
     let lacks = (now.need.stage..recipe.coarse.len() as u8)
         .map(|stage| match recipe.closer_at > 0.0 {
@@ -273,41 +314,35 @@ pub fn train_on(
             background: [0.0; 3],
             extras: context.is_some(),
         };
-        let frame = renderer.forward(&now.splats, context, &camera, &options);
-        pixel_weights(frame, &photo, &mut weights);
-        let trained = now.exposures.as_ref().map(|exposures| exposures.of(view.view));
-        let exposure = trained.unwrap_or_else(|| job.exposures?.of(view.view).copied());
-        let shown = exposure.as_ref().map_or(&frame.colour, |exposure| {
-            expose(exposure, &frame.colour, &mut exposed);
-            &exposed
-        });
-        let value = loss.evaluate(shown, &photo, &weights, &mut upstream.colour);
-        if value.total.is_finite() {
-            if let Some(exposure) = &exposure {
-                let by_exposure = expose_backward(exposure, &frame.colour, &mut upstream.colour);
-                if let Some(exposures) = &mut now.exposures {
-                    let visits = (steps as f32 / views.len() as f32).max(1.0);
-                    exposures.step(view.view, &by_exposure, between(recipe.exposure, progress) / visits);
-                }
-            }
-            let gradients = renderer.backward(&now.splats, &upstream);
-            now.evidence.add(gradients, photo.area() as f32);
-            now.adam.step(&mut now.splats, gradients, options.sh_degree, &rates(recipe, progress, log_scale_bounds));
-        } else {
-            now.skipped += 1;
-        }
+        let visits = (steps as f32 / views.len() as f32).max(1.0);
+        let drawn = Step {
+            view: view.view,
+            photo,
+            camera,
+            options,
+            rates: rates(recipe, progress, log_scale_bounds),
+            exposure: job.exposures.and_then(|exposures| exposures.of(view.view).copied()),
+            exposure_rate: between(recipe.exposure, progress) / visits,
+        };
+        side.step(&mut now, drawn)?;
 
         let growth = &recipe.growth;
         now.step = step + 1;
         let epoch = views.len() as u32;
-        let seen = value.total.is_finite().then_some(value.l1);
-        let error = now.need.note(seen, now.splats.len(), epoch, now.step.is_multiple_of(epoch));
+        let mut error = None;
+        if now.step.is_multiple_of(epoch) {
+            side.fetch(&mut now, Part::Tally)?;
+            error = now.need.end_epoch(now.splats.len(), epoch);
+            side.give(&now, Part::Tally)?;
+        }
         if coarser > 0 {
             let stage = usize::from(now.need.stage);
             let fits =
                 error.is_some_and(|e| e <= f64::from(recipe.closer_at) * lacks[stage - usize::from(first_stage)]);
             if fits || now.step.saturating_sub(now.need.since) >= (recipe.coarse[stage] * steps as f32) as u32 {
+                side.fetch(&mut now, Part::Tally)?;
                 now.need.look_closer(now.step);
+                side.give(&now, Part::Tally)?;
             }
         }
         let worth_db = f64::from(growth.worth_db);
@@ -317,22 +352,23 @@ pub fn train_on(
         let every = growth.interval(steps);
         if now.step.is_multiple_of(every) && progress >= growth.from && now.step <= until + every && now.step < steps {
             let target = growth.target(now.step, steps, now.start_count, budget);
+            side.fetch(&mut now, Part::All)?;
             let (grown, rows, _) = growth::refine(&now.splats, &mut now.evidence, growth, target, counts, keeps);
             now.splats = grown;
             now.adam.rearrange(&rows);
+            side.give(&now, Part::All)?;
         }
-        let said = Progress {
-            step: now.step,
-            steps,
-            loss: value.total,
-            splats: &now.splats,
-            skipped: now.skipped,
-            state: &now,
-        };
-        if report(said) == Flow::Stop {
+        let mut failed = None;
+        let (step, now, side) = (now.step, &mut now, &mut *side);
+        let flow = report(Progress { step, steps, now, side, failed: &mut failed });
+        if let Some(error) = failed {
+            return Err(error);
+        }
+        if flow == Flow::Stop {
             break;
         }
     }
+    side.fetch(&mut now, Part::Splats)?;
     let exposures = now.exposures.map(|exposures| exposures.exposures());
     Ok((now.splats, exposures))
 }
@@ -363,32 +399,5 @@ fn rates(recipe: &Recipe, progress: f32, log_scale_bounds: [f32; 2]) -> Rates {
         opacity_pull: recipe.opacity_pull,
         needle_pull: recipe.needle_pull,
         log_scale_bounds,
-    }
-}
-
-/// What each pixel counts: nothing under a mask; else the share of what is drawn there that the block's own splats explain.
-/// Empty where every pixel counts alike.
-fn pixel_weights(frame: &render::Frame, photo: &Pixels, weights: &mut Vec<f32>) {
-    weights.clear();
-    if !frame.own.is_empty() {
-        // What nothing explains yet is half the block's: whoever sees it may repair it. Squared, as Adam makes steps of a
-        // given size of however small a gradient, if only it is steady.
-        const UNEXPLAINED: f32 = 0.5;
-        const NOTHING: f32 = 1e-4;
-        weights.extend(frame.own.iter().zip(&frame.transmittance).map(|(own, transmittance)| {
-            let open = UNEXPLAINED * transmittance + NOTHING;
-            let share = (own + open) / (1.0 - transmittance + open);
-            share * share
-        }));
-    }
-    if let Some(mask) = &photo.mask {
-        if weights.is_empty() {
-            weights.resize(mask.len(), 1.0);
-        }
-        for (weight, &mask) in weights.iter_mut().zip(mask) {
-            if mask < 128 {
-                *weight = 0.0;
-            }
-        }
     }
 }

@@ -8,7 +8,7 @@ use render::cpu::Renderer;
 use scene::{Camera, Pinhole, Pixels, Rect, Rigid, Splat, Splats, column};
 use train::importance::Order;
 use train::prune::{Pruned, Pruning, keep, to_share, within_tolerance};
-use train::{Flow, Job, Recipe, TrainError, TrainView, WindowSource, metrics, random};
+use train::{Backend, Flow, Job, Recipe, TrainError, TrainView, WindowSource, metrics, random};
 
 const WIDTH: u32 = 64;
 const HEIGHT: u32 = 48;
@@ -109,6 +109,7 @@ fn with_job<R>(
         trains_exposures: false,
         recipe: &recipe,
         source: photos,
+        backend: &Backend::Cpu,
     })
 }
 

@@ -10,7 +10,7 @@ use glam::Vec3;
 use scene::{BlockId, Capture, Exposures, Splats};
 use train::importance::Views;
 use train::prune::{self, Pruning};
-use train::{Recipe, TrainError, TrainView};
+use train::{Backend, Recipe, TrainError, TrainView};
 
 use crate::cap::{Cap, Limit};
 use crate::clock::Stopwatch;
@@ -20,8 +20,13 @@ use crate::merged::{Judge, is_look};
 use crate::refine::{self, Start};
 use crate::{ExecuteError, Flow, Report, TaskOrder};
 
-/// Steps between two reports.
-const REPORT_EVERY: u32 = 10;
+/// Steps between two reports: on a GPU each makes the device wait.
+fn report_every(backend: &Backend) -> u32 {
+    match backend {
+        Backend::Cpu => 10,
+        Backend::Gpu(_) => 100,
+    }
+}
 
 /// What a block comes to.
 pub(crate) struct Trained {
@@ -58,9 +63,10 @@ impl Block<'_> {
         let eval_every = self.trainer.options.eval_every;
         let recipe = recipe_of(&plan.settings, task);
         let wrong = |error| match error {
-            TrainError::NoViews | TrainError::Empty(_) => {
+            TrainError::NoViews | TrainError::Exposures | TrainError::Empty(_) => {
                 ExecuteError { message: format!("block {}: {error}", task.block), is_input: true }
             }
+            TrainError::Device(_) => failed(format!("block {}: {error}", task.block)),
             TrainError::Source(_) => failed(error),
         };
         let counts = |p: Vec3| self.owns(task, p.as_dvec3());
@@ -103,6 +109,7 @@ impl Block<'_> {
             trains_exposures: plan.settings.exposure && task.parent.is_none(),
             recipe: &recipe,
             source: self.reader,
+            backend: &self.trainer.backend,
         };
         let pruning = self.pruning();
         let mut job = job_of(initial, task.steps);
@@ -126,20 +133,22 @@ impl Block<'_> {
         };
         let steps = trained + pruning.map_or(0, |pruning| pruning.steps(whole));
         let (mut cancelled, mut late) = (false, false);
-        // Reports a step if one is due; whether to go on.
-        let mut tell = |step: u32, loss: f64, splats: &Splats, last: bool| -> bool {
+        let every = report_every(&self.trainer.backend);
+        // Is a step to be reported, and the merged model measured for it?
+        let due = |step: u32, last: bool| -> Option<bool> {
             let evaluate =
                 (last && is_look(plan, self.order.task)) || (eval_every > 0 && step.is_multiple_of(eval_every));
-            if !evaluate && !last && !step.is_multiple_of(REPORT_EVERY) {
-                return true;
-            }
+            (evaluate || last || step.is_multiple_of(every)).then_some(evaluate)
+        };
+        // Reports a step, measured where splats are given; whether to go on.
+        let mut tell = |step: u32, loss: f64, count: usize, splats: Option<&Splats>, last: bool| -> bool {
             let (cpu_seconds, wall_seconds) = (stopwatch.cpu_seconds(), stopwatch.wall_seconds());
-            let measured = if evaluate { stopwatch.paused(|| measure(splats)) } else { None };
+            let measured = splats.and_then(|splats| stopwatch.paused(|| measure(splats)));
             let flow = report(Report {
                 step: step.into(),
                 steps: steps.into(),
                 loss,
-                splats: splats.len() as u64,
+                splats: count as u64,
                 cpu_seconds,
                 wall_seconds,
                 psnr: measured.map(|(psnr, _)| psnr),
@@ -156,36 +165,53 @@ impl Block<'_> {
         }
         let clock = Stopwatch::start();
         let mut next_checkpoint = self.trainer.options.checkpoint_seconds;
-        let (mut splats, exposures) = train::train_on(job, from, &mut |now| {
+        let (mut splats, exposures) = train::train_on(job, from, &mut |mut now| {
             let (seconds, last) = (clock.wall_seconds(), now.step == now.steps);
             // The last one is what pruning begins with.
             if let Some(memory) = self.memory
                 && (seconds >= next_checkpoint || (last && seconds > 0.5 * next_checkpoint))
+                && let Some(state) = now.state()
             {
-                memory.keep_checkpoint(&self.trainer.store, now.state);
+                memory.keep_checkpoint(&self.trainer.store, state);
                 next_checkpoint = seconds + self.trainer.options.checkpoint_seconds;
             }
-            late = now.step < now.steps && over();
-            loss = now.loss;
-            stopped = !tell(now.step, loss, now.splats, late || now.step == steps);
+            late = !last && over();
+            let (step, last) = (now.step, late || now.step == steps);
+            if let Some(evaluate) = due(step, last) {
+                // Where there is no telling, training ends with why.
+                loss = now.loss().unwrap_or(f64::NAN);
+                let count = now.count();
+                stopped = !tell(step, loss, count, if evaluate { now.splats() } else { None }, last);
+            }
             going(!stopped && !late)
         })
         .map_err(wrong)?;
+        // Where training's last step is not the last to tell.
+        let mut end = (settled && pruning.is_none()).then_some(task.steps);
         if let Some(pruning) = pruning.filter(|_| !stopped && !late) {
             let job = train::Job { exposures: exposures.as_ref().or(self.exposures_given), ..job_of(splats, whole) };
-            let (pruned, outcome) = prune::within_tolerance(job, &pruning, &mut |now| {
+            let (pruned, outcome) = prune::within_tolerance(job, &pruning, &mut |mut now| {
                 late = over();
-                loss = now.loss;
                 // Once more at the end, with what pruning chose.
-                going(tell(trained + now.step.min(now.steps - 1), loss, now.splats, false) && !late)
+                let (step, healing) = (trained + now.step.min(now.steps - 1), &mut now.healing);
+                let due = due(step, false);
+                if due.is_some() || healing.step == healing.steps {
+                    loss = healing.loss().unwrap_or(f64::NAN);
+                }
+                let told = due.is_none_or(|evaluate| {
+                    let count = healing.count();
+                    tell(step, loss, count, if evaluate { healing.splats() } else { None }, false)
+                });
+                going(told && !late)
             })
             .map_err(wrong)?;
             tracing::info!(block = %task.block, before = outcome.splats[0], after = outcome.splats[1], "pruned");
             splats = pruned;
-            tell(steps, loss, &splats, true);
+            end = Some(steps);
         }
-        if settled && pruning.is_none() {
-            tell(task.steps, loss, &splats, true);
+        if let Some(end) = end {
+            let evaluate = due(end, true) == Some(true);
+            tell(end, loss, splats.len(), evaluate.then_some(&splats), true);
         }
         if cancelled {
             return Err(failed("stopped before its end, as asked"));

@@ -183,7 +183,9 @@ fn rehearse(job: &Job, cap: &Cap, until: f64) -> Pace {
         let trial = Job { initial: job.initial.clone(), views: &few, steps, recipe: &recipe, ..*job };
         let mut times = vec![cap.now()];
         // What fails here fails again in earnest, and is said then.
-        let _ = train::train(trial, &mut |_| {
+        let _ = train::train(trial, &mut |mut now| {
+            // Which waits for the step.
+            let _ = now.loss();
             times.push(cap.now());
             if cap.now() < until { Flow::Continue } else { Flow::Stop }
         });

@@ -12,10 +12,10 @@ use std::sync::atomic::{AtomicU32, Ordering};
 
 use blocks::{Plan, Task};
 use dataset::windows::WindowReader;
-use render::cpu::Isa;
 use scene::frame::{self, About};
 use scene::{ArtefactId, BlockId, Exposures, Splats};
 use store::BlockingStore;
+use train::Backend;
 
 use crate::block::{Block, Trained};
 use crate::cap::Cap;
@@ -52,17 +52,13 @@ pub struct Shared {
     pub settled: AtomicU32,
 }
 
-/// Trains blocks on the CPU backend.
+/// Trains blocks.
 pub struct BlockTrainer {
     pub(crate) store: BlockingStore,
     pub(crate) options: TrainerOptions,
     pub(crate) shared: Arc<Shared>,
+    pub(crate) backend: Backend,
     pool: rayon::ThreadPool,
-}
-
-/// The name of the backend that [`BlockTrainer`] runs on, instruction set included.
-pub fn backend() -> String {
-    format!("cpu-{}", Isa::detect().name())
 }
 
 impl BlockTrainer {
@@ -70,12 +66,17 @@ impl BlockTrainer {
     ///
     /// # Errors
     /// The operating system refused the threads.
-    pub fn new(store: BlockingStore, options: TrainerOptions, shared: Arc<Shared>) -> Result<Self, String> {
+    pub fn new(
+        store: BlockingStore,
+        options: TrainerOptions,
+        shared: Arc<Shared>,
+        backend: Backend,
+    ) -> Result<Self, String> {
         let pool = rayon::ThreadPoolBuilder::new()
             .num_threads(options.threads.max(1))
             .build()
             .map_err(|error| format!("cannot start {} threads: {error}", options.threads))?;
-        Ok(Self { store, options, shared, pool })
+        Ok(Self { store, options, shared, backend, pool })
     }
 }
 
@@ -88,6 +89,10 @@ impl Execute for BlockTrainer {
         let mut stopwatch = Stopwatch::start();
         let plan = self.store.get(order.plan).map_err(failed)?;
         let plan = Plan::from_frame(&plan).map_err(failed)?;
+        if plan.backend != self.backend.name() {
+            let (planned, own) = (&plan.backend, self.backend.name());
+            return Err(failed(format!("the plan is for the backend {planned}, this worker computes on {own}")));
+        }
         let task = plan.tasks.get(order.task as usize).ok_or_else(|| failed("the plan has no such task"))?;
         let capture = Arc::new(dataset::ingest::load_capture(&self.store, plan.capture).map_err(failed)?);
         let reader = WindowReader::new(capture.clone(), self.store.clone(), self.options.cache_bytes);

@@ -1,7 +1,7 @@
 //! What earlier runs left of a task: its result, or a checkpoint on the way.
 //!
-//! A task's result is a function of its plan and its inputs, so their hash is its name, and whoever finds the name need not
-//! train. Both are records that appear whole or not at all; one that is damaged, or cannot be written, is as none.
+//! A task's result is a function of its plan, which names the backend, and of its inputs. So their hash is its name, and whoever
+//! finds the name need not train. Both are records that appear whole or not at all; one that is damaged, or cannot be written, is as none.
 
 use scene::{ArtefactId, Splats, frame};
 use store::BlockingStore;

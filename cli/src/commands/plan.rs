@@ -48,12 +48,12 @@ pub(crate) fn run(args: &PlanArgs, output: &Output) -> Result<(), Failure> {
     check_plan(&plan, &capture, &Output::new(false, true))
 }
 
-/// Plans an opened capture; returns it as it was planned for.
+/// Plans an opened capture for the CPU; returns it as it was planned for.
 pub(crate) fn plan_of(capture: &Capture, options: &PlanOptions) -> Result<(Capture, Plan), Failure> {
     let capture = cameras::shrunk(capture, options.downscale)?;
     let id = ArtefactId::of(&frame::encode(dataset::ingest::CAPTURE, &capture, &[]));
     let settings = options.settings(&capture);
-    let plan = blocks::plan(&capture, id, &settings, &worker::execute::backend())?;
+    let plan = blocks::plan(&capture, id, &settings, &train::Backend::Cpu.name())?;
     Ok((capture, plan))
 }
 

@@ -14,7 +14,7 @@ use store::BlockingStore;
 use tempfile::TempDir;
 use train::importance::{self, Order, Shares, Views};
 use train::prune::{self, PruneProgress, Pruned, Pruning};
-use train::{Flow, Job, Recipe, TrainError, TrainView};
+use train::{Backend, Flow, Job, Recipe, TrainError, TrainView};
 
 use crate::args::{BenchPruneArgs, PruneArgs, PruneCapture};
 use crate::cameras;
@@ -76,7 +76,7 @@ pub(crate) fn run(args: &PruneArgs, output: &Output) -> Result<(), Failure> {
     let record = Record {
         scene: cameras::name_of(capture),
         downscale: photos.downscale,
-        backend: worker::execute::backend(),
+        backend: Backend::Cpu.name(),
         threads: rayon::current_num_threads() as u32,
         psnr: held_out.map(|[_, after]| after),
         ..Record::new("prune")
@@ -213,10 +213,11 @@ impl Photos {
             trains_exposures: false,
             recipe: &recipe,
             source: &self.reader,
+            backend: &Backend::Cpu,
         };
         let progress = output.progress("pruning", 1000);
         let mut report = |now: PruneProgress| {
-            progress.at(1000 * u64::from(now.step) / u64::from(now.steps), format!("{} splats", now.splats.len()));
+            progress.at(1000 * u64::from(now.step) / u64::from(now.steps), format!("{} splats", now.healing.count()));
             Flow::Continue
         };
         let pruned = match share {

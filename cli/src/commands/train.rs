@@ -11,6 +11,7 @@ use blocks::{Plan, Severity};
 use coordinator::{LocalError, run_local};
 use dataset::ingest::{IngestOptions, Ingested, ingest};
 use dataset::open::Source;
+use render::gpu::Gpu;
 use scene::{ArtefactId, BadInput, Capture};
 use serde::Serialize;
 use store::file::save;
@@ -79,11 +80,12 @@ pub(crate) fn run(args: &TrainArgs, output: &Output) -> Result<(), Failure> {
 
 /// Trains and writes everything under `--out`.
 pub(crate) fn train(args: &TrainArgs, output: &Output) -> Result<Trained, Failure> {
-    check_backend(args.backend)?;
     let mut clock = Stopwatch::start();
     let source = cameras::open(&args.capture, output)?;
     // What the plan refuses is said before any photo is read.
     let (planned_for, plan) = plan_of(&source.capture, &args.plan)?;
+    let backend = backend_of(args)?;
+    let plan = Plan { backend: backend.name(), ..plan };
     check_plan(&plan, &planned_for, output)?;
     fs::create_dir_all(&args.out).map_err(cannot("made", &args.out))?;
     let store_url = args.store.clone().unwrap_or_else(|| args.out.join("store").display().to_string());
@@ -116,9 +118,10 @@ pub(crate) fn train(args: &TrainArgs, output: &Output) -> Result<Trained, Failur
         resume: !args.fresh,
         checkpoint_seconds: args.checkpoint_every,
     };
-    let trainers = (0..args.workers).map(|_| BlockTrainer::new(metered.blocking(), options, shared.clone()));
+    let trainers =
+        (0..args.workers).map(|_| BlockTrainer::new(metered.blocking(), options, shared.clone(), backend.clone()));
     let trainers = trainers.map(|trainer| trainer.map(Arc::new)).collect::<Result<_, _>>().map_err(Failure::Work)?;
-    let outcome = train_blocks(trainers, &store, plan_id, &mut journal, output);
+    let outcome = train_blocks(trainers, &plan.backend, &store, plan_id, &mut journal, output);
     let spent = journal.close()?;
     drop(progress);
     let results = outcome?;
@@ -179,12 +182,21 @@ fn cap_of(minutes: f64, clock: Stopwatch, plan: &Plan, workers: u32) -> Cap {
     Cap::new(clock, seconds - writing.min(0.1 * seconds), workers)
 }
 
-fn check_backend(backend: Backend) -> Result<(), BadInput> {
-    match backend {
-        Backend::Auto | Backend::Cpu => Ok(()),
-        Backend::Gpu => {
-            Err(BadInput::new("--backend", "the GPU backend is not in this version", "give --backend cpu or auto"))
+/// What computes. A software adapter pretends to be a GPU on the CPU, slower than the CPU's own backend: it serves who asks for it.
+fn backend_of(args: &TrainArgs) -> Result<train::Backend, BadInput> {
+    let trains_exposures = args.plan.exposure;
+    match args.backend {
+        Backend::Gpu if trains_exposures => {
+            Err(BadInput::new("--exposure", "is not trained on a GPU", "leave it, or give --backend cpu"))
         }
+        Backend::Gpu => Gpu::open().map(train::Backend::Gpu).map_err(|error| {
+            BadInput::new("--backend", error.to_string(), "give --backend cpu, or name an adapter by PLAT_GPU_ADAPTER")
+        }),
+        Backend::Auto if !trains_exposures => Ok(match Gpu::open() {
+            Ok(gpu) if !gpu.is_software() => train::Backend::Gpu(gpu),
+            _ => train::Backend::Cpu,
+        }),
+        Backend::Auto | Backend::Cpu => Ok(train::Backend::Cpu),
     }
 }
 
@@ -221,6 +233,7 @@ pub(crate) fn check_plan(plan: &Plan, capture: &Capture, output: &Output) -> Res
 /// Runs the plan on workers in this process; Ctrl-C cancels the job.
 fn train_blocks(
     trainers: Vec<Arc<BlockTrainer>>,
+    backend: &str,
     store: &Store,
     plan: ArtefactId,
     journal: &mut Journal,
@@ -229,8 +242,8 @@ fn train_blocks(
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build();
     let runtime = runtime.map_err(|error| Failure::Work(format!("cannot start threads: {error}")))?;
     let start_worker = |coordinator_url, number: usize, shutdown| {
-        let backend = worker::execute::backend();
-        let options = worker::Options { coordinator_url, worker_id: format!("local-{number}"), backend };
+        let (worker_id, backend) = (format!("local-{number}"), backend.to_owned());
+        let options = worker::Options { coordinator_url, worker_id, backend };
         worker::run(options, trainers[number].clone(), shutdown)
     };
     let result = runtime.block_on(async {

@@ -1,0 +1,85 @@
+//! A whole job on a GPU: as good as on the CPU, the same bytes when it was killed, and refused in one line where it cannot be.
+
+mod common;
+
+use std::path::Path;
+use std::process::{Command, Stdio};
+use std::time::Duration;
+
+use render::gpu::Gpu;
+use serde_json::Value;
+
+const JOB: [&str; 8] = ["train", "city", "--steps", "100", "--budget", "500", "--levels", "1"];
+
+fn job(at: &Path, backend: &str, words: &[&str]) -> Command {
+    common::command(at, &[&JOB[..], &["--backend", backend], words].concat())
+}
+
+fn done(at: &Path, backend: &str, words: &[&str]) -> Value {
+    common::json_of(&mut job(at, backend, words))
+}
+
+/// The GPU's name, or a line that says why the test is skipped. With PLAT_GPU=required there has to be one.
+fn gpu() -> Option<String> {
+    match Gpu::open() {
+        Ok(gpu) => Some(gpu.name().to_owned()),
+        Err(error) if std::env::var("PLAT_GPU").is_ok_and(|value| value == "required") => panic!("{error}"),
+        Err(error) => {
+            println!("skipped: no adapter ({error})");
+            None
+        }
+    }
+}
+
+#[test]
+fn a_job_on_a_gpu_is_as_good_and_survives_kills() {
+    let Some(name) = gpu() else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    common::city(at, 20, 64, 48);
+    let psnr = |report: &Value| report["psnr"].as_f64().expect("held-out views are measured");
+    let cpu = done(at, "cpu", &["--out", "cpu", "--store", "store"]);
+    // In one store: what the CPU left there is not taken for the GPU's.
+    let gpu = done(at, "gpu", &["--out", "calm", "--store", "store"]);
+    println!("{:.2} dB on {}, {:.2} dB on {}", psnr(&cpu), cpu["backend"], psnr(&gpu), gpu["backend"]);
+    assert!(gpu["backend"] == name.as_str() && cpu["backend"] != gpu["backend"]);
+    assert_eq!(gpu["resumed"], 0);
+    assert!((psnr(&cpu) - psnr(&gpu)).abs() < 0.2);
+    let plan = |out: &str| -> Value {
+        serde_json::from_slice(&std::fs::read(at.join(out).join("plan.json")).unwrap()).expect("a plan")
+    };
+    assert_eq!(plan("calm")["backend"], name.as_str());
+
+    // Killed after so many lines of its journal: within the root, and within leaves.
+    let mut kills = 0;
+    for lines in [1, 4] {
+        let mut run = job(at, "gpu", &["--out", "killed", "--checkpoint-every", "0"]);
+        let mut run = run.stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
+        let journal = at.join("killed/metrics.jsonl");
+        let _ = std::fs::remove_file(&journal);
+        while run.try_wait().unwrap().is_none() {
+            if std::fs::read_to_string(&journal).map_or(0, |text| text.lines().count()) >= lines {
+                run.kill().unwrap();
+                run.wait().unwrap();
+                kills += 1;
+                break;
+            }
+            std::thread::sleep(Duration::from_millis(2));
+        }
+    }
+    assert!(kills > 0, "no kill found it at work");
+    let resumed = done(at, "gpu", &["--out", "killed"]);
+    assert!(resumed["resumed"].as_u64() >= Some(1), "{resumed}");
+    let bytes = |path: &str| std::fs::read(at.join(path)).unwrap();
+    assert!(bytes("calm/merged.ply") == bytes("killed/merged.ply"), "a kill shows in the result");
+}
+
+#[test]
+fn what_cannot_be_is_refused_in_one_line() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    common::city(at, 16, 64, 48);
+    let mut elsewhere = job(at, "gpu", &["--out", "o"]);
+    common::stopped(elsewhere.env("PLAT_GPU_ADAPTER", "an adapter that nobody has"), 2, "--backend");
+    common::stopped(&mut job(at, "gpu", &["--out", "o", "--exposure"]), 2, "--exposure");
+}

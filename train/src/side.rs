@@ -1,0 +1,91 @@
+//! Where the arithmetic of a training step happens: on the CPU, or on a GPU.
+//!
+//! [`State`] is what the host knows of a training. The loop decides from it (which view, which mip, when to grow), a side does the
+//! steps. The CPU's side works on the state itself. A GPU's side keeps a copy of its own that runs ahead of the host, and brings
+//! the state up to date when asked: asking costs time, and changes no bit of the result.
+
+mod cpu;
+mod gpu;
+
+use std::sync::Arc;
+
+use render::Options;
+use render::cpu::Isa;
+use render::gpu::Gpu;
+use scene::{Camera, Exposure, Pixels, Splats};
+
+use crate::optimiser::Rates;
+use crate::{State, TrainError};
+
+/// What computes.
+#[derive(Debug, Clone, Default)]
+pub enum Backend {
+    /// SIMD and threads.
+    #[default]
+    Cpu,
+    /// A GPU, or what pretends to be one.
+    Gpu(Arc<Gpu>),
+}
+
+impl Backend {
+    /// Its full name, with the instruction set or the adapter: what computed elsewhere may differ in the last bits.
+    pub fn name(&self) -> String {
+        match self {
+            Self::Cpu => format!("cpu-{}", Isa::detect().name()),
+            Self::Gpu(gpu) => gpu.name().to_owned(),
+        }
+    }
+
+    /// A training's place, from where it stands; λ weighs 1 - SSIM in the loss.
+    pub(crate) fn side<'a>(
+        &self,
+        now: &State,
+        lambda: f32,
+        context: Option<&'a Splats>,
+    ) -> Result<Box<dyn Side + 'a>, TrainError> {
+        Ok(match self {
+            Self::Cpu => Box::new(cpu::CpuSide::new(lambda, context)),
+            Self::Gpu(gpu) => Box::new(gpu::GpuSide::new(gpu, now, lambda, context)?),
+        })
+    }
+}
+
+/// One step of training.
+#[derive(Debug, Clone)]
+pub(crate) struct Step {
+    /// Index of the view in the capture.
+    pub(crate) view: u32,
+    /// What it shows.
+    pub(crate) photo: Arc<Pixels>,
+    /// Of the window that the photo is.
+    pub(crate) camera: Camera,
+    pub(crate) options: Options,
+    pub(crate) rates: Rates,
+    /// Of the view, where exposures are given, not trained.
+    pub(crate) exposure: Option<Exposure>,
+    /// Step of exposures, where they are trained.
+    pub(crate) exposure_rate: f32,
+}
+
+/// What of the state is meant; each holds the one before it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(crate) enum Part {
+    /// The last loss, the epoch's errors, the steps that were left out.
+    Tally,
+    /// And the splats.
+    Splats,
+    /// And all that the next step depends on.
+    All,
+}
+
+/// Carries out steps. A step whose loss is not finite changes nothing but its count.
+pub(crate) trait Side {
+    /// Begins a step; it may end after this returns.
+    fn step(&mut self, now: &mut State, step: Step) -> Result<(), TrainError>;
+
+    /// Brings a part of the state up to date with the steps begun.
+    fn fetch(&mut self, now: &mut State, part: Part) -> Result<(), TrainError>;
+
+    /// Goes on from this part of the state, which the host has changed since it fetched it.
+    fn give(&mut self, now: &State, part: Part) -> Result<(), TrainError>;
+}

@@ -1,0 +1,149 @@
+//! Training on a GPU: as good as on the CPU, and always the same bytes.
+
+mod ring;
+
+use render::gpu::Gpu;
+use ring::*;
+use scene::{Exposures, Splats};
+use train::{Backend, Flow, Recipe, State, TrainError};
+
+/// The GPU, or a line that says why the test is skipped. With PLAT_GPU=required there has to be one.
+fn gpu() -> Option<Backend> {
+    match Gpu::open() {
+        Ok(gpu) => Some(Backend::Gpu(gpu)),
+        Err(error) if std::env::var("PLAT_GPU").is_ok_and(|value| value == "required") => panic!("{error}"),
+        Err(error) => {
+            println!("skipped: no adapter ({error})");
+            None
+        }
+    }
+}
+
+/// A job with growth, in front of a context.
+fn job<'a>(photos: &'a Photos, context: &'a Splats, truth: &Splats, backend: &Backend) -> Setup<'a> {
+    let (context, backend) = (Some(context), backend.clone());
+    Setup { context, backend, budget: 300, steps: 90, ..Setup::new(perturbed(truth), photos) }
+}
+
+fn bits(splats: &Splats) -> Vec<u32> {
+    splats.columns().iter().flatten().map(|value| value.to_bits()).collect()
+}
+
+#[test]
+fn a_gpu_trains_as_well_as_the_cpu() {
+    let Some(gpu) = gpu() else { return };
+    let truth = cloud(1, 200, 0.8);
+    let photos = photos(&truth);
+    let initial = perturbed(&truth);
+    let before = psnr(&initial, &photos, |_| true);
+    let run = |backend: &Backend| {
+        let setup = Setup::new(initial.clone(), &photos);
+        Setup { backend: backend.clone(), budget: 300, steps: 160, ..setup }.run()
+    };
+    let [cpu, gpu] = [run(&Backend::Cpu), run(&gpu)];
+    let [cpu_db, gpu_db] = [&cpu, &gpu].map(|splats| psnr(splats, &photos, |_| true));
+    println!(
+        "{before:.2} dB before; CPU {cpu_db:.3} dB, {} splats; GPU {gpu_db:.3} dB, {} splats",
+        cpu.len(),
+        gpu.len()
+    );
+    assert!(cpu_db > before + 3.0, "the CPU must have learned something");
+    assert!((cpu_db - gpu_db).abs() < 0.1, "{cpu_db} dB on the CPU, {gpu_db} on the GPU");
+    assert!(gpu.len().abs_diff(cpu.len()) <= 3 && all_finite(&gpu));
+}
+
+#[test]
+fn the_same_job_gives_the_same_bytes_whoever_asks_whatever_and_whenever() {
+    let Some(gpu) = gpu() else { return };
+    let truth = cloud(2, 150, 0.8);
+    let photos = photos(&truth);
+    let context = cloud(3, 40, 0.5);
+    let run = |from: Option<State>, report: &mut dyn FnMut(train::Progress) -> Flow| {
+        job(&photos, &context, &truth, &gpu).try_run_on(from, &|_| true, report).expect("training goes well").0
+    };
+    let calm = bits(&run(None, &mut |_| Flow::Continue));
+    let mut left = None;
+    let asked = run(None, &mut |mut now| {
+        if now.step % 5 == 0 {
+            assert!(now.loss().is_some_and(f64::is_finite) && now.skipped() == Some(0));
+        }
+        if now.step % 7 == 0 {
+            assert_eq!(now.splats().map(Splats::len), Some(now.count()));
+        }
+        // Within an epoch, after some growth.
+        if now.step == 47 {
+            left = now.state().map(State::to_frame);
+        }
+        Flow::Continue
+    });
+    assert!(asked.len() > 150, "growth must have happened");
+    assert!(calm == bits(&asked), "reports change the result");
+    let from = State::from_frame(&left.expect("step 47 was reported")).expect("a checkpoint is readable");
+    assert!(calm == bits(&run(Some(from), &mut |_| Flow::Continue)), "an interruption shows");
+}
+
+#[test]
+fn what_is_under_a_mask_does_not_matter() {
+    let Some(gpu) = gpu() else { return };
+    let truth = cloud(4, 120, 0.8);
+    let given = photos(&truth);
+    let hidden = |i: usize| i % AREA % WIDTH as usize >= 43;
+    let masked = |content: u8| {
+        let mut out = given.clone();
+        for photo in &mut out.0 {
+            photo.mask = Some((0..AREA).map(|i| if hidden(i) { 0 } else { 255 }).collect());
+            photo.rgb.iter_mut().enumerate().filter(|(i, _)| hidden(*i)).for_each(|(_, byte)| *byte = content);
+        }
+        out
+    };
+    let run = |photos: &Photos| {
+        let setup =
+            Setup { backend: gpu.clone(), steps: 20, recipe: no_growth(), ..Setup::new(perturbed(&truth), photos) };
+        bits(&setup.run())
+    };
+    let bare = |mut photos: Photos| {
+        photos.0.iter_mut().for_each(|photo| photo.mask = None);
+        photos
+    };
+    assert!(run(&masked(0)) == run(&masked(200)), "hidden pixels moved parameters");
+    assert!(run(&bare(masked(0))) != run(&bare(masked(200))), "without the mask it must matter");
+}
+
+#[test]
+fn a_step_whose_loss_is_not_finite_is_left_out_and_counted() {
+    let Some(gpu) = gpu() else { return };
+    let truth = cloud(5, 60, 0.8);
+    let photos = photos(&truth);
+    let initial = perturbed(&truth);
+    // Whatever is drawn, such a loss is no number.
+    let recipe = Recipe { lambda: f32::NAN, ..no_growth() };
+    for backend in [Backend::Cpu, gpu] {
+        let mut skipped = None;
+        let setup = Setup { backend, steps: 12, recipe: recipe.clone(), ..Setup::new(initial.clone(), &photos) };
+        let out = setup.try_run(&|_| true, &mut |mut now| {
+            skipped = now.skipped();
+            Flow::Continue
+        });
+        assert_eq!(skipped, Some(12));
+        assert!(
+            bits(&out.expect("steps may be left out")) == bits(&initial),
+            "a step that does not count moved splats"
+        );
+    }
+}
+
+#[test]
+fn what_a_gpu_does_not_do_is_refused() {
+    let Some(gpu) = gpu() else { return };
+    let truth = cloud(9, 60, 0.8);
+    let photos = photos(&truth);
+    let exposures = Exposures::default();
+    let setup = || Setup { backend: gpu.clone(), ..Setup::new(perturbed(&truth), &photos) };
+    for setup in [Setup { trains_exposures: true, ..setup() }, Setup { exposures: Some(&exposures), ..setup() }] {
+        let refused = setup.try_run(&|_| true, &mut |_| Flow::Continue).unwrap_err();
+        assert_eq!(refused, TrainError::Exposures);
+        assert!(refused.to_string().contains("--backend cpu"));
+    }
+    let empty = Setup { backend: gpu.clone(), ..Setup::new(Splats::new(1), &photos) };
+    assert_eq!(empty.try_run(&|_| true, &mut |_| Flow::Continue), Err(TrainError::Empty(0)));
+}
