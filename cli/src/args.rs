@@ -134,7 +134,7 @@ pub(crate) enum Blocks {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub(crate) enum Backend {
-    /// A GPU where there is one that is not software, else the CPU
+    /// The CPU: GPUs have yet to be measured against it
     Auto,
     /// SIMD and threads
     Cpu,

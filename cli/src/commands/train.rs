@@ -182,21 +182,16 @@ fn cap_of(minutes: f64, clock: Stopwatch, plan: &Plan, workers: u32) -> Cap {
     Cap::new(clock, seconds - writing.min(0.1 * seconds), workers)
 }
 
-/// What computes. A software adapter pretends to be a GPU on the CPU, slower than the CPU's own backend: it serves who asks for it.
+/// What computes. The backend has run on a software adapter only, slower than the CPU's own: it serves who asks for it.
 fn backend_of(args: &TrainArgs) -> Result<train::Backend, BadInput> {
-    let trains_exposures = args.plan.exposure;
     match args.backend {
-        Backend::Gpu if trains_exposures => {
+        Backend::Auto | Backend::Cpu => Ok(train::Backend::Cpu),
+        Backend::Gpu if args.plan.exposure => {
             Err(BadInput::new("--exposure", "is not trained on a GPU", "leave it, or give --backend cpu"))
         }
         Backend::Gpu => Gpu::open().map(train::Backend::Gpu).map_err(|error| {
             BadInput::new("--backend", error.to_string(), "give --backend cpu, or name an adapter by PLAT_GPU_ADAPTER")
         }),
-        Backend::Auto if !trains_exposures => Ok(match Gpu::open() {
-            Ok(gpu) if !gpu.is_software() => train::Backend::Gpu(gpu),
-            _ => train::Backend::Cpu,
-        }),
-        Backend::Auto | Backend::Cpu => Ok(train::Backend::Cpu),
     }
 }
 
