@@ -115,6 +115,8 @@ impl GpuSide {
                 *moments = Columns::new(gpu, "moments", sh_degree, stride)?;
             }
             moments.write(gpu, columns);
+            // What waits to be copied takes the host's memory once more.
+            gpu.submit(gpu.encoder())?;
         }
         self.evidence.fit(gpu, 8 * stride as u64)?;
         self.views.fit(gpu, 4 * stride as u64)?;
