@@ -5,12 +5,14 @@
 //! the state up to date when asked: asking costs time, and changes no bit of the result.
 
 mod cpu;
+#[cfg(feature = "gpu")]
 mod gpu;
 
 use std::sync::Arc;
 
 use render::Options;
 use render::cpu::Isa;
+#[cfg(feature = "gpu")]
 use render::gpu::Gpu;
 use scene::{Camera, Exposure, Pixels, Splats};
 
@@ -24,6 +26,7 @@ pub enum Backend {
     #[default]
     Cpu,
     /// A GPU, or what pretends to be one.
+    #[cfg(feature = "gpu")]
     Gpu(Arc<Gpu>),
 }
 
@@ -32,11 +35,18 @@ impl Backend {
     pub fn name(&self) -> String {
         match self {
             Self::Cpu => format!("cpu-{}", Isa::detect().name()),
+            #[cfg(feature = "gpu")]
             Self::Gpu(gpu) => gpu.name().to_owned(),
         }
     }
 
+    /// Not the CPU.
+    pub(crate) fn is_gpu(&self) -> bool {
+        !matches!(self, Self::Cpu)
+    }
+
     /// A training's place, from where it stands; λ weighs 1 - SSIM in the loss.
+    #[cfg_attr(not(feature = "gpu"), allow(unused_variables))]
     pub(crate) fn side<'a>(
         &self,
         now: &State,
@@ -45,6 +55,7 @@ impl Backend {
     ) -> Result<Box<dyn Side + 'a>, TrainError> {
         Ok(match self {
             Self::Cpu => Box::new(cpu::CpuSide::new(lambda, context)),
+            #[cfg(feature = "gpu")]
             Self::Gpu(gpu) => Box::new(gpu::GpuSide::new(gpu, now, lambda, context)?),
         })
     }

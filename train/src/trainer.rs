@@ -268,7 +268,7 @@ pub fn train_on(
     if views.is_empty() {
         return Err(TrainError::NoViews);
     }
-    if matches!(job.backend, Backend::Gpu(_)) && (job.trains_exposures || job.exposures.is_some()) {
+    if job.backend.is_gpu() && (job.trains_exposures || job.exposures.is_some()) {
         return Err(TrainError::Exposures);
     }
     let initial = std::mem::replace(&mut job.initial, Splats::new(0));

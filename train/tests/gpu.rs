@@ -1,5 +1,7 @@
 //! Training on a GPU: as good as on the CPU, and always the same bytes.
 
+#![cfg(feature = "gpu")]
+
 mod ring;
 
 use render::gpu::Gpu;
