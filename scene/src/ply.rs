@@ -40,34 +40,56 @@ pub fn read(bytes: &[u8]) -> Result<Splats, CodecError> {
 
 /// Splats as a `binary_little_endian` PLY with zero normals; each comment becomes one header line.
 pub fn write(splats: &Splats, comments: &[&str]) -> Vec<u8> {
-    let names = column_names(splats.sh_degree());
-    let mut order: Vec<(String, Option<usize>)> = Vec::with_capacity(names.len() + 3);
-    let mut put = |name: &str| order.push((name.into(), names.iter().position(|n| n == name)));
-    ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"].into_iter().for_each(&mut put);
-    (0..names.len() - column::SH - 3).for_each(|k| put(&format!("f_rest_{k}")));
-    ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"].into_iter().for_each(&mut put);
+    let header = header(splats.len(), splats.sh_degree(), comments);
+    let stride = 4 * places(splats.sh_degree()).len();
+    let mut bytes = Vec::with_capacity(header.len() + stride * splats.len());
+    bytes.extend_from_slice(&header);
+    append_rows(&mut bytes, splats);
+    bytes
+}
 
+/// The header of [`write`] for so many splats; what follows it is the [`rows`] of so many, in any number of parts.
+pub fn header(splats: usize, sh_degree: u8, comments: &[&str]) -> Vec<u8> {
     let mut header = String::from("ply\nformat binary_little_endian 1.0\n");
     for comment in comments {
         header += &format!("comment {}\n", comment.replace(['\n', '\r'], " "));
     }
-    header += &format!("element vertex {}\n", splats.len());
-    order.iter().for_each(|(name, _)| header += &format!("property float {name}\n"));
+    header += &format!("element vertex {splats}\n");
+    places(sh_degree).iter().for_each(|(name, _)| header += &format!("property float {name}\n"));
     header += "end_header\n";
+    header.into_bytes()
+}
 
-    let stride = 4 * order.len();
-    let mut bytes = Vec::with_capacity(header.len() + stride * splats.len());
-    bytes.extend_from_slice(header.as_bytes());
-    bytes.resize(header.len() + stride * splats.len(), 0);
-    for (block, rows) in bytes[header.len()..].chunks_mut(stride * ROWS).enumerate() {
-        for (place, (_, source)) in order.iter().enumerate() {
+/// Splats as [`write`] has them after its header.
+pub fn rows(splats: &Splats) -> Vec<u8> {
+    let mut bytes = Vec::new();
+    append_rows(&mut bytes, splats);
+    bytes
+}
+
+fn append_rows(bytes: &mut Vec<u8>, splats: &Splats) {
+    let places = places(splats.sh_degree());
+    let (start, stride) = (bytes.len(), 4 * places.len());
+    bytes.resize(start + stride * splats.len(), 0);
+    for (block, rows) in bytes[start..].chunks_mut(stride * ROWS).enumerate() {
+        for (place, (_, source)) in places.iter().enumerate() {
             let Some(source) = *source else { continue };
             for (row, value) in rows.chunks_exact_mut(stride).zip(&splats.col(source)[block * ROWS..]) {
                 row[4 * place..4 * place + 4].copy_from_slice(&value.to_le_bytes());
             }
         }
     }
-    bytes
+}
+
+/// The properties of a row in INRIA's order, each with the column that it is of; normals have none.
+fn places(sh_degree: u8) -> Vec<(String, Option<usize>)> {
+    let names = column_names(sh_degree);
+    let mut places: Vec<(String, Option<usize>)> = Vec::with_capacity(names.len() + 3);
+    let mut put = |name: &str| places.push((name.into(), names.iter().position(|n| n == name)));
+    ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"].into_iter().for_each(&mut put);
+    (0..names.len() - column::SH - 3).for_each(|k| put(&format!("f_rest_{k}")));
+    ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"].into_iter().for_each(&mut put);
+    places
 }
 
 /// The texts of the header's `comment` lines; none where the bytes are no PLY. plat marks anti-aliased models with

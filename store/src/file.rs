@@ -34,28 +34,78 @@ impl SaveError {
 /// # Errors
 /// A place that refuses it.
 pub fn save(path: &Path, bytes: &[u8]) -> Result<(), SaveError> {
-    write(path, bytes).map_err(|error| SaveError::new(path, &error))
+    let mut saving = Saving::begin(path)?;
+    saving.write(bytes)?;
+    saving.finish()
 }
 
-fn write(path: &Path, bytes: &[u8]) -> io::Result<()> {
-    let path = path.canonicalize().unwrap_or_else(|_| path.to_path_buf());
-    let permissions = match OpenOptions::new().write(true).open(&path) {
-        Ok(mut there) => match there.metadata()? {
-            about if about.is_file() => Some(about.permissions()),
-            _ => return there.write_all(bytes),
-        },
-        Err(error) if error.kind() == ErrorKind::NotFound => None,
-        // Also a file that is protected from being written, which renaming would not ask about.
-        Err(error) => return Err(error),
-    };
-    let part = part_beside(&path);
-    let written = File::create(&part).and_then(|mut file| {
-        file.write_all(bytes)?;
-        permissions.map_or(Ok(()), |permissions| file.set_permissions(permissions))
-    });
-    written.and_then(|()| fs::rename(&part, &path)).inspect_err(|_| {
-        let _ = fs::remove_file(&part);
-    })
+/// A file that is written part by part, as by [`save`]: it has its name when [`finish`](Self::finish) returns, and nothing is left of
+/// it where that is not reached.
+#[derive(Debug)]
+pub struct Saving {
+    /// As it was named, for errors.
+    shown: PathBuf,
+    /// Where it goes.
+    path: PathBuf,
+    file: File,
+    /// The name that it has until it is whole; none where it is a device or pipe.
+    part: Option<PathBuf>,
+}
+
+impl Saving {
+    /// Begins the file.
+    ///
+    /// # Errors
+    /// A place that refuses it.
+    pub fn begin(path: &Path) -> Result<Self, SaveError> {
+        Self::open(path).map_err(|error| SaveError::new(path, &error))
+    }
+
+    /// Adds to its end.
+    ///
+    /// # Errors
+    /// A disk that refuses it.
+    pub fn write(&mut self, bytes: &[u8]) -> Result<(), SaveError> {
+        self.file.write_all(bytes).map_err(|error| SaveError::new(&self.shown, &error))
+    }
+
+    /// Gives it its name.
+    ///
+    /// # Errors
+    /// A folder that refuses it.
+    pub fn finish(mut self) -> Result<(), SaveError> {
+        let Some(part) = self.part.take() else { return Ok(()) };
+        fs::rename(&part, &self.path).map_err(|error| {
+            let _ = fs::remove_file(&part);
+            SaveError::new(&self.shown, &error)
+        })
+    }
+
+    fn open(shown: &Path) -> io::Result<Self> {
+        let path = shown.canonicalize().unwrap_or_else(|_| shown.to_path_buf());
+        let shown = shown.to_path_buf();
+        let permissions = match OpenOptions::new().write(true).open(&path) {
+            Ok(file) => match file.metadata()? {
+                about if about.is_file() => Some(about.permissions()),
+                _ => return Ok(Self { shown, path, file, part: None }),
+            },
+            Err(error) if error.kind() == ErrorKind::NotFound => None,
+            // Also a file that is protected from being written, which renaming would not ask about.
+            Err(error) => return Err(error),
+        };
+        let part = part_beside(&path);
+        let saving = Self { shown, path, file: File::create(&part)?, part: Some(part) };
+        permissions.map_or(Ok(()), |permissions| saving.file.set_permissions(permissions))?;
+        Ok(saving)
+    }
+}
+
+impl Drop for Saving {
+    fn drop(&mut self) {
+        if let Some(part) = &self.part {
+            let _ = fs::remove_file(part);
+        }
+    }
 }
 
 /// A hidden name in the same folder that nothing else writes.
@@ -102,6 +152,22 @@ mod tests {
         assert!(line.contains("a/a: cannot be written: "), "{line}");
         assert!(save(folder.path(), b"x").is_err());
         assert_eq!(names(folder.path()), ["a"]);
+    }
+
+    #[test]
+    fn what_is_not_finished_is_as_if_it_had_not_begun() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a");
+        let begun = |parts: &[&str]| {
+            let mut saving = Saving::begin(&path).unwrap();
+            parts.iter().for_each(|part| saving.write(part.as_bytes()).unwrap());
+            saving
+        };
+        drop(begun(&["lost"]));
+        assert!(names(folder.path()).is_empty());
+        begun(&["one ", "two ", ""]).finish().unwrap();
+        drop(begun(&["lost"]));
+        assert_eq!((names(folder.path()), &*fs::read_to_string(&path).unwrap()), (vec!["a".to_owned()], "one two "));
     }
 
     #[cfg(target_os = "linux")]
