@@ -2,11 +2,13 @@
 //! splats with finite means. Both sides use [`Ground::block_at`], the one ownership rule, so no splat is lost or
 //! doubled, wherever it lies. Splats whose mean is not finite belong nowhere and are dropped.
 
+use std::borrow::Borrow;
 use std::collections::BTreeMap;
 
 use scene::{BlockId, Splats};
 
 use crate::ground::Ground;
+use crate::lod::Cut;
 
 /// The splats of each block of `level` that has any.
 pub fn cut(splats: &Splats, ground: &Ground, level: u8) -> BTreeMap<BlockId, Splats> {
@@ -36,6 +38,19 @@ pub fn merge(parts: impl IntoIterator<Item = (BlockId, Splats)>) -> Splats {
         merged.append(&splats);
     }
     merged
+}
+
+/// What a cut of the tree shows: of every block's splats those that it owns there.
+///
+/// # Errors
+/// A part that is not to be had.
+pub fn sew<S: Borrow<Splats>, E>(
+    cut: &Cut,
+    ground: &Ground,
+    parts: impl IntoIterator<Item = Result<(BlockId, S), E>>,
+) -> Result<Splats, E> {
+    let owned = |(block, splats): (BlockId, S)| (block, cut.keep(splats.borrow(), ground, block));
+    Ok(merge(parts.into_iter().map(|part| part.map(owned)).collect::<Result<Vec<_>, E>>()?))
 }
 
 #[cfg(test)]

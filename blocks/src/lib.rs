@@ -23,7 +23,7 @@ mod shown;
 mod testing;
 pub mod view_cut;
 
-pub use cut::{cut, keep_core, merge};
+pub use cut::{cut, keep_core, merge, sew};
 pub use draw::draw;
 pub use ground::{Ground, Square};
 pub use lint::{Finding, Severity, lint};

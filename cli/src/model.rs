@@ -10,13 +10,14 @@
 pub(crate) mod rewrite;
 
 use std::collections::BTreeMap;
+use std::convert::Infallible;
 use std::fs;
 use std::path::{Path, PathBuf};
 
 use blocks::{Cut, Ground, Plan};
 use scene::{ArtefactId, BadInput, BlockId, CodecError, Exposures, GeoOrigin, Splats, frame, ply, spz};
 use serde::{Deserialize, Serialize};
-use store::file::save;
+use store::file::{Saving, save};
 use store::{BlockingStore, Store};
 use tempfile::TempDir;
 
@@ -84,8 +85,7 @@ impl Model {
 
     /// As an INRIA PLY.
     pub(crate) fn to_ply(&self) -> Vec<u8> {
-        let comments: &[&str] = if self.antialiased { &[ANTIALIASED] } else { &[] };
-        ply::write(&self.splats, comments)
+        ply::write(&self.splats, comments(self.antialiased))
     }
 
     /// As SPZ of version 3.
@@ -142,7 +142,16 @@ fn begin(out: &Path, plan: &Plan) -> Result<PathBuf, Failure> {
     Ok(folder)
 }
 
-/// Writes the results of all tasks of a plan, in its order, under `out`, and returns the sewn model.
+/// What [`write`] wrote.
+pub(crate) struct Written {
+    /// Splats of the finest cut.
+    pub(crate) splats: u64,
+    /// Bytes of `merged.ply`.
+    pub(crate) bytes: u64,
+}
+
+/// Writes the results of all tasks of a plan, in its order, under `out`: one block in memory at a time, as the model may be
+/// larger than that.
 pub(crate) fn write(
     out: &Path,
     plan: &Plan,
@@ -150,43 +159,60 @@ pub(crate) fn write(
     store: &BlockingStore,
     geo_origin: Option<GeoOrigin>,
     downscale: u32,
-) -> Result<Model, Failure> {
+) -> Result<Written, Failure> {
     let folder = begin(out, plan)?;
+    let (leaves, sh_degree) = (plan.leaves(), plan.settings.sh_degree);
+    let owned = |splats: &Splats, block| leaves.keep(splats, &plan.ground, block).with_sh_degree(sh_degree);
 
-    let (mut blocks, mut exposures) = (Vec::new(), None);
-    let splats = sew(plan, |block| -> Result<_, Failure> {
-        let index = plan.tasks.iter().position(|task| task.block == block);
-        let artefact =
-            *index.and_then(|i| results.get(i)).ok_or_else(|| Failure::Work(format!("block {block} has no result")))?;
+    let (mut blocks, mut exposures, mut count) = (Vec::new(), None, 0);
+    for (index, task) in plan.tasks.iter().enumerate() {
+        let block = task.block;
+        let artefact = *results.get(index).ok_or_else(|| Failure::Work(format!("block {block} has no result")))?;
         let bytes = store.get(artefact)?;
         let damaged = |error: CodecError| Failure::Work(format!("block {block}: {error}"));
         let (splats, about) = frame::decode_result(&bytes).map_err(damaged)?;
         exposures = exposures.or(about.exposures);
         save(&folder.join("blocks").join(file_name(block)), &bytes)?;
         blocks.push(Block { block, artefact, splats: splats.len() as u64 });
-        Ok(splats)
-    })?;
+        count += owned(&splats, block).len();
+    }
+
+    let mut order: Vec<BlockId> = blocks.iter().map(|of| of.block).collect();
+    order.sort_unstable();
+    let mut merged = Saving::begin(&out.join(MERGED_FILE))?;
+    let header = ply::header(count, sh_degree, comments(plan.settings.antialiased));
+    merged.write(&header)?;
+    let mut bytes = header.len() as u64;
+    for block in order {
+        let rows = ply::rows(&owned(&read_block(&folder, block)?, block));
+        merged.write(&rows)?;
+        bytes += rows.len() as u64;
+    }
+    merged.finish()?;
+
+    if let Some(id) = exposures {
+        save(&folder.join(EXPOSURES_FILE), &store.get(id)?)?;
+    }
     let manifest = Manifest {
         version: VERSION,
         plan: plan.id(),
         antialiased: plan.settings.antialiased,
-        sh_degree: plan.settings.sh_degree,
+        sh_degree,
         geo_origin,
         ground: plan.ground,
         test_every: plan.settings.test_every,
         downscale,
         exposures,
-        splats: splats.len() as u64,
+        splats: count as u64,
         blocks,
     };
-    let exposures = match exposures {
-        Some(id) => Some(Exposures::from_frame(&store.get(id)?).map_err(|error| Failure::Work(error.to_string()))?),
-        None => None,
-    };
-    let antialiased = manifest.antialiased;
-    let model = Model { splats, antialiased, exposures, trained: Some((manifest, out.to_path_buf())) };
-    finish(out, &model)?;
-    Ok(model)
+    save_json(&folder.join("model.json"), &manifest)?;
+    Ok(Written { splats: count as u64, bytes })
+}
+
+/// The comments of a model's PLY.
+fn comments(antialiased: bool) -> &'static [&'static str] {
+    if antialiased { &[ANTIALIASED] } else { &[] }
 }
 
 /// Ends what [`begin`] began, once the blocks are there; returns the bytes of `merged.ply`.
@@ -200,17 +226,6 @@ fn finish(out: &Path, model: &Model) -> Result<u64, Failure> {
         save_json(&out.join("model/model.json"), manifest)?;
     }
     Ok(merged.len() as u64)
-}
-
-/// The finest cut: of every task's splats those that its block owns among all of them.
-fn sew<E>(plan: &Plan, mut result_of: impl FnMut(BlockId) -> Result<Splats, E>) -> Result<Splats, E> {
-    let leaves = plan.leaves();
-    let mut parts = Vec::new();
-    for task in &plan.tasks {
-        let splats = result_of(task.block)?;
-        parts.push((task.block, leaves.keep(&splats, &plan.ground, task.block)));
-    }
-    Ok(blocks::merge(parts))
 }
 
 /// Reads a model: a folder that `plat train` wrote, its `model` folder, a `.ply` or a `.spz`.
@@ -242,7 +257,8 @@ pub(crate) fn read(path: &Path) -> Result<Model, BadInput> {
 
 fn read_trained(folder: &Path) -> Result<Model, BadInput> {
     let (manifest, plan) = read_plan(folder)?;
-    let splats = sew(&plan, |block| read_block(folder, block))?;
+    let parts = plan.tasks.iter().map(|task| Ok((task.block, read_block(folder, task.block)?)));
+    let splats = blocks::sew(&plan.leaves(), &plan.ground, parts)?;
     let out = folder.parent().filter(|_| folder.ends_with("model")).unwrap_or(folder);
     let exposures = match manifest.exposures {
         Some(_) => {
@@ -267,8 +283,8 @@ pub(crate) struct Tree {
 impl Tree {
     /// What a cut shows.
     pub(crate) fn sewn(&self, cut: &Cut) -> Splats {
-        let kept = self.results.iter().map(|(&block, splats)| (block, cut.keep(splats, &self.plan.ground, block)));
-        blocks::merge(kept)
+        let parts = self.results.iter().map(|(&block, splats)| Ok((block, splats)));
+        blocks::sew(cut, &self.plan.ground, parts).unwrap_or_else(|never: Infallible| match never {})
     }
 }
 

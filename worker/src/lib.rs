@@ -16,7 +16,7 @@ pub mod clock;
 pub mod estimate;
 pub mod execute;
 mod memory;
-mod merged;
+pub mod merged;
 mod refine;
 mod start;
 

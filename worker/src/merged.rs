@@ -4,13 +4,15 @@
 //! Architecture invariant: this only looks. No result depends on it.
 
 use std::collections::BTreeMap;
+use std::convert::Infallible;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use blocks::{Cut, Mode, Plan};
 use dataset::windows::WindowReader;
 use render::Options;
 use render::cpu::Renderer;
-use scene::{ArtefactId, BlockId, Capture, Splats};
+use scene::splats::sh_coefficients;
+use scene::{ArtefactId, BlockId, Capture, Splats, column};
 use store::BlockingStore;
 use train::metrics;
 
@@ -21,6 +23,8 @@ const PIXELS_LIMIT: u64 = 4 << 20;
 const LOOKS: usize = 16;
 /// Photos kept decoded.
 const CACHE_BYTES: usize = 32 << 20;
+/// A merged model of more bytes is not measured on the way: it would be most of what a worker takes, and more with every block.
+const MERGED_BYTES: u64 = 64 << 20;
 
 /// What is finished of a job, as far as the workers that share this know: those of one process know all of it, others
 /// what their tasks were given.
@@ -64,11 +68,8 @@ impl Finished {
             let cut = cut_of(plan, parts.keys().copied().chain([block]));
             let mut all: BTreeMap<BlockId, &Splats> = parts.iter().map(|(&of, part)| (of, part)).collect();
             all.insert(block, splats);
-            let mut merged = Splats::new(plan.settings.sh_degree);
-            merged.reserve(all.values().map(|part| part.len()).sum());
-            // One copy at a time.
-            all.into_iter().for_each(|(of, part)| merged.append(&cut.keep(part, &plan.ground, of)));
-            merged
+            let all = all.into_iter().map(Ok);
+            blocks::sew(&cut, &plan.ground, all).unwrap_or_else(|never: Infallible| match never {})
         })
     }
 
@@ -80,6 +81,13 @@ impl Finished {
         }
         f(&mut parts.1)
     }
+}
+
+/// Whether the merged model is measured on the way: where it is one block's, which is in memory anyway, or small. Else it is evaluated
+/// at the end, by whoever wants to.
+pub fn is_measured(plan: &Plan) -> bool {
+    let columns = column::SH + 3 * sh_coefficients(plan.settings.sh_degree);
+    plan.tasks.len() == 1 || u64::from(plan.settings.budget) * 4 * columns as u64 <= MERGED_BYTES
 }
 
 /// Whether the merged model is measured when this row of the plan's tasks has ended; after the last it is.
@@ -106,8 +114,11 @@ pub(crate) struct Judge {
 }
 
 impl Judge {
-    /// `None` where no view is held out. What it reads is not counted among what the store moved.
+    /// `None` where no view is held out, or the merged model is too large. What it reads is not counted among what the store moved.
     pub(crate) fn new(plan: &Plan, capture: &Arc<Capture>, store: &BlockingStore) -> Option<Self> {
+        if !is_measured(plan) {
+            return None;
+        }
         let held_out = capture.views.iter().enumerate().filter(|(i, _)| Capture::is_test(*i, plan.settings.test_every));
         let mip = |camera: &scene::Camera| {
             (0..31).find(|&mip| camera.mip(mip).full().area() <= PIXELS_LIMIT).unwrap_or_default()
@@ -193,24 +204,39 @@ mod tests {
         assert_eq!(sizes(&finished.with(ArtefactId([3; 32]), &plan, b, &four(3.0))), [3]);
     }
 
+    fn task() -> blocks::Task {
+        blocks::Task {
+            block: BlockId::ROOT,
+            parent: None,
+            context: Vec::new(),
+            views: Vec::new(),
+            test_views: Vec::new(),
+            points: 0,
+            budget: 1,
+            drawn: 0,
+            steps: 1,
+            rho_metres: 1.0,
+            memory_bytes: 0,
+        }
+    }
+
+    #[test]
+    fn what_may_not_fit_beside_the_work_is_not_measured() {
+        let measured = |tasks: usize, budget: u32, sh_degree: u8| {
+            let plan = plan(Mode::Tree);
+            let settings = PlanSettings { budget, sh_degree, ..plan.settings.clone() };
+            is_measured(&Plan { tasks: vec![task(); tasks], settings, ..plan })
+        };
+        // 59 floats of four bytes each: 284,359 are 64 MiB.
+        assert!(measured(5, 284_359, 3) && !measured(5, 284_360, 3));
+        assert!(measured(5, 1_000_000, 0) && measured(1, u32::MAX, 3));
+    }
+
     #[test]
     fn large_plans_are_looked_at_now_and_then_and_at_their_end() {
         let mut plan = plan(Mode::Tree);
         let mut looks = |count: usize| {
-            let task = blocks::Task {
-                block: BlockId::ROOT,
-                parent: None,
-                context: Vec::new(),
-                views: Vec::new(),
-                test_views: Vec::new(),
-                points: 0,
-                budget: 1,
-                drawn: 0,
-                steps: 1,
-                rho_metres: 1.0,
-                memory_bytes: 0,
-            };
-            plan.tasks = vec![task; count];
+            plan.tasks = vec![task(); count];
             (0..count as u32).filter(|&i| is_look(&plan, i)).collect::<Vec<u32>>()
         };
         assert_eq!(looks(5), [0, 1, 2, 3, 4]);

@@ -44,7 +44,8 @@ pub(crate) fn pareto(args: &ParetoArgs, output: &Output) -> Result<(), Failure> 
     let out = args.train.out.join("eval");
     let mut record = trained.report.record.clone();
     let every = args.train.plan.test_every;
-    let evaluated = evaluate(&trained.model, trained.capture, store, every, lpips.as_ref(), &out, output)?;
+    let model = model::read(&args.train.out)?;
+    let evaluated = evaluate(&model, trained.capture, store, every, lpips.as_ref(), &out, output)?;
     save_json(&out.join("report.json"), &evaluated)?;
     record.scene.clone_from(&args.scene);
     record.measured(&evaluated.record);
@@ -76,7 +77,8 @@ pub(crate) fn adaptive(args: &AdaptiveArgs, output: &Output) -> Result<(), Failu
         let every = train.plan.test_every;
         let out = args.out.join("eval").join(label.replace(' ', "_"));
         let mut record = trained.report.record.clone();
-        let evaluated = evaluate(&trained.model, trained.capture, store, every, None, &out, output)?;
+        let model = model::read(&train.out)?;
+        let evaluated = evaluate(&model, trained.capture, store, every, None, &out, output)?;
         save_json(&out.join("report.json"), &evaluated)?;
         record.scene = "half a bare plain".into();
         record.measured(&evaluated.record);

@@ -15,7 +15,7 @@ use crate::commands::eval::evaluate;
 use crate::commands::render::to_image;
 use crate::commands::train::{Report, train};
 use crate::failure::Failure;
-use crate::model::save_json;
+use crate::model::{self, save_json};
 use crate::output::Output;
 
 /// Width of the pictures from above, pixels.
@@ -56,6 +56,7 @@ pub(crate) fn build(args: &DemoArgs, output: &Output) -> Result<Built, Failure> 
     ));
 
     let trained = train(&train_args, output)?;
+    let model = model::read(&train_args.out)?;
     let store = Store::open(&args.out.join("store").display().to_string())?.blocking();
     let eval_folder = args.out.join("eval");
     let [birdseye, oblique] = ["birdseye.png", "oblique.png"].map(|name| args.out.join(name));
@@ -64,11 +65,11 @@ pub(crate) fn build(args: &DemoArgs, output: &Output) -> Result<Built, Failure> 
         (&birdseye, birdseye_camera(&trained.capture, up, PICTURE_WIDTH)),
         (&oblique, oblique_camera(&trained.capture, up, PICTURE_WIDTH)),
     ] {
-        let frame = renderer.forward(&trained.model.splats, None, &camera, &trained.model.options());
+        let frame = renderer.forward(&model.splats, None, &camera, &model.options());
         write_png(path, &to_image(frame))?;
     }
     let every = train_args.plan.test_every;
-    let evaluated = evaluate(&trained.model, trained.capture, store, every, None, &eval_folder, output)?;
+    let evaluated = evaluate(&model, trained.capture, store, every, None, &eval_folder, output)?;
     save_json(&eval_folder.join("report.json"), &evaluated)?;
 
     let mut report = trained.report;

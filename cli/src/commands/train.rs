@@ -20,12 +20,13 @@ use tokio_util::sync::CancellationToken;
 use worker::cap::Cap;
 use worker::estimate::Estimate;
 use worker::execute::{BlockTrainer, Shared, TrainerOptions};
+use worker::merged::is_measured;
 
 use crate::args::{Backend, TrainArgs};
 use crate::clock::{self, Stopwatch};
 use crate::commands::plan::plan_of;
 use crate::failure::{Failure, cannot};
-use crate::model::{self, Model, save_json};
+use crate::model::{self, save_json};
 use crate::output::Output;
 use crate::record::Record;
 use crate::{cameras, config, journal::Journal};
@@ -33,10 +34,9 @@ use crate::{cameras, config, journal::Journal};
 /// Windows of photos that each worker keeps decoded; the planner's estimate of memory counts on it.
 const CACHE_BYTES: usize = 128 << 20;
 
-/// What training left in memory.
+/// What training left, beside the model's folder.
 pub(crate) struct Trained {
     pub(crate) capture: Capture,
-    pub(crate) model: Model,
     pub(crate) report: Report,
     /// Held-out PSNR of the merged model on the way.
     pub(crate) curve: Vec<CurvePoint>,
@@ -106,6 +106,9 @@ pub(crate) fn train(args: &TrainArgs, output: &Output) -> Result<Trained, Failur
     save(&args.out.join("plan.svg"), blocks::draw(&plan, &capture).as_bytes())?;
     let plan_id = store.blocking().put(plan.to_frame())?;
 
+    if plan.settings.test_every > 0 && !is_measured(&plan) {
+        output.note("a model of so many splats is not measured on the way: plat eval measures it at the end");
+    }
     let progress = output.progress("training", plan.tasks.iter().map(|task| u64::from(task.steps)).sum());
     let mut journal = Journal::create(&args.out.join("metrics.jsonl"), &plan, args.workers, clock.clone(), &progress)?;
     let cap = args.minutes.map(|minutes| cap_of(minutes, clock.clone(), &plan, args.workers));
@@ -136,8 +139,7 @@ pub(crate) fn train(args: &TrainArgs, output: &Output) -> Result<Trained, Failur
     }
 
     clock = Stopwatch::start();
-    let model = model::write(&args.out, &plan, &results, &store.blocking(), capture.geo_origin, args.plan.downscale)?;
-    let bytes = fs::metadata(args.out.join("merged.ply")).ok().map(|file| file.len());
+    let written = model::write(&args.out, &plan, &results, &store.blocking(), capture.geo_origin, args.plan.downscale)?;
     let record = Record {
         scene: cameras::name_of(&args.capture),
         downscale: args.plan.downscale,
@@ -149,8 +151,8 @@ pub(crate) fn train(args: &TrainArgs, output: &Output) -> Result<Trained, Failur
         cpu_seconds: Some(spent.cpu_seconds + clock.cpu_seconds()),
         // Tasks that end side by side do not see each other's last splats.
         psnr: spent.last_psnr.filter(|_| args.workers == 1 || plan.tasks.len() == 1),
-        splats: model.splats.len() as u64,
-        bytes,
+        splats: written.splats,
+        bytes: Some(written.bytes),
         peak_memory_bytes: clock::peak_memory_bytes(),
         bytes_moved: Some(metered.traffic().read + metered.traffic().written),
         seed: Some(args.plan.seed),
@@ -162,7 +164,7 @@ pub(crate) fn train(args: &TrainArgs, output: &Output) -> Result<Trained, Failur
         capture: capture_id,
         tasks: plan.tasks.len(),
         levels: plan.levels,
-        antialiased: model.antialiased,
+        antialiased: plan.settings.antialiased,
         ingest_cpu_seconds,
         capped,
         resumed,
@@ -170,7 +172,7 @@ pub(crate) fn train(args: &TrainArgs, output: &Output) -> Result<Trained, Failur
         predicted: Estimate::of(&plan),
     };
     save_json(&args.out.join("report.json"), &report)?;
-    Ok(Trained { capture, model, report, curve: spent.curve })
+    Ok(Trained { capture, report, curve: spent.curve })
 }
 
 /// What lets the whole job end when its clock shows so many minutes: training has to end before.
