@@ -1,6 +1,7 @@
 //! The stages of the GPU backend as WGSL text, and the layouts that they share with Rust.
 //!
-//! A [`Stage`] is one file of `wgsl/` with the snippets that it uses before it; several entry points may share a file.
+//! A [`Stage`] is one file of `wgsl/` with the snippets that it uses before it; several entry points may share a file. Where
+//! subgroups do something faster, a snippet has a twin for them: [`SUBGROUPS`] are the stages with those in its place.
 //! A test parses every stage with naga and compares every structure with its Rust twin.
 //!
 //! Architecture invariant: text and layouts only; nothing here knows a device.
@@ -48,12 +49,32 @@ impl Stage {
 
 /// The view, the record of a projected splat, the renderer's status and its constants.
 pub const VIEW: &str = include_str!("../wgsl/view.wgsl");
+/// A snippet for every adapter, and its twin for those with subgroups.
+macro_rules! snippet {
+    ($name:literal) => {
+        [include_str!(concat!("../wgsl/", $name, ".wgsl")), include_str!(concat!("../wgsl/", $name, "_subgroups.wgsl"))]
+    };
+}
+
 /// Columns of splats in four banks, their EWA projection and their colour's basis.
 const SPLAT: &str = include_str!("../wgsl/splat.wgsl");
 /// Which tiles an ellipse touches.
 const TILES: &str = include_str!("../wgsl/tiles.wgsl");
 /// A splat's opacity at a pixel.
 const BLEND: &str = include_str!("../wgsl/blend.wgsl");
+
+/// Which thread of its workgroup a thread is.
+const THREADS: [&str; 2] = snippet!("threads");
+/// Sums over a workgroup.
+const SUMS: [&str; 2] = snippet!("sums");
+/// Which threads have which digit.
+const DIGITS_OF: [&str; 2] = snippet!("digits");
+/// Sums over the pixels of a tile.
+const PARTS: [&str; 2] = snippet!("parts");
+/// Where the sums of a pair go: to itself.
+const IN_ORDER: &str = include_str!("../wgsl/in_order.wgsl");
+/// Where the sums of a pair go: to its splat, by atomics.
+const BY_ATOMICS: &str = include_str!("../wgsl/by_atomics.wgsl");
 
 macro_rules! stages {
     ($($constant:ident $name:literal [$($part:expr),*] $entries:expr;)*) => {
@@ -70,17 +91,44 @@ macro_rules! stages {
 stages! {
     PLAN "plan" [VIEW] ["plan_start", "plan_visible", "plan_pairs"];
     PROJECT "project" [VIEW, SPLAT, TILES] ["project"];
-    SCAN "scan" [] ["scan_blocks", "scan_sums", "scan_apply"];
+    SCAN "scan" [THREADS[0], SUMS[0]] ["scan_blocks", "scan_sums", "scan_apply"];
     COMPACT "compact" [VIEW] ["compact"];
-    RADIX "radix" [] ["radix_count", "radix_scatter"];
+    RADIX "radix" [THREADS[0], DIGITS_OF[0]] ["radix_count", "radix_scatter"];
     GATHER "gather" [VIEW] ["gather"];
     EMIT "emit" [VIEW, TILES] ["emit"];
     RANGES "ranges" [VIEW] ["ranges"];
     RASTERIZE "rasterize" [VIEW, BLEND] ["rasterize"];
-    RASTERIZE_BACKWARD "rasterize_backward" [VIEW, BLEND] ["rasterize_backward"];
+    RASTERIZE_BACKWARD "rasterize_backward" [VIEW, BLEND, THREADS[0], PARTS[0], IN_ORDER] ["rasterize_backward"];
     REDUCE "reduce" [VIEW] ["reduce"];
     PROJECT_BACKWARD "project_backward" [VIEW, SPLAT] ["project_backward"];
 }
+
+const SCAN_TEXT: &str = include_str!("../wgsl/scan.wgsl");
+const RADIX_TEXT: &str = include_str!("../wgsl/radix.wgsl");
+const BACKWARD_TEXT: &str = include_str!("../wgsl/rasterize_backward.wgsl");
+
+/// As [`RASTERIZE_BACKWARD`], but a pair's sums are added to its splat's by atomics: what fixed order is measured against.
+pub const RASTERIZE_BACKWARD_ATOMICS: Stage = Stage::new(
+    "rasterize_backward_atomics",
+    &[VIEW, BLEND, THREADS[0], PARTS[0], BY_ATOMICS, BACKWARD_TEXT],
+    RASTERIZE_BACKWARD.entries,
+);
+
+/// What takes the place of the stages of the same names where the adapter has subgroups, all of one size from 8 to 128.
+pub const SUBGROUPS: &[Stage] = &[
+    Stage::new(SCAN.name, &[THREADS[1], SUMS[1], SCAN_TEXT], SCAN.entries),
+    Stage::new(RADIX.name, &[THREADS[1], DIGITS_OF[1], RADIX_TEXT], RADIX.entries),
+    Stage::new(
+        RASTERIZE_BACKWARD.name,
+        &[VIEW, BLEND, THREADS[1], PARTS[1], IN_ORDER, BACKWARD_TEXT],
+        RASTERIZE_BACKWARD.entries,
+    ),
+    Stage::new(
+        RASTERIZE_BACKWARD_ATOMICS.name,
+        &[VIEW, BLEND, THREADS[1], PARTS[1], BY_ATOMICS, BACKWARD_TEXT],
+        RASTERIZE_BACKWARD_ATOMICS.entries,
+    ),
+];
 
 /// A camera in single precision with what the stages want of it, and the sizes of what it draws. Uniform.
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]

@@ -6,7 +6,7 @@ use std::mem::offset_of;
 use naga::valid::{Capabilities, ValidationFlags, Validator};
 use naga::{Module, TypeInner};
 use shaders::train::{self, Books, Rates, Window};
-use shaders::{Pass, Planes, STAGES, Set, Status, View};
+use shaders::{Pass, Planes, RASTERIZE_BACKWARD_ATOMICS, STAGES, SUBGROUPS, Set, Stage, Status, View};
 
 /// Name and byte offset of each member, and the size of the whole.
 type Layout = (Vec<(String, usize)>, usize);
@@ -47,9 +47,15 @@ fn structures(module: &Module) -> BTreeMap<String, Layout> {
         .collect()
 }
 
-fn parse(name: &str, source: &str) -> Result<Module, String> {
+/// Every stage, and what an adapter must have for it.
+fn stages() -> impl Iterator<Item = (&'static Stage, Capabilities)> {
+    let plain = STAGES.iter().chain(train::STAGES).chain([&RASTERIZE_BACKWARD_ATOMICS]);
+    plain.map(|s| (s, Capabilities::empty())).chain(SUBGROUPS.iter().map(|s| (s, Capabilities::SUBGROUP)))
+}
+
+fn parse(name: &str, source: &str, needs: Capabilities) -> Result<Module, String> {
     let module = naga::front::wgsl::parse_str(source).map_err(|e| format!("{name}: {}", e.emit_to_string(source)))?;
-    let mut validator = Validator::new(ValidationFlags::all(), Capabilities::empty());
+    let mut validator = Validator::new(ValidationFlags::all(), needs);
     validator.validate(&module).map_err(|e| format!("{name}: {}", e.emit_to_string(source)))?;
     Ok(module)
 }
@@ -58,8 +64,8 @@ fn parse(name: &str, source: &str) -> Result<Module, String> {
 fn stages_are_valid_and_agree_with_their_twins() {
     let twins = twins();
     let mut compared: BTreeMap<&str, usize> = BTreeMap::new();
-    for stage in STAGES.iter().chain(train::STAGES) {
-        let module = parse(stage.name, &stage.source()).unwrap_or_else(|e| panic!("{e}"));
+    for (stage, needs) in stages() {
+        let module = parse(stage.name, &stage.source(), needs).unwrap_or_else(|e| panic!("{e}"));
         let entries: Vec<&str> = module.entry_points.iter().map(|entry| entry.name.as_str()).collect();
         assert_eq!(entries, stage.entries, "entry points of {}", stage.name);
         for entry in &module.entry_points {
@@ -79,13 +85,37 @@ fn stages_are_valid_and_agree_with_their_twins() {
 }
 
 #[test]
+fn subgroups_take_the_place_of_portable_stages() {
+    for stage in SUBGROUPS {
+        let mut portable = stages().filter(|(other, needs)| other.name == stage.name && needs.is_empty());
+        let (portable, _) = portable.next().unwrap_or_else(|| panic!("{} is for subgroups only", stage.name));
+        assert_eq!(portable.entries, stage.entries);
+        let bindings = |stage: &Stage, needs| -> Vec<String> {
+            let module = parse(stage.name, &stage.source(), needs).unwrap_or_else(|e| panic!("{e}"));
+            let bindings =
+                module.global_variables.iter().filter_map(|(_, variable)| variable.binding.map(|b| (b, variable)));
+            let mut all: Vec<String> = bindings.map(|(at, variable)| format!("{at:?} {:?}", variable.space)).collect();
+            all.sort();
+            all
+        };
+        assert_eq!(
+            bindings(portable, Capabilities::empty()),
+            bindings(stage, Capabilities::SUBGROUP),
+            "{}",
+            stage.name
+        );
+        assert!(parse(stage.name, &stage.source(), Capabilities::empty()).is_err(), "{} uses none", stage.name);
+    }
+}
+
+#[test]
 fn a_wrong_layout_and_a_wrong_stage_are_seen() {
     let moved = "struct Set { count: u32, first: u32, stride: u32, sh_degree: u32, }
         @group(0) @binding(0) var<uniform> s: Set;
         @compute @workgroup_size(1) fn main() { let x = s.count; }";
-    let module = parse("moved", moved).unwrap_or_else(|e| panic!("{e}"));
+    let module = parse("moved", moved, Capabilities::empty()).unwrap_or_else(|e| panic!("{e}"));
     assert_ne!(structures(&module)["Set"], twins()["Set"]);
-    assert!(parse("untyped", "fn f() -> u32 { return 1.5; }").is_err());
+    assert!(parse("untyped", "fn f() -> u32 { return 1.5; }", Capabilities::empty()).is_err());
 }
 
 /// `const NAME: type = value;` lines of all stages agree with the Rust constants of the same name.
@@ -102,7 +132,7 @@ fn constants_agree() {
     ]
     .into();
     let mut found = BTreeMap::new();
-    for stage in STAGES.iter().chain(train::STAGES) {
+    for (stage, _) in stages() {
         for line in stage.source().lines() {
             let Some((name, value)) = line.strip_prefix("const ").and_then(|line| line.split_once(": u32 = ")) else {
                 continue;

@@ -31,17 +31,20 @@ fn block_of(group: vec3<u32>, groups: vec3<u32>) -> u32 {
 fn radix_count(
     @builtin(workgroup_id) group: vec3<u32>,
     @builtin(num_workgroups) groups: vec3<u32>,
-    @builtin(local_invocation_index) local: u32,
+    thread: Thread,
 ) {
+    let local = place_of(thread);
     let count = status[pass_.slot];
     let block = block_of(group, groups);
     atomicStore(&counts[local], 0u);
     workgroupBarrier();
     for (var round = 0u; round < ROUNDS; round++) {
         let at = block * BLOCK + round * 256u + local;
+        var digit = 0u;
         if at < count {
-            atomicAdd(&counts[(keys[at] >> pass_.shift) & 255u], 1u);
+            digit = (keys[at] >> pass_.shift) & 255u;
         }
+        count_digit(digit, at < count, thread);
     }
     workgroupBarrier();
     let blocks = count / BLOCK + select(0u, 1u, count % BLOCK != 0u);
@@ -54,8 +57,9 @@ fn radix_count(
 fn radix_scatter(
     @builtin(workgroup_id) group: vec3<u32>,
     @builtin(num_workgroups) groups: vec3<u32>,
-    @builtin(local_invocation_index) local: u32,
+    thread: Thread,
 ) {
+    let local = place_of(thread);
     let count = status[pass_.slot];
     let block = block_of(group, groups);
     let blocks = count / BLOCK + select(0u, 1u, count % BLOCK != 0u);
@@ -77,9 +81,8 @@ fn radix_scatter(
         if at < count {
             key = keys[at];
             digit = (key >> pass_.shift) & 255u;
-            // Which threads have which digit: the order in which they say so does not matter.
-            atomicOr(&holders[word * 256u + digit], bit);
         }
+        hold_digit(digit, at < count, thread);
         workgroupBarrier();
         if at < count {
             var rank = countOneBits(atomicLoad(&holders[word * 256u + digit]) & (bit - 1u));

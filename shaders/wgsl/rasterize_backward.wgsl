@@ -3,8 +3,8 @@
 // A workgroup walks its tile's pairs front to back, as `rasterize` does, eight at a time, in two steps. First a thread is a
 // pixel: it replays its eight opacities, knows the colour behind each as "final minus seen so far", and leaves
 // v = alpha dL/dalpha and w = alpha T in workgroup memory. Then 32 threads are a pair: each adds up eight pixels of one
-// column, so that most moments need only the sums of v, v dy and v dy^2; 32 such sums are added in order. No atomics
-// on floats: the same bits every time.
+// column, so that most moments need only the sums of v, v dy and v dy^2; 32 such parts are added in a fixed order
+// (`add_up_parts`). No atomics on floats: the same bits every time.
 
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<storage, read> tile_ranges: array<vec2<u32>>;
@@ -16,18 +16,14 @@
 // Planes: dL/d red, green, blue and, where `planes` says so, transmittance and depth.
 @group(0) @binding(7) var<storage, read> upstream: array<f32>;
 @group(0) @binding(8) var<uniform> planes: Planes;
-// MOMENTS floats a pair: v, v dx, v dy, v dx^2, v dx dy, v dy^2, w red, w green, w blue, w depth, w, |x|, |y|; the three
-// colours and depth stand for the upstream gradients, |x| and |y| for the mean's gradient summed without cancellation.
-@group(0) @binding(9) var<storage, read_write> moments: array<f32>;
-
 const PAIRS: u32 = 8u; // at a time
 const PARTS: u32 = 32u; // threads of a pair
 const PIXELS: u32 = 8u; // of a part
-const STRIDE: u32 = 33u; // not 32: threads that add up different moments read different memory banks
 
 var<workgroup> places: array<vec4<f32>, PAIRS>;
 var<workgroup> reaches: array<vec2<f32>, PAIRS>;
 var<workgroup> looks: array<vec4<f32>, PAIRS>;
+// Of each pair, or of its splat, where its sums go.
 var<workgroup> pairs: array<u32, PAIRS>;
 var<workgroup> owns: array<u32, PAIRS>;
 // dL/d colour and depth of each pixel.
@@ -43,8 +39,9 @@ var<workgroup> end_now: u32;
 fn rasterize_backward(
     @builtin(workgroup_id) group: vec3<u32>,
     @builtin(num_workgroups) groups: vec3<u32>,
-    @builtin(local_invocation_index) local: u32,
+    thread: Thread,
 ) {
+    let local = place_of(thread);
     let tile = group.y * groups.x + group.x;
     let exists = tile < view.tiles.x * view.tiles.y;
     var range = vec2<u32>(0u);
@@ -97,7 +94,7 @@ fn rasterize_backward(
             places[local] = record.place;
             reaches[local] = record.reach.xy;
             looks[local] = record.look;
-            pairs[local] = pair;
+            pairs[local] = owner_of(pair, i);
             owns[local] = u32(i < view.own);
         }
         if local == 0u {
@@ -141,32 +138,7 @@ fn rasterize_backward(
         if k < count && any && owns[k] != 0u {
             sums = add_up(k, part, dx, f32(corner.y + part / TILE) + 0.5 - places[k].y);
         }
-        workgroupBarrier();
-        if k < count {
-            let to = k * MOMENTS * STRIDE + part;
-            shared_[to] = sums.v;
-            shared_[to + STRIDE] = sums.v * dx;
-            shared_[to + 2u * STRIDE] = sums.vy;
-            shared_[to + 3u * STRIDE] = sums.v * dx * dx;
-            shared_[to + 4u * STRIDE] = sums.vy * dx;
-            shared_[to + 5u * STRIDE] = sums.vyy;
-            shared_[to + 6u * STRIDE] = sums.look.x;
-            shared_[to + 7u * STRIDE] = sums.look.y;
-            shared_[to + 8u * STRIDE] = sums.look.z;
-            shared_[to + 9u * STRIDE] = sums.look.w;
-            shared_[to + 10u * STRIDE] = sums.w;
-            shared_[to + 11u * STRIDE] = sums.along.x;
-            shared_[to + 12u * STRIDE] = sums.along.y;
-        }
-        workgroupBarrier();
-        if local < count * MOMENTS && owns[local / MOMENTS] != 0u {
-            var total = 0.0;
-            for (var p = 0u; p < PARTS; p++) {
-                total += shared_[local * STRIDE + p];
-            }
-            moments[pairs[local / MOMENTS] * MOMENTS + local % MOMENTS] = total;
-        }
-        workgroupBarrier();
+        add_up_parts(moments_of(sums, dx), count, thread);
     }
 
     // Pairs behind the last one that any pixel blended.
@@ -175,10 +147,26 @@ fn rasterize_backward(
         // The loop above went to the end of a group of eight.
         rest = min(range.x + (stop - range.x + PAIRS - 1u) / PAIRS * PAIRS, range.y);
     }
-    let words = (range.y - rest) * MOMENTS;
-    for (var word = local; word < words; word += 256u) {
-        moments[sorted[rest + word / MOMENTS] * MOMENTS + word % MOMENTS] = 0.0;
-    }
+    leave_nothing(rest, range.y, local);
+}
+
+// What a pair hands to its splat, MOMENTS floats: v, v dx, v dy, v dx^2 | v dx dy, v dy^2, w red, w green | w blue, w depth, w,
+// |x| | |y|. The three colours and depth stand for the upstream gradients, |x| and |y| for the mean's gradient summed without
+// cancellation.
+struct Moments {
+    a: vec4<f32>,
+    b: vec4<f32>,
+    c: vec4<f32>,
+    d: f32,
+}
+
+fn moments_of(sums: Sums, dx: f32) -> Moments {
+    return Moments(
+        vec4<f32>(sums.v, sums.v * dx, sums.vy, sums.v * dx * dx),
+        vec4<f32>(sums.vy * dx, sums.vyy, sums.look.xy),
+        vec4<f32>(sums.look.zw, sums.w, sums.along.x),
+        sums.along.y,
+    );
 }
 
 struct Sums {

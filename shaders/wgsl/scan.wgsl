@@ -14,8 +14,6 @@ struct Pass {
 
 const BLOCK: u32 = 1024u; // four entries a thread
 
-var<workgroup> partial: array<u32, 256>;
-
 fn add(a: u32, b: u32) -> u32 {
     let sum = a + b;
     return select(sum, 0xffffffffu, sum < a);
@@ -32,43 +30,26 @@ fn load(at: u32, count: u32) -> u32 {
     return 0u;
 }
 
-// The sum of `value` over the threads before this one; all threads must come here. `partial[255]` is the sum of all.
-fn exclusive(value: u32, local: u32) -> u32 {
-    partial[local] = value;
-    workgroupBarrier();
-    for (var reach = 1u; reach < 256u; reach *= 2u) {
-        var before = 0u;
-        if local >= reach {
-            before = partial[local - reach];
-        }
-        workgroupBarrier();
-        partial[local] = add(before, partial[local]);
-        workgroupBarrier();
-    }
-    if local == 0u {
-        return 0u;
-    }
-    return partial[local - 1u];
-}
-
 @compute @workgroup_size(256)
 fn scan_blocks(
     @builtin(workgroup_id) group: vec3<u32>,
     @builtin(num_workgroups) groups: vec3<u32>,
-    @builtin(local_invocation_index) local: u32,
+    thread: Thread,
 ) {
+    let local = place_of(thread);
     let count = status[pass_.slot];
     let block = block_of(group, groups);
     let at = block * BLOCK + 4u * local;
     let sum = add(add(load(at, count), load(at + 1u, count)), add(load(at + 2u, count), load(at + 3u, count)));
-    exclusive(sum, local);
+    exclusive(sum, thread);
     if local == 0u && block * BLOCK < count {
-        block_sums[block] = partial[255];
+        block_sums[block] = total(thread);
     }
 }
 
 @compute @workgroup_size(256)
-fn scan_sums(@builtin(local_invocation_index) local: u32) {
+fn scan_sums(thread: Thread) {
+    let local = place_of(thread);
     let count = status[pass_.slot];
     let blocks = count / BLOCK + select(0u, 1u, count % BLOCK != 0u);
     var carry = 0u;
@@ -78,11 +59,11 @@ fn scan_sums(@builtin(local_invocation_index) local: u32) {
         if at < blocks {
             value = block_sums[at];
         }
-        let before = exclusive(value, local);
+        let before = exclusive(value, thread);
         if at < blocks {
             block_sums[at] = add(carry, before);
         }
-        carry = add(carry, partial[255]);
+        carry = add(carry, total(thread));
         workgroupBarrier();
     }
 }
@@ -91,13 +72,14 @@ fn scan_sums(@builtin(local_invocation_index) local: u32) {
 fn scan_apply(
     @builtin(workgroup_id) group: vec3<u32>,
     @builtin(num_workgroups) groups: vec3<u32>,
-    @builtin(local_invocation_index) local: u32,
+    thread: Thread,
 ) {
+    let local = place_of(thread);
     let count = status[pass_.slot];
     let block = block_of(group, groups);
     let at = block * BLOCK + 4u * local;
     var values = array<u32, 4>(load(at, count), load(at + 1u, count), load(at + 2u, count), load(at + 3u, count));
-    let before = exclusive(add(add(values[0], values[1]), add(values[2], values[3])), local);
+    let before = exclusive(add(add(values[0], values[1]), add(values[2], values[3])), thread);
     if block * BLOCK >= count {
         return;
     }

@@ -1,0 +1,35 @@
+// The sum of the 32 parts of each moment of each pair, through workgroup memory, part by part.
+
+const STRIDE: u32 = 33u; // not 32: threads that add up different moments read different memory banks
+
+// All threads must come here: thread 32 k + part with what that part of pair k came to.
+fn add_up_parts(m: Moments, count: u32, thread: Thread) {
+    let local = place_of(thread);
+    let k = local / PARTS;
+    workgroupBarrier();
+    if k < count {
+        let to = k * MOMENTS * STRIDE + local % PARTS;
+        shared_[to] = m.a.x;
+        shared_[to + STRIDE] = m.a.y;
+        shared_[to + 2u * STRIDE] = m.a.z;
+        shared_[to + 3u * STRIDE] = m.a.w;
+        shared_[to + 4u * STRIDE] = m.b.x;
+        shared_[to + 5u * STRIDE] = m.b.y;
+        shared_[to + 6u * STRIDE] = m.b.z;
+        shared_[to + 7u * STRIDE] = m.b.w;
+        shared_[to + 8u * STRIDE] = m.c.x;
+        shared_[to + 9u * STRIDE] = m.c.y;
+        shared_[to + 10u * STRIDE] = m.c.z;
+        shared_[to + 11u * STRIDE] = m.c.w;
+        shared_[to + 12u * STRIDE] = m.d;
+    }
+    workgroupBarrier();
+    if local < count * MOMENTS && owns[local / MOMENTS] != 0u {
+        var total = 0.0;
+        for (var p = 0u; p < PARTS; p++) {
+            total += shared_[local * STRIDE + p];
+        }
+        leave(pairs[local / MOMENTS] * MOMENTS + local % MOMENTS, total);
+    }
+    workgroupBarrier();
+}

@@ -1,0 +1,10 @@
+// Which thread of its workgroup a thread is. This one every adapter knows.
+
+struct Thread {
+    @builtin(local_invocation_index) local: u32,
+}
+
+// 0 to 255, each once.
+fn place_of(thread: Thread) -> u32 {
+    return thread.local;
+}
