@@ -12,7 +12,7 @@ use std::sync::{Arc, OnceLock};
 use reference::mixture::{KINDS, Kind, SIZES, Tally, camera_of, mixture};
 use reference::{Random, Scene, tensors};
 use render::cpu::{Isa, Renderer};
-use render::gpu::{Gpu, GpuRenderer, GpuSplats, UpstreamPlanes};
+use render::gpu::{Gpu, GpuError, GpuOptions, GpuRenderer, GpuSplats, Reduction, UpstreamPlanes};
 use render::{Frame, Gradients, Options, Stages, Upstream};
 use scene::{Camera, Splats};
 
@@ -28,6 +28,18 @@ fn gpu() -> Option<Arc<Gpu>> {
         println!("skipped: no adapter");
     }
     gpu.clone()
+}
+
+/// The device with its fastest stages and, where those are not the portable ones, with these.
+fn gpus() -> Vec<Arc<Gpu>> {
+    static PORTABLE: OnceLock<Option<Arc<Gpu>>> = OnceLock::new();
+    let Some(fast) = gpu() else { return Vec::new() };
+    let open = || {
+        let options = GpuOptions { portable: true, ..GpuOptions::from_env().expect("a sound environment") };
+        fast.has_subgroups().then(|| Gpu::open_with(&options).expect("it opened once"))
+    };
+    let portable = PORTABLE.get_or_init(open).clone();
+    [Some(fast), portable].into_iter().flatten().collect()
 }
 
 fn options(antialiased: bool) -> Options {
@@ -92,12 +104,125 @@ fn on_gpu(
 
 #[test]
 fn images_and_gradients_agree_with_the_float64_oracle() {
-    let Some(gpu) = gpu() else { return };
-    let mut renderer = GpuRenderer::new(gpu.clone()).expect("a renderer");
-    for name in ["tiny.npz", "small.npz", "medium.npz"] {
-        let Some(case) = tensors::case(name) else { return };
-        let drawn = on_gpu(&gpu, &mut renderer, &case.splats, None, &case.camera, &case.options, &case.upstream());
-        case.compare(&format!("{name} {}", gpu.name()), &drawn.frame, &drawn.gradients);
+    for gpu in gpus() {
+        let mut renderer = GpuRenderer::new(gpu.clone()).expect("a renderer");
+        for name in ["tiny.npz", "small.npz", "medium.npz"] {
+            let Some(case) = tensors::case(name) else { return };
+            let drawn = on_gpu(&gpu, &mut renderer, &case.splats, None, &case.camera, &case.options, &case.upstream());
+            case.compare(&format!("{name} {}", gpu.name()), &drawn.frame, &drawn.gradients);
+        }
+    }
+}
+
+/// What faster stages may change: the order in which the pixels of a tile are added up, and nothing before.
+#[test]
+fn every_path_draws_the_same_bits_and_adds_up_the_same_sums() {
+    let gpus = gpus();
+    let [fast, portable] = gpus.as_slice() else {
+        println!("skipped: one path");
+        return;
+    };
+    assert!(fast.name() == format!("{}-subgroups", portable.name()), "{} and {}", fast.name(), portable.name());
+    for kind in [Kind::Common, Kind::Needle, Kind::Close] {
+        // 475 tiles: their numbers have two digits to sort by.
+        let camera = camera_of(400, 300);
+        let mut random = Random(31);
+        let splats = mixture(&mut random, &camera, kind, 1000);
+        let context = mixture(&mut random, &camera, Kind::Common, 200);
+        let options = options(true);
+        let upstream = noise(&camera, &options);
+        let [a, b] = [fast, portable].map(|gpu| {
+            let mut renderer = GpuRenderer::new(gpu.clone()).expect("a renderer");
+            let drawn = on_gpu(gpu, &mut renderer, &splats, Some(&context), &camera, &options, &upstream);
+            (drawn, renderer.read_stages().expect("stages"))
+        });
+        assert!(a.1 == b.1 && a.0.frame == b.0.frame, "{kind:?}: scans and sorts are exact");
+        assert_eq!(a.0.gradients.seen, b.0.gradients.seen);
+        let (error, column) = worst(&a.0.gradients, &b.0.gradients);
+        println!("{kind:?}: {} pairs, gradients off by {error:.1e} ({column})", a.1.pairs.len());
+        // Needles magnify what their sums differ by, as they do among the CPU's instruction sets.
+        assert!(error > 0.0, "{kind:?}: the same bits: did both run the same stages?");
+        assert!(error < if kind == Kind::Needle { NEEDLES } else { 1e-4 }, "{kind:?}: {error} of {column}");
+    }
+}
+
+#[test]
+fn atomics_come_to_the_same_sums() {
+    for gpu in gpus() {
+        let camera = camera_of(250, 187);
+        let splats = mixture(&mut Random(17), &camera, Kind::Opaque, 2000);
+        let there = GpuSplats::upload(&gpu, &splats, 0).expect("splats fit");
+        let mut renderer = GpuRenderer::new(gpu.clone()).expect("a renderer");
+        let options = options(false);
+        let frame = renderer.draw(&there, None, &camera, &options).expect("drawn");
+        let upstream = noise(&camera, &options);
+        let [ordered, atomic] = [Reduction::InOrder, Reduction::ByAtomics].map(|how| {
+            let mut encoder = gpu.encoder();
+            gpu.write(&mut encoder, renderer.upstream(), 0, &upstream.colour);
+            renderer.add_up_pairs(&mut encoder, UpstreamPlanes::default(), how).expect("encoded");
+            gpu.submit(encoder).expect("submitted");
+            renderer.read_sums(how).expect("sums")
+        });
+        assert!(frame.transmittance.iter().any(|&t| t < 0.5) && ordered.len() == 2000);
+        for m in 0..ordered[0].len() {
+            let [a, b] = [&atomic, &ordered].map(|sums| sums.iter().map(|sums| sums[m]).collect::<Vec<f32>>());
+            let error = difference(&a, &b);
+            // Depth has no gradient here, and so no sum.
+            assert!(error < 1e-5 && (m == 9) == b.iter().all(|&v| v == 0.0), "{}, moment {m}: {error}", gpu.name());
+        }
+    }
+}
+
+#[test]
+fn memory_is_counted_and_capped() {
+    let Some(open) = gpu() else { return };
+    let options = GpuOptions { memory_bytes: Some(1 << 20), ..GpuOptions::from_env().expect("a sound environment") };
+    let gpu = Gpu::open_with(&options).expect("a cap is no reason not to open");
+    assert_eq!(gpu.name(), open.name(), "a cap changes no bit");
+    let half = gpu.buffer("half", 1 << 19).expect("there is room");
+    let other = gpu.buffer("other", (1 << 19) - 16).expect("there is room");
+    assert_eq!(gpu.memory_bytes(), [(1 << 20) - 16; 2]);
+    let error = gpu.buffer("more", 20).expect_err("there is no room");
+    assert!(error.is_memory() && error.to_string().contains("more would take 20 bytes"), "{error}");
+    assert_eq!(gpu.buffer("rest", 16).map(|rest| rest.size()), Ok(16));
+    drop((half, other));
+    assert_eq!(gpu.memory_bytes(), [0, 1 << 20]);
+    let camera = camera_of(250, 187);
+    let splats = mixture(&mut Random(9), &camera, Kind::Common, 50);
+    let drawn = GpuRenderer::new(gpu.clone()).and_then(|mut renderer| {
+        renderer.draw(&GpuSplats::upload(&gpu, &splats, 0)?, None, &camera, &self::options(false))
+    });
+    let error = drawn.expect_err("pairs alone take more");
+    println!("{error}");
+    assert!(matches!(error, GpuError::OverCap { most: 1_048_576, .. }), "{error}");
+    assert_eq!(gpu.memory_bytes()[0], 0, "what failed gives back what it had");
+    gpu.buffer("all", 1 << 20).expect("there is room again");
+}
+
+#[test]
+fn a_lost_device_gives_no_result() {
+    if gpu().is_none() {
+        return;
+    }
+    let camera = camera_of(40, 30);
+    let splats = mixture(&mut Random(1), &camera, Kind::Common, 50);
+    for moment in 0..4 {
+        let gpu = Gpu::open().expect("it opened before");
+        let mut renderer = GpuRenderer::new(gpu.clone()).expect("a renderer");
+        let there = GpuSplats::upload(&gpu, &splats, 0).expect("splats fit");
+        renderer.draw(&there, None, &camera, &options(false)).expect("drawn");
+        gpu.device().destroy();
+        let error = match moment {
+            0 => renderer.draw(&there, None, &camera, &options(false)).map(|_| ()),
+            1 => renderer.read_frame().map(|_| ()),
+            2 => there.download().map(|_| ()),
+            _ => GpuRenderer::new(gpu.clone()).and_then(|mut fresh| {
+                let there = GpuSplats::upload(&gpu, &splats, 0)?;
+                fresh.draw(&there, None, &camera, &options(false)).map(|_| ())
+            }),
+        };
+        assert!(matches!(error, Err(GpuError::Lost(_))), "moment {moment}: {error:?}");
+        assert!(matches!(gpu.wait(), Err(GpuError::Lost(_))), "it stays lost");
     }
 }
 
@@ -465,6 +590,19 @@ fn splats_come_back_as_they_went() {
         assert_eq!((there.len(), there.sh_degree()), (777, 3 - degree));
         assert_eq!(there.download().expect("splats"), more);
     }
+}
+
+#[test]
+fn large_buffers_go_and_come_back_by_pieces() {
+    let Some(gpu) = gpu() else { return };
+    // Ten million words, 40 MB, from the second word on.
+    let values: Vec<u32> = (0..10_000_000u32).map(|i| i.wrapping_mul(0x9e37_79b9)).collect();
+    let buffer = gpu.buffer("words", 4 * 10_000_001).expect("there is room");
+    gpu.upload(&buffer, 4, &values).expect("uploaded");
+    assert!(gpu.read::<u32>(&buffer, 1, values.len()).expect("read") == values);
+    assert_eq!(gpu.read::<u32>(&buffer, 0, 2).expect("read"), [0, values[0]]);
+    let [left, peak] = gpu.memory_bytes();
+    assert!(peak >= left && left >= 40_000_000 && gpu.read::<u32>(&buffer, 0, 0).is_ok_and(|none| none.is_empty()));
 }
 
 #[test]

@@ -238,6 +238,9 @@ pub enum TrainError {
     /// The device failed.
     #[error("{0}")]
     Device(String),
+    /// The device has too little memory for the block: on a larger one it may be trained.
+    #[error("{0}")]
+    OutOfMemory(String),
     /// Exposures are the CPU's alone.
     #[error("exposures are not trained on a GPU: use --backend cpu, or leave --exposure")]
     Exposures,

@@ -4,7 +4,7 @@
 
 mod ring;
 
-use render::gpu::Gpu;
+use render::gpu::{Gpu, GpuOptions};
 use ring::*;
 use scene::{Exposures, Splats};
 use train::{Backend, Flow, Recipe, State, TrainError};
@@ -82,6 +82,85 @@ fn the_same_job_gives_the_same_bytes_whoever_asks_whatever_and_whenever() {
     assert!(calm == bits(&asked), "reports change the result");
     let from = State::from_frame(&left.expect("step 47 was reported")).expect("a checkpoint is readable");
     assert!(calm == bits(&run(Some(from), &mut |_| Flow::Continue)), "an interruption shows");
+}
+
+/// A device of its own, for what others must not notice.
+fn another(memory_bytes: Option<u64>) -> std::sync::Arc<Gpu> {
+    let options = GpuOptions { memory_bytes, ..GpuOptions::from_env().expect("a sound environment") };
+    Gpu::open_with(&options).expect("it opened before")
+}
+
+#[test]
+fn a_training_that_does_not_fit_ends_with_why() {
+    if gpu().is_none() {
+        return;
+    }
+    let truth = cloud(6, 150, 0.8);
+    let photos = photos(&truth);
+    let context = cloud(3, 40, 0.5);
+    let run = |gpu: &std::sync::Arc<Gpu>| {
+        let setup = Setup { steps: 30, ..job(&photos, &context, &truth, &Backend::Gpu(gpu.clone())) };
+        setup.try_run(&|_| true, &mut |_| Flow::Continue)
+    };
+    let roomy = another(None);
+    let free = bits(&run(&roomy).expect("there is memory"));
+    let [left, peak] = roomy.memory_bytes();
+    println!("{peak} bytes at most");
+    assert_eq!(left, 0, "all is given back");
+    // A cap is not seen in the result, and where it is too small there is none.
+    assert!(free == bits(&run(&another(Some(peak))).expect("there is as much as it took")));
+    for cap in [0, 1000, peak / 2] {
+        let gpu = another(Some(cap));
+        match run(&gpu) {
+            Err(TrainError::OutOfMemory(line)) => {
+                assert!(
+                    line.contains(&format!("of {cap} that PLAT_GPU_MEMORY allows")) && !line.contains('\n'),
+                    "{line}"
+                );
+            }
+            other => panic!("{cap} bytes: {:?}", other.map(|splats| splats.len())),
+        }
+        assert_eq!(gpu.memory_bytes()[0], 0);
+    }
+}
+
+#[test]
+fn a_training_whose_device_is_lost_ends_with_why() {
+    if gpu().is_none() {
+        return;
+    }
+    let truth = cloud(6, 150, 0.8);
+    let photos = photos(&truth);
+    let context = cloud(3, 40, 0.5);
+    // Between looks at the device, and just before one.
+    for lost_at in [1, 29] {
+        let gpu = another(None);
+        let mut steps = 0;
+        let out = job(&photos, &context, &truth, &Backend::Gpu(gpu.clone())).try_run(&|_| true, &mut |now| {
+            steps = now.step;
+            if now.step == lost_at {
+                gpu.device().destroy();
+            }
+            Flow::Continue
+        });
+        let line = match out {
+            Err(TrainError::Device(line)) => line,
+            other => panic!("lost at {lost_at}: {:?}", other.map(|splats| splats.len())),
+        };
+        println!("lost at {lost_at}, ended after {steps}: {line}");
+        assert!(line.starts_with("the GPU was lost") && !line.contains('\n'), "{line}");
+        // Asking finds it out at once.
+        let gpu = another(None);
+        let out = job(&photos, &context, &truth, &Backend::Gpu(gpu.clone())).try_run(&|_| true, &mut |mut now| {
+            steps = now.step;
+            if now.step == lost_at {
+                gpu.device().destroy();
+                assert_eq!(now.splats(), None, "there is nothing to be told");
+            }
+            Flow::Continue
+        });
+        assert!(steps == lost_at && matches!(out, Err(TrainError::Device(_))), "{steps}");
+    }
 }
 
 #[test]

@@ -66,7 +66,7 @@ impl Block<'_> {
             TrainError::NoViews | TrainError::Exposures | TrainError::Empty(_) => {
                 ExecuteError { message: format!("block {}: {error}", task.block), is_input: true }
             }
-            TrainError::Device(_) => failed(format!("block {}: {error}", task.block)),
+            TrainError::Device(_) | TrainError::OutOfMemory(_) => failed(format!("block {}: {error}", task.block)),
             TrainError::Source(_) => failed(error),
         };
         let counts = |p: Vec3| self.owns(task, p.as_dvec3());

@@ -69,8 +69,8 @@ impl GpuRenderer {
         if status.overflow == 0 {
             return Ok(false);
         }
-        self.pair_capacity = room_for(status.most_pairs as usize);
-        self.gpu.queue().write_buffer(&self.status, 0, bytemuck::bytes_of(&Status::default()));
+        self.pair_capacity = self.room_for(status.most_pairs as usize);
+        self.gpu.upload(&self.status, 0, &[Status::default()])?;
         Ok(true)
     }
 
@@ -209,45 +209,41 @@ impl GpuRenderer {
         }
     }
 
+    /// With room to spare where a binding has it, so that a job does not stop for a few pairs more.
+    fn room_for(&self, pairs: usize) -> usize {
+        let bound = (self.gpu.room() / (4 * u64::from(MOMENTS))) as usize;
+        (pairs + pairs / 2).next_multiple_of(1 << 16).min(bound).max(pairs)
+    }
+
     /// Makes room for a view. Buffers only grow.
     pub(super) fn fit(&mut self, view: &View, splats: &GpuSplats) -> Result<(), GpuError> {
         let gpu = &*self.gpu;
-        let (total, pairs) = (view.total as usize, self.pair_capacity);
-        let tiles = u64::from(view.tiles[0]) * u64::from(view.tiles[1]);
-        let area = u64::from(view.pixels[0]) * u64::from(view.pixels[1]);
-        let of = &mut self.of_splats;
-        of.records.fit(gpu, RECORD_BYTES * u64::from(view.total.max(1)))?;
-        of.sums.fit(gpu, 4 * (total + 1) as u64)?;
-        for buffer in [&mut of.seen, &mut of.tiles, &mut of.first, &mut of.visible] {
-            buffer.fit(gpu, 4 * total as u64)?;
-        }
-        of.sides.fit(gpu, total)?;
-        let of = &mut self.of_pairs;
-        of.splat.fit(gpu, 4 * pairs as u64)?;
-        of.sides.fit(gpu, pairs)?;
-        of.moments.fit(gpu, 4 * u64::from(MOMENTS) * pairs as u64)?;
-        self.sorter.fit(gpu, total.max(pairs), total + 1)?;
-        self.tile_ranges.fit(gpu, 8 * tiles)?;
-        self.last.fit(gpu, 4 * area)?;
-        self.frame.fit(gpu, 4 * area * if view.extras != 0 { 6 } else { 4 })?;
-        self.upstream.fit(gpu, 4 * area * 5)?;
         let (stride, sh_degree) = (splats.columns().stride(), splats.sh_degree());
-        self.sums.fit(gpu, 4 * u64::from(MOMENTS) * (splats.len() as u64).next_multiple_of(REDUCE_SPLATS.into()))?;
-        self.statistics.fit(gpu, 12 * stride as u64)?;
+        let sizes = Sizes::of(view, stride);
+        let of = &mut self.of_splats;
+        of.records.fit(gpu, sizes.records)?;
+        of.sums.fit(gpu, sizes.scanned)?;
+        for buffer in [&mut of.seen, &mut of.tiles, &mut of.first, &mut of.visible] {
+            buffer.fit(gpu, sizes.splat_words)?;
+        }
+        of.sides.fit(gpu, sizes.splat_words)?;
+        let of = &mut self.of_pairs;
+        of.splat.fit(gpu, sizes.pair_words)?;
+        of.sides.fit(gpu, sizes.pair_words)?;
+        of.moments.fit(gpu, sizes.moments)?;
+        self.sorter.fit(gpu, sizes.histogram, sizes.block_sums)?;
+        self.tile_ranges.fit(gpu, sizes.ranges)?;
+        self.last.fit(gpu, sizes.last)?;
+        self.frame.fit(gpu, sizes.frame)?;
+        self.upstream.fit(gpu, sizes.upstream)?;
+        self.sums.fit(gpu, sizes.sums)?;
+        self.statistics.fit(gpu, sizes.statistics)?;
         if self.gradients.stride() != stride || self.gradients.sh_degree() != sh_degree {
             self.gradients = Columns::new(gpu, "gradients", 0, 0)?;
             self.gradients = Columns::new(gpu, "gradients", sh_degree, stride)?;
         }
         Ok(())
     }
-}
-
-/// Bytes of a record in `view.wgsl`.
-const RECORD_BYTES: u64 = 48;
-
-/// With room to spare, so that a job does not stop for a few pairs more.
-fn room_for(pairs: usize) -> usize {
-    (pairs + pairs / 2).next_multiple_of(1 << 16)
 }
 
 pub(super) fn set_of(splats: &GpuSplats, first: usize, sh_degree: u8) -> Set {

@@ -12,22 +12,32 @@
 //! No float is ever added atomically: the same adapter gives the same bits.
 
 mod access;
+mod backward;
 mod device;
 mod error;
+mod kernel;
+mod memory;
+mod options;
+mod sizes;
 mod sort;
 mod splats;
 
 use std::sync::Arc;
 
 use scene::Camera;
-use shaders::{GROUP, MOMENTS, REDUCE_SPLATS, SCAN_BLOCK, Set, Status, TILE, View, args, slot};
+use shaders::{GROUP, MOMENTS, SCAN_BLOCK, Set, Status, TILE, View, args, slot};
 
-pub use device::{Gpu, Growing, Kernel};
+pub use backward::Reduction;
+pub use device::Gpu;
 pub use error::GpuError;
+pub use kernel::Kernel;
+pub use memory::{Buffer, Growing};
+pub use options::GpuOptions;
 pub use splats::{Columns, GpuSplats};
 
 use crate::{Frame, Gradients, Options};
 use access::set_of;
+use sizes::Sizes;
 use sort::{Groups, Sides, Sorted, Sorter};
 
 /// Pairs for which there is room at first.
@@ -49,8 +59,8 @@ pub struct GpuRenderer {
     kernels: Kernels,
     sorter: Sorter,
     view: wgpu::Buffer,
-    status: wgpu::Buffer,
-    args: wgpu::Buffer,
+    status: Buffer,
+    args: Buffer,
     of_splats: OfSplats,
     of_pairs: OfPairs,
     pair_capacity: usize,
@@ -191,7 +201,7 @@ impl GpuRenderer {
         encoder.clear_buffer(&self.tile_ranges, 0, Some(8 * tiles as u64));
 
         let pass = &mut encoder.begin_compute_pass(&wgpu::ComputePassDescriptor::default());
-        let (kernels, status, args) = (&self.kernels, &self.status, &self.args);
+        let (kernels, status, args) = (&self.kernels, &*self.status, &*self.args);
         let OfSplats { records, seen, sums, tiles: tile_counts, first, visible, sides } = &self.of_splats;
         let plan: [(u32, &wgpu::Buffer); 4] = [(0, &self.view), (1, status), (2, sums), (3, args)];
         kernels.plan_start.run(gpu, pass, &plan[..3], 1);
@@ -260,82 +270,18 @@ impl GpuRenderer {
         self.drawn = Some(Drawn { view, set, side });
         Ok(())
     }
-
-    /// Gradients of the trainable splats of the last [`forward`](Self::forward), whose splats must be passed again
-    /// unchanged, from what lies in [`upstream`](Self::upstream). The pose has none here.
-    ///
-    /// # Errors
-    /// Without a forward pass before, or with another number of splats; and as `forward`.
-    pub fn backward(
-        &mut self,
-        encoder: &mut wgpu::CommandEncoder,
-        splats: &GpuSplats,
-        planes: UpstreamPlanes,
-    ) -> Result<(), GpuError> {
-        let Some(Drawn { view, set, side }) = self.drawn.filter(|drawn| drawn.set.count as usize == splats.len())
-        else {
-            return Err(GpuError::Failed("backward needs the splats that forward drew".into()));
-        };
-        if planes.depth && view.extras == 0 {
-            return Err(GpuError::Failed("a gradient of depth needs a forward pass with extras".into()));
-        }
-        let gpu = &*self.gpu;
-        let (kernels, status, args, pairs) = (&self.kernels, &self.status, &self.args, &self.of_pairs);
-        let OfSplats { records, tiles: tile_counts, first, visible, .. } = &self.of_splats;
-        let pass = &mut encoder.begin_compute_pass(&wgpu::ComputePassDescriptor::default());
-        let planes = gpu.uniform(&shaders::Planes {
-            transmittance: planes.transmittance.into(),
-            depth: planes.depth.into(),
-            padding: [0; 2],
-        });
-        let bindings = [
-            (0, &self.view),
-            (1, &*self.tile_ranges),
-            (2, &*pairs.sides.values[side]),
-            (3, &*pairs.splat),
-            (4, records),
-            (5, &*self.frame),
-            (6, &*self.last),
-            (7, &*self.upstream),
-            (8, &planes),
-            (9, &*pairs.moments),
-        ];
-        kernels.rasterize_backward.run(gpu, pass, &bindings, view.tiles[0] * view.tiles[1]);
-        let bindings: [(u32, &wgpu::Buffer); 6] =
-            [(0, status), (1, visible), (2, first), (3, tile_counts), (4, &pairs.moments), (5, &self.sums)];
-        kernels.reduce.run_indirect(gpu, pass, &bindings, args, args::SEEN_REDUCE);
-        let set = gpu.uniform(&set);
-        let [a, b, c, d] = splats.columns().banks();
-        let [out_a, out_b, out_c, out_d] = self.gradients.banks();
-        let bindings = [
-            (0, a),
-            (1, b),
-            (2, c),
-            (3, d),
-            (4, &self.view),
-            (5, &set),
-            (6, status),
-            (7, visible),
-            (8, &*self.sums),
-            (9, out_a),
-            (10, out_b),
-            (11, out_c),
-            (12, out_d),
-            (13, &*self.statistics),
-        ];
-        kernels.project_backward.run_indirect(gpu, pass, &bindings, args, args::SEEN);
-        Ok(())
-    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    /// A device; `None`, and a line that says so, where there is none and `PLAT_GPU` does not require one.
-    pub(super) fn gpu() -> Option<Arc<Gpu>> {
+    /// A device, with the portable stages where asked; `None`, and a line that says so, where there is none and `PLAT_GPU` does not
+    /// require one.
+    pub(super) fn gpu(portable: bool) -> Option<Arc<Gpu>> {
         let required = std::env::var("PLAT_GPU").is_ok_and(|value| value == "required");
-        match Gpu::open() {
+        let options = GpuOptions { portable, ..GpuOptions::from_env().expect("a sound environment") };
+        match Gpu::open_with(&options) {
             Ok(gpu) => Some(gpu),
             Err(e) if required => panic!("PLAT_GPU=required, but {e}"),
             Err(_) => {

@@ -3,10 +3,12 @@
 //! How many entries there are only the device knows: a word of its status says so to the threads, an entry of `args` to
 //! the dispatches.
 
-use shaders::{Pass, RADIX_BLOCK, SCAN_BLOCK, args, slot};
+use shaders::{Pass, args, slot};
 
-use super::device::{Gpu, Growing, Kernel};
+use super::device::Gpu;
 use super::error::GpuError;
+use super::kernel::Kernel;
+use super::memory::Growing;
 
 /// Bits of a digit.
 const DIGIT_BITS: u32 = 8;
@@ -36,8 +38,8 @@ impl Sides {
         Ok(Self { keys: [make("keys")?, make("keys")?], values: [make("values")?, make("values")?] })
     }
 
-    pub(super) fn fit(&mut self, gpu: &Gpu, entries: usize) -> Result<(), GpuError> {
-        self.keys.iter_mut().chain(&mut self.values).try_for_each(|buffer| buffer.fit(gpu, 4 * entries as u64))
+    pub(super) fn fit(&mut self, gpu: &Gpu, bytes: u64) -> Result<(), GpuError> {
+        self.keys.iter_mut().chain(&mut self.values).try_for_each(|buffer| buffer.fit(gpu, bytes))
     }
 }
 
@@ -63,11 +65,10 @@ impl Sorter {
         })
     }
 
-    /// Room to sort so many entries, and to add up so many sums.
-    pub(super) fn fit(&mut self, gpu: &Gpu, entries: usize, sums: usize) -> Result<(), GpuError> {
-        let digits = shaders::DIGITS as usize * entries.div_ceil(RADIX_BLOCK as usize).max(1);
-        self.histogram.fit(gpu, 4 * digits as u64)?;
-        self.block_sums.fit(gpu, 4 * digits.max(sums).div_ceil(SCAN_BLOCK as usize) as u64)
+    /// Room for a histogram and for sums of blocks, bytes.
+    pub(super) fn fit(&mut self, gpu: &Gpu, histogram: u64, block_sums: u64) -> Result<(), GpuError> {
+        self.histogram.fit(gpu, histogram)?;
+        self.block_sums.fit(gpu, block_sums)
     }
 
     /// Exclusive sums of `data` in place; the status word `slot` says how many.
@@ -146,6 +147,8 @@ impl Groups<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::gpu::sizes;
+    use shaders::{RADIX_BLOCK, SCAN_BLOCK};
 
     /// A number for each place, the same on every machine (SplitMix64).
     fn numbers(count: usize, seed: u64) -> Vec<u32> {
@@ -159,13 +162,13 @@ mod tests {
     struct Bench {
         gpu: std::sync::Arc<Gpu>,
         sorter: Sorter,
-        status: wgpu::Buffer,
-        args: wgpu::Buffer,
+        status: crate::gpu::Buffer,
+        args: crate::gpu::Buffer,
     }
 
     impl Bench {
-        fn open() -> Option<Self> {
-            let gpu = crate::gpu::tests::gpu()?;
+        fn open(portable: bool) -> Option<Self> {
+            let gpu = crate::gpu::tests::gpu(portable)?;
             let sorter = Sorter::new(&gpu).expect("kernels");
             let status = gpu.buffer("status", size_of::<shaders::Status>() as u64).expect("a buffer");
             let args = gpu.buffer("args", 12 * args::COUNT).expect("a buffer");
@@ -185,13 +188,17 @@ mod tests {
             self.gpu.write(encoder, &self.status, 0, &[status]);
             self.gpu.write(encoder, &self.args, 12 * args::VISIBLE_SORT, &[blocks, 1, 1]);
             self.gpu.write(encoder, &self.args, 12 * args::VISIBLE_DIGITS, &[digits.div_ceil(SCAN_BLOCK), 1, 1]);
-            self.sorter.fit(&self.gpu, count.max(1), count).expect("room");
+            let entries = u64::from(digits).max(count as u64);
+            self.sorter.fit(&self.gpu, 4 * sizes::digits(count as u64), sizes::block_sums(entries)).expect("room");
         }
     }
 
     #[test]
     fn sums_are_exclusive_and_stay_at_the_largest_number() {
-        let Some(mut bench) = Bench::open() else { return };
+        [false, true].into_iter().filter_map(Bench::open).for_each(check_sums);
+    }
+
+    fn check_sums(mut bench: Bench) {
         for (count, huge) in [(1, false), (255, false), (1024, false), (1025, false), (300_000, false), (5000, true)] {
             let mut values: Vec<u32> = numbers(count, 3).iter().map(|v| v % 1000).collect();
             if huge {
@@ -214,19 +221,22 @@ mod tests {
 
     #[test]
     fn sorts_are_stable() {
-        let Some(mut bench) = Bench::open() else { return };
+        [false, true].into_iter().filter_map(Bench::open).for_each(check_sorts);
+    }
+
+    fn check_sorts(mut bench: Bench) {
         let mut sides = Sides::new(&bench.gpu).expect("buffers");
         for count in [1, 255, 256, 257, 4095, 4096, 4097, 100_000] {
             for (bits, mask) in [(32, u32::MAX), (32, 0x3f00_0007), (10, 0x3ff), (8, 0x1)] {
                 let keys: Vec<u32> = numbers(count, 9).iter().map(|key| key & mask).collect();
                 let values: Vec<u32> = (0..count as u32).collect();
-                sides.fit(&bench.gpu, count).expect("room");
+                sides.fit(&bench.gpu, 4 * count as u64).expect("room");
                 let mut encoder = bench.gpu.encoder();
                 bench.plan(&mut encoder, count);
                 bench.gpu.write(&mut encoder, &sides.keys[0], 0, &keys);
                 bench.gpu.write(&mut encoder, &sides.values[0], 0, &values);
                 let mut pass = encoder.begin_compute_pass(&wgpu::ComputePassDescriptor::default());
-                let known = (&bench.status, &bench.args);
+                let known = (&*bench.status, &*bench.args);
                 let side = bench.sorter.sort(&bench.gpu, &mut pass, &sides, None, bits, known, Sorted::Splats);
                 drop(pass);
                 bench.gpu.submit(encoder).expect("submitted");

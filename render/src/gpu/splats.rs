@@ -7,6 +7,7 @@ use scene::{Splats, column};
 
 use super::device::Gpu;
 use super::error::GpuError;
+use super::memory::Buffer;
 
 /// First column of each bank, and the end: parameters with the constant colour, then five coefficients each.
 const BANKS: [usize; 5] = [0, column::SH + 3, column::SH + 18, column::SH + 33, column::SH + 48];
@@ -14,7 +15,7 @@ const BANKS: [usize; 5] = [0, column::SH + 3, column::SH + 18, column::SH + 33, 
 /// Columns of floats on the device, in the order of [`scene::column`]. Column `k` of a bank begins at entry `k · stride`.
 #[derive(Debug)]
 pub struct Columns {
-    banks: [wgpu::Buffer; 4],
+    banks: [Buffer; 4],
     stride: usize,
     sh_degree: u8,
 }
@@ -25,20 +26,18 @@ impl Columns {
     /// # Errors
     /// Where that is more than the adapter binds, or memory is short.
     pub fn new(gpu: &Gpu, label: &str, sh_degree: u8, capacity: usize) -> Result<Self, GpuError> {
-        let stride = capacity.max(1).next_multiple_of(64);
-        let size = |bank: usize| columns_of(sh_degree, bank);
-        let widest = (0..4).map(size).max().unwrap_or(1);
-        let fit = (gpu.room() / (4 * widest as u64)) as usize / 64 * 64;
-        if stride > fit {
+        let fit = most_splats(gpu.room(), sh_degree);
+        if capacity > fit {
             return Err(GpuError::TooManySplats { count: capacity, fit });
         }
-        let bank = |bank: usize| gpu.buffer(label, 4 * (size(bank) * stride) as u64);
+        let stride = stride_of(capacity);
+        let bank = |bank: usize| gpu.buffer(label, bytes_of_bank(sh_degree, bank, stride));
         Ok(Self { banks: [bank(0)?, bank(1)?, bank(2)?, bank(3)?], stride, sh_degree })
     }
 
     /// The four banks: columns 0..14, 14..29, 29..44, 44..59. Those above the SH degree are small and hold nothing.
     pub fn banks(&self) -> [&wgpu::Buffer; 4] {
-        self.banks.each_ref()
+        self.banks.each_ref().map(|bank| &**bank)
     }
 
     /// Entries from a column of a bank to the next.
@@ -52,11 +51,14 @@ impl Columns {
     }
 
     /// Overwrites the first rows. Takes effect before whatever is submitted next.
-    pub fn write(&self, gpu: &Gpu, columns: &[Vec<f32>]) {
-        for (k, column) in columns.iter().enumerate() {
+    ///
+    /// # Errors
+    /// What went wrong until now.
+    pub fn write(&self, gpu: &Gpu, columns: &[Vec<f32>]) -> Result<(), GpuError> {
+        columns.iter().enumerate().try_for_each(|(k, column)| {
             let (bank, offset) = self.place(k);
-            gpu.queue().write_buffer(bank, offset, bytemuck::cast_slice(column));
-        }
+            gpu.upload(bank, offset, column)
+        })
     }
 
     /// The first `count` rows, once everything submitted is done.
@@ -82,6 +84,22 @@ impl Columns {
     }
 }
 
+/// Entries from a column to the next with room for so many splats.
+pub(super) fn stride_of(capacity: usize) -> usize {
+    capacity.max(1).next_multiple_of(64)
+}
+
+/// Bytes of a bank.
+pub(super) fn bytes_of_bank(sh_degree: u8, bank: usize, stride: usize) -> u64 {
+    4 * columns_of(sh_degree, bank) as u64 * stride as u64
+}
+
+/// How many splats fit where a binding holds so many bytes.
+pub(super) fn most_splats(room: u64, sh_degree: u8) -> usize {
+    let widest = (0..4).map(|bank| columns_of(sh_degree, bank)).max().unwrap_or(1);
+    (room / (4 * widest as u64)) as usize / 64 * 64
+}
+
 /// How many columns of an SH degree lie in a bank.
 fn columns_of(sh_degree: u8, bank: usize) -> usize {
     let columns = column::SH + 3 * sh_coefficients(sh_degree);
@@ -103,8 +121,7 @@ impl GpuSplats {
     /// See [`Columns::new`].
     pub fn upload(gpu: &Arc<Gpu>, splats: &Splats, capacity: usize) -> Result<Self, GpuError> {
         let columns = Columns::new(gpu, "splats", splats.sh_degree(), capacity.max(splats.len()))?;
-        columns.write(gpu, splats.columns());
-        gpu.check()?;
+        columns.write(gpu, splats.columns())?;
         Ok(Self { gpu: Arc::clone(gpu), columns, count: splats.len() })
     }
 
@@ -120,9 +137,9 @@ impl GpuSplats {
             self.columns = Columns::new(&self.gpu, "splats", splats.sh_degree(), splats.len() + splats.len() / 8)
                 .or_else(|_| Columns::new(&self.gpu, "splats", splats.sh_degree(), splats.len()))?;
         }
-        self.columns.write(&self.gpu, splats.columns());
+        self.columns.write(&self.gpu, splats.columns())?;
         self.count = splats.len();
-        self.gpu.check()
+        Ok(())
     }
 
     /// Copies them back, once everything submitted is done.

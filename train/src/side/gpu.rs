@@ -13,7 +13,7 @@ use std::iter;
 use std::sync::Arc;
 
 use render::cpu::Isa;
-use render::gpu::{Columns, Gpu, GpuError, GpuRenderer, GpuSplats, Growing, Kernel, UpstreamPlanes};
+use render::gpu::{Buffer, Columns, Gpu, GpuError, GpuRenderer, GpuSplats, Growing, Kernel, UpstreamPlanes};
 use scene::{Splats, column};
 use shaders::train::{ADAM, Books, EVIDENCE, LOSS, Rates, Window};
 use shaders::{TILE, args};
@@ -45,7 +45,7 @@ pub(crate) struct GpuSide {
     /// Of each splat error and weight, with the splats' stride; and views.
     evidence: Growing,
     views: Growing,
-    books: wgpu::Buffer,
+    books: Buffer,
     /// Photo and mask, a byte a value.
     photo: Growing,
     /// SSIM's derivatives.
@@ -114,9 +114,7 @@ impl GpuSide {
                 *moments = Columns::new(gpu, "moments", 0, 0)?;
                 *moments = Columns::new(gpu, "moments", sh_degree, stride)?;
             }
-            moments.write(gpu, columns);
-            // What waits to be copied takes the host's memory once more.
-            gpu.submit(gpu.encoder())?;
+            moments.write(gpu, columns)?;
         }
         self.evidence.fit(gpu, 8 * stride as u64)?;
         self.views.fit(gpu, 4 * stride as u64)?;
@@ -125,9 +123,10 @@ impl GpuSide {
         // There is evidence of all splats, or of none since the last refinement.
         let padded =
             |values: &[f32]| -> Vec<f32> { values.iter().copied().chain(iter::repeat(0.0)).take(stride).collect() };
-        gpu.queue().write_buffer(&self.evidence, 0, bytemuck::cast_slice(&[padded(error), padded(weight)].concat()));
+        gpu.upload(&self.evidence, 0, &padded(error))?;
+        gpu.upload(&self.evidence, 4 * stride as u64, &padded(weight))?;
         let views: Vec<u32> = views.iter().copied().chain(iter::repeat(0)).take(n).collect();
-        gpu.queue().write_buffer(&self.views, 0, bytemuck::cast_slice(&views));
+        gpu.upload(&self.views, 0, &views)?;
         let Tally { sum, count } = now.need.tally;
         let books = Books {
             adam_steps: adam_steps as u32,
@@ -138,8 +137,7 @@ impl GpuSide {
             ..Books::default()
         };
         self.done = 0;
-        gpu.queue().write_buffer(&self.books, 0, bytemuck::bytes_of(&books));
-        gpu.check()
+        gpu.upload(&self.books, 0, &[books])
     }
 
     /// Hands a step to the device.
@@ -181,16 +179,11 @@ impl GpuSide {
         }
         self.renderer.backward(&mut encoder, &self.splats, UpstreamPlanes::default())?;
         self.move_splats(&mut encoder, options.sh_degree, rates, area);
-        let index = gpu.queue().submit([encoder.finish()]);
-        gpu.check()?;
-        self.in_flight.push_back(index);
-        if self.in_flight.len() > IN_FLIGHT {
-            let submission_index = self.in_flight.pop_front();
-            let polled = gpu.device().poll(wgpu::PollType::Wait { submission_index, timeout: None });
-            gpu.check()?;
-            polled.map_err(|error| GpuError::Failed(error.to_string()))?;
+        self.in_flight.push_back(gpu.submit(encoder)?);
+        match self.in_flight.len() > IN_FLIGHT {
+            true => self.in_flight.pop_front().map_or(Ok(()), |index| gpu.wait_for(index)),
+            false => Ok(()),
         }
-        Ok(())
     }
 
     /// Evidence, and a step of Adam, from the gradients.
@@ -301,7 +294,7 @@ impl Side for GpuSide {
         if part == Part::Tally {
             let Tally { sum, count } = now.need.tally;
             let offset = std::mem::offset_of!(Books, count) as u64;
-            self.gpu.queue().write_buffer(&self.books, offset, bytemuck::bytes_of(&[count, (sum as f32).to_bits()]));
+            self.gpu.upload(&self.books, offset, &[count, (sum as f32).to_bits()])?;
         } else {
             self.splats.replace(&now.splats)?;
             self.take_over(now)?;
@@ -312,7 +305,10 @@ impl Side for GpuSide {
 
 impl From<GpuError> for TrainError {
     fn from(error: GpuError) -> Self {
-        Self::Device(error.to_string())
+        match error.is_memory() {
+            true => Self::OutOfMemory(error.to_string()),
+            false => Self::Device(error.to_string()),
+        }
     }
 }
 
