@@ -1,0 +1,140 @@
+//! What a fixed order of the backward's sums costs against float atomics, and what subgroups save:
+//!
+//! ```sh
+//! cargo run --release -p render --example reduce_cost -- [ROUNDS] [SPLATS]...
+//! ```
+//! Each round times, for every path that the adapter has, both ways from the pixels' gradients to the splats' sums
+//! (`rasterize_backward` and `reduce` in order, `rasterize_backward` alone by atomics) and the whole of a step's drawing and going
+//! back, one after the other, so that whatever else the machine does falls on all. Medians over the rounds are printed.
+
+use std::error::Error;
+use std::sync::Arc;
+use std::time::Instant;
+
+use glam::{DQuat, DVec3, Vec3};
+use render::Options;
+use render::gpu::{Gpu, GpuError, GpuOptions, GpuRenderer, GpuSplats, Reduction, UpstreamPlanes};
+use scene::{Camera, Pinhole, Rigid, Splat, Splats};
+
+const WIDTH: u32 = 480;
+const HEIGHT: u32 = 270;
+
+fn main() -> Result<(), Box<dyn Error>> {
+    let numbers = std::env::args().skip(1).map(|word| word.parse::<usize>().map_err(|e| format!("{word}: {e}")));
+    let numbers = numbers.collect::<Result<Vec<usize>, String>>()?;
+    let rounds = numbers.first().copied().unwrap_or(15).max(1);
+    let counts = if numbers.len() > 1 { &numbers[1..] } else { &[12_000, 48_000] };
+    let options = GpuOptions::from_env()?;
+    let mut gpus = vec![Gpu::open_with(&options)?];
+    if gpus[0].has_subgroups() {
+        gpus.push(Gpu::open_with(&GpuOptions { portable: true, ..options })?);
+    }
+    for &count in counts {
+        let splats = random_splats(count);
+        let mut sides = gpus.iter().map(|gpu| Timed::new(gpu, &splats)).collect::<Result<Vec<_>, _>>()?;
+        // The first round warms up.
+        for round in 0..=rounds {
+            for side in &mut sides {
+                side.round(round > 0)?;
+            }
+        }
+        for side in &mut sides {
+            let [step, ordered, atomic] = side.millis.each_mut().map(|values| median(values));
+            println!(
+                "{count} splats, {WIDTH}×{HEIGHT}, {}: forward and backward {step:.2} ms, sums in order {ordered:.2} ms, by atomics \
+                 {atomic:.2} ms: order costs {:.3} of atomics ({} rounds)",
+                side.gpu.name(),
+                ordered / atomic,
+                rounds
+            );
+        }
+        if let [fast, portable] = sides.as_mut_slice() {
+            let [[a_step, a, _], [b_step, b, _]] =
+                [fast, portable].map(|side| side.millis.each_mut().map(|values| median(values)));
+            println!(
+                "{count} splats: subgroups take {:.3} of the portable sums, {:.3} of the whole",
+                a / b,
+                a_step / b_step
+            );
+        }
+    }
+    Ok(())
+}
+
+/// A renderer on one path and what it took.
+struct Timed {
+    gpu: Arc<Gpu>,
+    renderer: GpuRenderer,
+    splats: GpuSplats,
+    /// Of the whole, of sums in order and by atomics.
+    millis: [Vec<f64>; 3],
+}
+
+impl Timed {
+    fn new(gpu: &Arc<Gpu>, splats: &Splats) -> Result<Self, GpuError> {
+        let splats = GpuSplats::upload(gpu, splats, 0)?;
+        let mut renderer = GpuRenderer::new(Arc::clone(gpu))?;
+        renderer.draw(&splats, None, &camera(), &Options::default())?;
+        gpu.upload(renderer.upstream(), 0, &vec![1e-3f32; (3 * WIDTH * HEIGHT) as usize])?;
+        Ok(Self { gpu: Arc::clone(gpu), renderer, splats, millis: Default::default() })
+    }
+
+    fn round(&mut self, counts: bool) -> Result<(), GpuError> {
+        let Self { gpu, renderer, splats, millis } = self;
+        let planes = UpstreamPlanes::default();
+        let mut time = |which: usize, encode: &mut dyn FnMut(&mut wgpu::CommandEncoder) -> Result<(), GpuError>| {
+            let mut encoder = gpu.encoder();
+            encode(&mut encoder)?;
+            gpu.wait()?;
+            let start = Instant::now();
+            gpu.submit(encoder)?;
+            gpu.wait()?;
+            if counts {
+                millis[which].push(1e3 * start.elapsed().as_secs_f64());
+            }
+            Ok::<(), GpuError>(())
+        };
+        time(0, &mut |encoder| {
+            renderer.forward(encoder, splats, None, &camera(), &Options::default())?;
+            renderer.backward(encoder, splats, planes)
+        })?;
+        time(1, &mut |encoder| renderer.add_up_pairs(encoder, planes, Reduction::InOrder))?;
+        time(2, &mut |encoder| renderer.add_up_pairs(encoder, planes, Reduction::ByAtomics))
+    }
+}
+
+/// A camera that sees the box.
+fn camera() -> Camera {
+    let pinhole = Pinhole { width: WIDTH, height: HEIGHT, fx: 480.0, fy: 480.0, cx: 240.0, cy: 135.0 };
+    let camera_from_world = Rigid { rotation: DQuat::IDENTITY, translation: DVec3::new(0.0, 0.0, 8.0) };
+    Camera { pinhole, camera_from_world }
+}
+
+/// Random splats in a box before the camera, of sizes that cover it a few times, as those of `plat bench kernels`.
+fn random_splats(count: usize) -> Splats {
+    let mut splats = Splats::new(3);
+    let mut state = 1u64;
+    // SplitMix64.
+    let mut number = || {
+        state = state.wrapping_add(0x9e37_79b9_7f4a_7c15);
+        let z = (state ^ (state >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+        let z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+        ((z ^ (z >> 31)) >> 40) as f32 / (1u64 << 24) as f32
+    };
+    let edge = 6.0 / (count as f32).cbrt();
+    for _ in 0..count {
+        let place = 6.0 * (Vec3::new(number(), number(), number()) - 0.5);
+        let size = (0.3 * edge * (0.5 + number())).ln();
+        let colour = Vec3::new(number(), number(), number());
+        let mut splat = Splat::round(place, size, colour, 0.1 + 0.8 * number());
+        splat.log_scale += Vec3::new(number(), number(), number()) - 0.5;
+        splat.quat = [number() - 0.5, number() - 0.5, number() - 0.5, number() - 0.5];
+        splats.push(&splat);
+    }
+    splats
+}
+
+fn median(values: &mut [f64]) -> f64 {
+    values.sort_by(f64::total_cmp);
+    values[values.len() / 2]
+}
