@@ -75,6 +75,29 @@ fn a_job_on_a_gpu_is_as_good_and_survives_kills() {
 }
 
 #[test]
+fn too_little_memory_ends_the_job_and_names_the_block() {
+    if gpu().is_none() {
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    common::city(at, 16, 64, 48);
+    let capped = |cap: &str| {
+        let mut job = job(at, "gpu", &["--out", "o", "--quiet"]);
+        job.env("PLAT_GPU_MEMORY", cap);
+        job
+    };
+    let line = common::stopped(&mut capped("2MiB"), 1, "of 2097152 that PLAT_GPU_MEMORY allows");
+    println!("{line}");
+    assert!(line.contains("block 0/0/0"), "{line}");
+    assert!(!at.join("o/merged.ply").exists());
+    common::stopped(&mut capped("much"), 2, "PLAT_GPU_MEMORY is \"much\"");
+    // What there was is not taken for a result: with memory, the same command does the work.
+    let done = common::json_of(&mut capped("1GiB"));
+    assert!(done["splats"].as_u64() > Some(0));
+}
+
+#[test]
 fn what_cannot_be_is_refused_in_one_line() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();

@@ -38,13 +38,14 @@ pub(crate) fn refused(folder: &Path, words: &[&str], wanted: &str) {
     stopped(&mut command(folder, words), 2, wanted);
 }
 
-/// Runs a command that must end with this exit code and one line that says this.
-pub(crate) fn stopped(command: &mut Command, code: i32, wanted: &str) {
+/// Runs a command that must end with this exit code and one line that says this; that line.
+pub(crate) fn stopped(command: &mut Command, code: i32, wanted: &str) -> String {
     let output = command.output().expect("plat runs");
     let line = String::from_utf8(output.stderr).unwrap();
     assert_eq!(output.status.code(), Some(code), "{command:?}: {line}");
     assert!(line.contains(wanted) && line.trim_end().lines().count() == 1, "{command:?}: {line}");
     assert!(output.stdout.is_empty(), "{command:?}");
+    line
 }
 
 /// A small city where nothing moves, mostly from the air, so that few photos show all of it.
