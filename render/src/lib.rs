@@ -88,6 +88,19 @@ pub struct Stages {
     pub pairs: Vec<u32>,
 }
 
+/// Sums that a pair of splat and tile hands to its splat.
+pub const MOMENTS: usize = 13;
+
+/// What the stages between `rasterize` and `project_backward` came to, of trainable splats, in the same form from every backend.
+/// A moment is a sum over the pixels of a tile from which the gradients of a splat's record follow linearly.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Moments {
+    /// Tile, splat and moments of each pair, by tile and then front to back.
+    pub pairs: Vec<(u32, u32, [f32; MOMENTS])>,
+    /// Splat and the sums over its pairs, of those that were drawn, by index.
+    pub splats: Vec<(u32, [f32; MOMENTS])>,
+}
+
 /// The gradient of a loss with respect to the trainable splats, and what growth and pruning want to know.
 #[derive(Debug, Clone, Default)]
 pub struct Gradients {

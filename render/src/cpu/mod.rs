@@ -10,6 +10,7 @@
 mod bin;
 pub mod ceiling;
 mod contribute;
+mod moments;
 mod project;
 mod project_backward;
 mod rasterize;
@@ -40,6 +41,32 @@ pub enum Stage {
     RasterizeBackward,
     Reduce,
     ProjectBackward,
+}
+
+impl Stage {
+    /// In their order.
+    pub const ALL: [Self; 7] = [
+        Self::Project,
+        Self::Sort,
+        Self::Bin,
+        Self::Rasterize,
+        Self::RasterizeBackward,
+        Self::Reduce,
+        Self::ProjectBackward,
+    ];
+
+    /// Its name in every backend.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Project => "project",
+            Self::Sort => "sort",
+            Self::Bin => "bin",
+            Self::Rasterize => "rasterize",
+            Self::RasterizeBackward => "rasterize_backward",
+            Self::Reduce => "reduce",
+            Self::ProjectBackward => "project_backward",
+        }
+    }
 }
 
 /// A renderer with its buffers, which it keeps from view to view.

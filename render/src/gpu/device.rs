@@ -4,13 +4,14 @@
 //! returns them: a failed device never looks like a result.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::sync::Arc;
 use std::sync::atomic::AtomicU64;
+use std::sync::{Arc, Mutex};
 
 use super::error::{Faults, GpuError, one_line};
 use super::kernel::Kernels;
 use super::memory::Meter;
 use super::options::GpuOptions;
+use super::watch::{CLOCK, Watch};
 
 /// Storage bindings of the stage that has most (`project_backward`).
 const STORAGE_BINDINGS: u32 = 12;
@@ -23,13 +24,15 @@ pub struct Gpu {
     device: wgpu::Device,
     queue: wgpu::Queue,
     name: String,
-    software: bool,
+    class: &'static str,
     subgroups: bool,
     faults: Arc<Faults>,
     meter: Arc<Meter>,
     /// Bytes handed to [`Gpu::upload`] that may still wait on the host.
     staged: AtomicU64,
     kernels: Kernels,
+    /// Who looks at the clock.
+    pub(super) watch: Mutex<Option<Watch>>,
 }
 
 impl Gpu {
@@ -82,7 +85,8 @@ impl Gpu {
         let subgroups = !options.portable && has_subgroups(adapter.features(), &info);
         let descriptor = wgpu::DeviceDescriptor {
             label: Some("plat"),
-            required_features: if subgroups { wgpu::Features::SUBGROUP } else { wgpu::Features::empty() },
+            required_features: adapter.features() & CLOCK
+                | if subgroups { wgpu::Features::SUBGROUP } else { wgpu::Features::empty() },
             // All that the adapter has: what does not fit is refused with a reason (`room`), not by a smaller default.
             required_limits: limits,
             ..Default::default()
@@ -95,12 +99,13 @@ impl Gpu {
         device.set_device_lost_callback(move |_, message| of_loss.lost(&message));
         Ok(Self {
             name: name(&info, subgroups),
-            software: info.device_type == wgpu::DeviceType::Cpu,
+            class: class(info.device_type),
             subgroups,
             faults,
             meter: Meter::new(options.memory_bytes),
             staged: AtomicU64::new(0),
             kernels: Kernels::default(),
+            watch: Mutex::default(),
             device,
             queue,
         })
@@ -114,7 +119,12 @@ impl Gpu {
 
     /// True where a CPU pretends to be a GPU.
     pub fn is_software(&self) -> bool {
-        self.software
+        self.class == class(wgpu::DeviceType::Cpu)
+    }
+
+    /// What sort of adapter it is: `discrete`, `integrated`, `virtual`, `software` (a CPU pretends to be a GPU) or `other`.
+    pub fn class(&self) -> &'static str {
+        self.class
     }
 
     /// True where [`shaders::SUBGROUPS`] run.
@@ -207,6 +217,16 @@ fn has_subgroups(features: wgpu::Features, info: &wgpu::AdapterInfo) -> bool {
         && size == info.subgroup_max_size
         && (8..=128).contains(&size)
         && size.is_power_of_two()
+}
+
+fn class(kind: wgpu::DeviceType) -> &'static str {
+    match kind {
+        wgpu::DeviceType::DiscreteGpu => "discrete",
+        wgpu::DeviceType::IntegratedGpu => "integrated",
+        wgpu::DeviceType::VirtualGpu => "virtual",
+        wgpu::DeviceType::Cpu => "software",
+        wgpu::DeviceType::Other => "other",
+    }
 }
 
 fn name(info: &wgpu::AdapterInfo, subgroups: bool) -> String {

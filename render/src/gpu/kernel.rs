@@ -30,7 +30,7 @@ impl Gpu {
         Ok(kernel)
     }
 
-    fn compile(&self, stage: &Stage, entry: &str) -> Result<Kernel, GpuError> {
+    fn compile(&self, stage: &Stage, entry: &'static str) -> Result<Kernel, GpuError> {
         let module = self.device().create_shader_module(wgpu::ShaderModuleDescriptor {
             label: Some(stage.name),
             source: wgpu::ShaderSource::Wgsl(stage.source().into()),
@@ -49,13 +49,14 @@ impl Gpu {
         });
         self.check()?;
         let layout = pipeline.get_bind_group_layout(0);
-        Ok(Kernel { pipeline, layout })
+        Ok(Kernel { entry, pipeline, layout })
     }
 }
 
 /// A compiled entry point. Its bindings are those of group 0 that its text uses.
 #[derive(Debug, Clone)]
 pub struct Kernel {
+    entry: &'static str,
     pipeline: wgpu::ComputePipeline,
     layout: wgpu::BindGroupLayout,
 }
@@ -65,7 +66,7 @@ impl Kernel {
     pub fn run(&self, gpu: &Gpu, pass: &mut wgpu::ComputePass, bindings: &[(u32, &wgpu::Buffer)], groups: u32) {
         self.bind(gpu, pass, bindings);
         let columns = groups.clamp(1, GROUPS_IN_A_ROW);
-        pass.dispatch_workgroups(columns, groups.div_ceil(columns), 1);
+        gpu.dispatch(pass, self.entry, |pass| pass.dispatch_workgroups(columns, groups.div_ceil(columns), 1));
     }
 
     /// Runs as many workgroups as entry `place` of `args` says.
@@ -78,7 +79,7 @@ impl Kernel {
         place: u64,
     ) {
         self.bind(gpu, pass, bindings);
-        pass.dispatch_workgroups_indirect(args, 12 * place);
+        gpu.dispatch(pass, self.entry, |pass| pass.dispatch_workgroups_indirect(args, 12 * place));
     }
 
     fn bind(&self, gpu: &Gpu, pass: &mut wgpu::ComputePass, bindings: &[(u32, &wgpu::Buffer)]) {

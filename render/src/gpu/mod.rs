@@ -17,10 +17,12 @@ mod device;
 mod error;
 mod kernel;
 mod memory;
+mod moments;
 mod options;
 mod sizes;
 mod sort;
 mod splats;
+mod watch;
 
 use std::sync::Arc;
 
@@ -34,6 +36,7 @@ pub use kernel::Kernel;
 pub use memory::{Buffer, Growing};
 pub use options::GpuOptions;
 pub use splats::{Columns, GpuSplats};
+pub use watch::Dispatched;
 
 use crate::{Frame, Gradients, Options};
 use access::set_of;
