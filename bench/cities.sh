@@ -14,7 +14,7 @@ while read -r area views levels; do
     model="$city-model"
     rm -rf "$model"
     "$plat" --quiet bench pareto "$city" --label "plat tree" --scene "city, $area km²" \
-        --levels "$levels" --steps $((10 * views)) --eval-every 0 --out "$model"
+        --levels "$levels" --steps $((10 * views)) --eval-every 0 --fresh --out "$model"
     "$plat" --quiet bench tree "$model" "$city" --scene "city, $area km²"
 done <<'CITIES'
 0.3 500 2

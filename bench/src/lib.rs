@@ -1,17 +1,19 @@
 //! What a run leaves for people: result lines, the chart and table drawn from them, contact sheets, bird's-eye cameras.
 //!
 //! `bench/results/*.jsonl` holds one [`ResultLine`] per run and is never edited by hand; the README's chart and table
-//! are functions of it. Lines with a `kind` are measurements of a part ([`PartLine`]).
+//! are functions of it and of what other trainers reached ([`reference`]). Lines with a `kind` are measurements of a part
+//! ([`PartLine`]).
 
 pub mod birdseye;
 pub mod chart;
 pub mod parts;
+pub mod reference;
 pub mod seeds;
 pub mod sheet;
 pub mod table;
 
 use std::fs;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use scene::BadInput;
 use serde::{Deserialize, Serialize};
@@ -40,6 +42,15 @@ pub struct ResultLine {
     pub downscale: u32,
     /// Hash of the resolved configuration.
     pub config_hash: Option<String>,
+    /// Steps that were planned; null where nobody noted them.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub steps: Option<u32>,
+    /// Splats that were planned, likewise.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub budget: Option<u32>,
+    /// Loss of PSNR that pruning was allowed, dB, likewise; 0 = nothing was pruned.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub tolerance_db: Option<f64>,
     /// Backend and its instruction set or adapter.
     pub backend: String,
     /// Number of workers.
@@ -99,14 +110,19 @@ fn one() -> u32 {
     1
 }
 
+/// CPU seconds until a curve first reaches this PSNR, interpolated between its points; `None` if it never does.
+pub fn cpu_seconds_to(curve: &[CurvePoint], psnr: f64) -> Option<f64> {
+    let reached = curve.iter().position(|p| p.psnr >= psnr)?;
+    let at = curve[reached];
+    let Some(before) = reached.checked_sub(1).map(|i| curve[i]) else { return Some(at.cpu_seconds) };
+    let share = (psnr - before.psnr) / (at.psnr - before.psnr);
+    Some(before.cpu_seconds + share * (at.cpu_seconds - before.cpu_seconds))
+}
+
 impl ResultLine {
-    /// CPU seconds until the curve first reaches this PSNR, interpolated between its points; `None` if it never does.
+    /// As the function, of this run's curve.
     pub fn cpu_seconds_to(&self, psnr: f64) -> Option<f64> {
-        let reached = self.curve.iter().position(|p| p.psnr >= psnr)?;
-        let at = self.curve[reached];
-        let Some(before) = reached.checked_sub(1).map(|i| self.curve[i]) else { return Some(at.cpu_seconds) };
-        let share = (psnr - before.psnr) / (at.psnr - before.psnr);
-        Some(before.cpu_seconds + share * (at.cpu_seconds - before.cpu_seconds))
+        cpu_seconds_to(&self.curve, psnr)
     }
 
     /// The best PSNR of the curve and the end, dB.
@@ -116,7 +132,7 @@ impl ResultLine {
 
     fn is_finite(&self) -> bool {
         let numbers = [Some(self.cpu_seconds), Some(self.psnr), self.wall_seconds, self.ssim, self.lpips];
-        let more = [self.cc_psnr, self.perceptual, self.zone_psnr, self.detections_kept, self.fps];
+        let more = [self.tolerance_db, self.cc_psnr, self.perceptual, self.zone_psnr, self.detections_kept, self.fps];
         numbers.iter().chain(&more).flatten().all(|v| v.is_finite())
             && self.curve.iter().all(|p| p.cpu_seconds.is_finite() && p.psnr.is_finite())
     }
@@ -173,18 +189,23 @@ pub fn read(path: &Path) -> Result<Vec<ResultLine>, BadInput> {
 /// # Errors
 /// As [`read`].
 pub fn read_folder(folder: &Path) -> Result<Vec<ResultLine>, BadInput> {
+    let mut lines = Vec::new();
+    for path in files(folder, "jsonl")? {
+        lines.extend(read(&path)?);
+    }
+    Ok(lines)
+}
+
+/// The files of a folder with this extension, in name order.
+fn files(folder: &Path, extension: &str) -> Result<Vec<PathBuf>, BadInput> {
     let refuse = |e: std::io::Error| {
         BadInput::new(folder.display().to_string(), format!("cannot be read: {e}"), "name a folder of results")
     };
     let entries = fs::read_dir(folder).map_err(refuse)?.collect::<Result<Vec<_>, _>>().map_err(refuse)?;
     let mut paths: Vec<_> = entries.into_iter().map(|entry| entry.path()).collect();
-    paths.retain(|path| path.extension().is_some_and(|e| e == "jsonl"));
+    paths.retain(|path| path.extension().is_some_and(|e| e == extension));
     paths.sort();
-    let mut lines = Vec::new();
-    for path in paths {
-        lines.extend(read(&path)?);
-    }
-    Ok(lines)
+    Ok(paths)
 }
 
 /// CPU model and number of cores of this machine: `Intel(R) Xeon(R) CPU @ 2.50GHz, 2 cores`. No host name.
@@ -275,14 +296,5 @@ pub(crate) mod tests {
         assert_eq!(run.cpu_seconds_to(19.0), Some(10.0));
         assert_eq!(run.cpu_seconds_to(24.1), None);
         assert_eq!(run.best_psnr(), 24.0);
-    }
-
-    #[test]
-    fn the_stored_reference_reads() {
-        let path = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/results/reference_opensplat.jsonl"));
-        let lines = read(path).unwrap();
-        assert_eq!(scenes(lines.iter()), ["fox", "aerial_caliterra", "street_lund", "building_sceaux"]);
-        assert!(lines.iter().all(|l| l.source.is_some()));
-        assert_eq!(lines[0].cpu_seconds_to(24.44), Some(365.0));
     }
 }

@@ -6,6 +6,8 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 use store::file::SaveError;
 
+use crate::CurvePoint;
+
 /// A measurement of a part, as one line of JSON.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "lowercase")]
@@ -18,6 +20,8 @@ pub enum PartLine {
     Prune(Prune),
     /// A tree's levels, and its faces between blocks.
     Tree(Tree),
+    /// Training in another way.
+    Ablation(Ablation),
 }
 
 /// How long the renderer's passes take: medians.
@@ -29,7 +33,10 @@ pub struct Kernels {
     pub machine: String,
     /// Backend and its instruction set or adapter.
     pub backend: String,
-    /// Threads.
+    /// What sort of adapter it is: `discrete`, `integrated`, `virtual`, `software` or `other`; null on the CPU.
+    #[serde(default)]
+    pub adapter_class: Option<String>,
+    /// Threads of the host.
     pub threads: u32,
     /// Splats drawn.
     pub splats: u64,
@@ -39,9 +46,9 @@ pub struct Kernels {
     pub height: u32,
     /// Pairs of splat and tile.
     pub pairs: u64,
-    /// Blocks of 4×4 pixels that the rasterizer visited, each for one splat.
+    /// Blocks of 4×4 pixels that the CPU's rasterizer visited, each for one splat.
     #[serde(default)]
-    pub visits: u64,
+    pub visits: Option<u64>,
     /// What one core can do, measured beside: fused multiply-adds, 10⁹ operations a second, a fused one counted as two.
     #[serde(default)]
     pub ceiling_gflops: Option<f64>,
@@ -51,9 +58,13 @@ pub struct Kernels {
     /// The stages.
     #[serde(default)]
     pub stages: Vec<StageTime>,
-    /// CPU time, milliseconds.
+    /// What timed the stages of a GPU: `device` (its own clock) or `wall` (a pass up to a stage's end less one up to its
+    /// beginning, each submitted and waited for); null on the CPU.
+    #[serde(default)]
+    pub clock: Option<String>,
+    /// CPU time of the process, milliseconds.
     pub forward_cpu_millis: f64,
-    /// CPU time, milliseconds.
+    /// CPU time of the process, milliseconds.
     pub backward_cpu_millis: f64,
     /// Wall time, milliseconds.
     pub forward_wall_millis: f64,
@@ -68,8 +79,11 @@ pub struct Kernels {
 pub struct StageTime {
     /// Its name.
     pub stage: String,
-    /// CPU time, milliseconds: median.
-    pub cpu_millis: f64,
+    /// CPU time, milliseconds: median; null on a GPU.
+    pub cpu_millis: Option<f64>,
+    /// Time on the device, milliseconds: median; null on the CPU.
+    #[serde(default)]
+    pub device_millis: Option<f64>,
     /// Arithmetic by the count of the stage's inner loop, 10⁹ operations a second and core; null where it is not what the
     /// stage is about.
     pub gflops: Option<f64>,
@@ -77,6 +91,54 @@ pub struct StageTime {
     pub gbytes: Option<f64>,
     /// The larger of the two over its ceiling.
     pub of_ceiling: Option<f64>,
+}
+
+/// Training one block with one variant of the recipe. Clocks leave out ingest and measurements.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Ablation {
+    /// The program's git commit.
+    pub commit: String,
+    /// See [`crate::machine`].
+    pub machine: String,
+    /// The capture's name.
+    pub scene: String,
+    /// Photos were used at one over this of their size.
+    pub downscale: u32,
+    /// Backend and its instruction set or adapter.
+    pub backend: String,
+    /// Threads.
+    pub threads: u32,
+    /// What was changed.
+    pub variant: String,
+    /// The run's seed.
+    pub seed: u64,
+    /// Steps.
+    pub steps: u32,
+    /// Splats to end with.
+    pub budget: u32,
+    /// How long it took to reach what.
+    pub reached: Vec<Reached>,
+    /// Held-out views at the end, dB.
+    pub psnr: f64,
+    /// Splats at the end.
+    pub splats: u64,
+    /// User and system time of all threads.
+    pub cpu_seconds: f64,
+    /// Seconds.
+    pub wall_seconds: f64,
+    /// Held-out PSNR along the way; the first point is the model that training starts from.
+    pub curve: Vec<CurvePoint>,
+    /// The command that made the line.
+    pub command: String,
+}
+
+/// When a curve first reached a PSNR.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Reached {
+    /// Held-out views, dB.
+    pub psnr: f64,
+    /// Interpolated between the curve's points; null if it never did.
+    pub cpu_seconds: Option<f64>,
 }
 
 /// What an ingest into an empty store took.
@@ -201,7 +263,9 @@ impl PartLine {
                 let passes = [line.forward_cpu_millis, line.backward_cpu_millis];
                 let walls = [line.forward_wall_millis, line.backward_wall_millis];
                 let of_stages = line.stages.iter().flat_map(|stage| {
-                    [Some(stage.cpu_millis), stage.gflops, stage.gbytes, stage.of_ceiling].into_iter().flatten()
+                    [stage.cpu_millis, stage.device_millis, stage.gflops, stage.gbytes, stage.of_ceiling]
+                        .into_iter()
+                        .flatten()
                 });
                 let ceilings = [line.ceiling_gflops, line.ceiling_gbytes].into_iter().flatten();
                 passes.into_iter().chain(walls).chain(of_stages).chain(ceilings).all(f64::is_finite)
@@ -217,6 +281,12 @@ impl PartLine {
                     without.chain(faces.psnr).chain(faces.ssim).chain(faces.flip).chain([faces.step])
                 });
                 of_levels.chain(of_faces).flatten().all(f64::is_finite)
+            }
+            Self::Ablation(line) => {
+                let reached = line.reached.iter().flat_map(|reached| [Some(reached.psnr), reached.cpu_seconds]);
+                let curve = line.curve.iter().flat_map(|point| [point.cpu_seconds, point.psnr]);
+                let all = [line.psnr, line.cpu_seconds, line.wall_seconds].into_iter().chain(curve);
+                all.chain(reached.flatten()).all(f64::is_finite)
             }
             Self::Ingest(line) => line.wall_seconds.is_finite() && line.cpu_seconds.is_finite(),
         }

@@ -9,31 +9,55 @@ use crate::{CurvePoint, ResultLine};
 pub struct Averaged {
     /// The last line of the run with its figures averaged; those that a seed lacks are null.
     pub line: ResultLine,
+    /// In what its configuration differs from the others of its scene and label: `400 steps, 12000 splats`; empty where it is the only
+    /// one.
+    pub variant: String,
     /// Number of seeds.
     pub seeds: usize,
     /// Largest PSNR less the smallest, dB.
     pub spread: f64,
 }
 
-/// For each scene and label, in the order of their first appearance: the mean over seeds of the lines that the last
-/// line's commit wrote, each seed's last one. Lines without a seed (references) stand alone.
+/// For each scene and label, in the order of their first appearance, and for each configuration that the last line's commit ran: the mean
+/// over seeds, each seed's last one. Lines without a seed (references) stand alone.
 pub fn averaged(lines: &[ResultLine]) -> Vec<Averaged> {
     let same = |a: &ResultLine, b: &ResultLine| a.scene == b.scene && a.label == b.label;
     let firsts = lines.iter().enumerate().filter(|(i, line)| !lines[..*i].iter().any(|before| same(before, line)));
-    let run = |(_, first): (usize, &ResultLine)| {
+    let runs = |(_, first): (usize, &ResultLine)| -> Vec<Averaged> {
         let last = lines.iter().rfind(|line| same(line, first)).expect("the first is one");
-        let of_run = |line: &&ResultLine| same(line, last) && line.commit == last.commit && line.seed.is_some();
-        let by_seed: BTreeMap<Option<u64>, &ResultLine> =
-            lines.iter().filter(of_run).map(|line| (line.seed, line)).collect();
-        match last.seed {
-            Some(_) => mean(last, &by_seed.into_values().collect::<Vec<_>>()),
-            None => mean(last, &[last]),
+        if last.seed.is_none() {
+            return vec![mean(last, &[last], String::new())];
         }
+        let of_run = |line: &&ResultLine| same(line, last) && line.commit == last.commit && line.seed.is_some();
+        let all: Vec<&ResultLine> = lines.iter().filter(of_run).collect();
+        let new = |(i, line): (usize, &&ResultLine)| !all[..i].iter().any(|before| settings(before) == settings(line));
+        let distinct: Vec<&ResultLine> =
+            all.iter().enumerate().filter(|&(i, line)| new((i, line))).map(|(_, line)| *line).collect();
+        let of_settings = |of: &&ResultLine| {
+            let alike = all.iter().filter(|line| settings(line) == settings(of));
+            let by_seed: BTreeMap<Option<u64>, &ResultLine> = alike.clone().map(|line| (line.seed, *line)).collect();
+            let last = alike.last().expect("it is one");
+            mean(last, &by_seed.into_values().collect::<Vec<_>>(), variant(of, &distinct))
+        };
+        distinct.iter().map(of_settings).collect()
     };
-    firsts.map(run).collect()
+    firsts.flat_map(runs).collect()
 }
 
-fn mean(last: &ResultLine, runs: &[&ResultLine]) -> Averaged {
+/// What a sweep goes through.
+fn settings(line: &ResultLine) -> [Option<f64>; 3] {
+    [line.steps.map(f64::from), line.budget.map(f64::from), line.tolerance_db]
+}
+
+/// In what a run's settings are not those of all.
+fn variant(line: &ResultLine, all: &[&ResultLine]) -> String {
+    let names = [" steps", " splats", " dB pruned"];
+    let differs = |k: usize| all.iter().any(|other| settings(other)[k] != settings(line)[k]);
+    let name = |(k, name): (usize, &str)| Some(format!("{}{name}", settings(line)[k].filter(|_| differs(k))?));
+    names.into_iter().enumerate().filter_map(name).collect::<Vec<_>>().join(", ")
+}
+
+fn mean(last: &ResultLine, runs: &[&ResultLine], variant: String) -> Averaged {
     let count = runs.len() as f64;
     let of = |get: &dyn Fn(&ResultLine) -> f64| runs.iter().map(|run| get(run)).sum::<f64>() / count;
     let maybe = |get: &dyn Fn(&ResultLine) -> Option<f64>| {
@@ -56,7 +80,7 @@ fn mean(last: &ResultLine, runs: &[&ResultLine]) -> Averaged {
         ..last.clone()
     };
     let spread = runs.iter().map(psnr).fold(f64::MIN, f64::max) - runs.iter().map(psnr).fold(f64::MAX, f64::min);
-    Averaged { line, seeds: runs.len(), spread }
+    Averaged { line, variant, seeds: runs.len(), spread }
 }
 
 /// Point by point where all curves have as many; else the last one's.
@@ -102,6 +126,27 @@ mod tests {
         assert_eq!((plat.seeds, plat.spread, plat.line.psnr), (2, 4.0, 22.0));
         assert_eq!(plat.line.curve[1].cpu_seconds, 44.0);
         assert_eq!((reference.seeds, reference.spread, &reference.line), (1, 0.0, &lines[2]));
+    }
+
+    #[test]
+    fn configurations_of_a_commit_stand_side_by_side() {
+        let with = |commit: &str, steps: u32, budget: u32, seed: u64, psnr: f64| ResultLine {
+            steps: Some(steps),
+            budget: Some(budget),
+            ..of_seed(commit, seed, psnr)
+        };
+        let lines = [
+            with("old", 900, 12, 0, 50.0),
+            with("new", 400, 12, 0, 20.0),
+            with("new", 800, 12, 0, 30.0),
+            with("new", 400, 12, 1, 22.0),
+            with("new", 800, 12, 0, 31.0),
+        ];
+        let found = averaged(&lines);
+        let found: Vec<_> = found.iter().map(|run| (&*run.variant, run.seeds, run.line.psnr)).collect();
+        assert_eq!(found, [("400 steps", 2, 21.0), ("800 steps", 1, 31.0)]);
+        let one = averaged(&lines[..2]);
+        assert_eq!((one.len(), &*one[0].variant), (1, ""));
     }
 
     #[test]

@@ -7,7 +7,7 @@ use crate::{Averaged, ResultLine, averaged, scenes};
 const BEGIN: &str = "<!-- bench:begin -->";
 const END: &str = "<!-- bench:end -->";
 
-/// The latest run of each scene and label, references (lines with a source) first; of several seeds the mean, with the
+/// The latest runs of each scene and label, references (lines with a source) first; of several seeds the mean, with the
 /// largest PSNR less the smallest. The column of times says how long a run took to the reference's best PSNR, and how
 /// much sooner that is than the reference's own.
 pub fn table(lines: &[ResultLine]) -> String {
@@ -29,7 +29,7 @@ pub fn table(lines: &[ResultLine]) -> String {
                 text,
                 "| {}{size} | {} | {} | {} | {} | {} | {} | {} | {} | {} |",
                 cell(scene),
-                cell(&line.label),
+                cell(&name(run)),
                 cell(&line.backend),
                 psnr(run),
                 number(line.ssim, 3),
@@ -50,6 +50,11 @@ pub fn replace_table(document: &str, table: &str) -> Option<String> {
     let from = document.find(BEGIN)? + BEGIN.len();
     let to = from + document[from..].find(END)?;
     Some(format!("{}\n{}\n{}", &document[..from], table.trim_end(), &document[to..]))
+}
+
+fn name(run: &Averaged) -> String {
+    let label = &run.line.label;
+    if run.variant.is_empty() { label.clone() } else { format!("{label}, {}", run.variant) }
 }
 
 fn psnr(run: &Averaged) -> String {

@@ -1,6 +1,7 @@
 //! The command line, as data. Options without a meaning yet are not accepted.
 
 mod bench;
+mod sweep;
 mod synth;
 
 use std::fmt;
@@ -14,9 +15,10 @@ use serde::{Serialize, Serializer};
 use train::importance::Order;
 
 pub(crate) use bench::{
-    AdaptiveArgs, BenchCommand, BenchDemoArgs, BenchPruneArgs, BenchTreeArgs, ChartArgs, IngestArgs, KernelsArgs,
-    ParetoArgs,
+    AblateArgs, AdaptiveArgs, BenchCommand, BenchDemoArgs, BenchPruneArgs, BenchTreeArgs, ChartArgs, IngestArgs,
+    KernelsArgs, ParetoArgs,
 };
+pub(crate) use sweep::{Named, Sweep};
 pub(crate) use synth::SynthArgs;
 
 /// Trains Gaussian-splat models of whole cities from photos with poses.
@@ -142,6 +144,9 @@ pub(crate) enum Backend {
     Gpu,
 }
 
+/// The usual `--residual`.
+pub(crate) const RESIDUAL: f64 = 0.4;
+
 /// Options that decide the plan.
 #[derive(Debug, Clone, Args, Serialize)]
 #[serde(rename_all = "kebab-case")]
@@ -164,7 +169,7 @@ pub(crate) struct PlanOptions {
     pub(crate) tolerance_db: f64,
     /// Refine a block only where its parent's splats are off, in the block's own photos, by more than R times what the root is
     /// off by in all (root mean squares), and look at fine pixels and add splats only while that pays; 0 adapts nothing
-    #[arg(long, value_name = "R", value_parser = residual, default_value_t = 0.4)]
+    #[arg(long, value_name = "R", value_parser = residual, default_value_t = RESIDUAL)]
     pub(crate) residual: f64,
     /// Seed of all random choices
     #[arg(long, value_name = "S", default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=i64::MAX as u64))]

@@ -17,6 +17,7 @@ mod model;
 mod output;
 mod record;
 mod seams;
+mod variants;
 
 use std::process::ExitCode;
 
@@ -49,7 +50,8 @@ fn main() -> ExitCode {
         Command::Render(args) => commands::render::run(args, &output),
         Command::Prune(args) => commands::prune::run(args, &output),
         Command::Export(args) => commands::export::run(args, &output),
-        Command::Bench(BenchCommand::Pareto(args)) => commands::bench::pareto(args, &output),
+        Command::Bench(BenchCommand::Pareto(args)) => commands::pareto::run(args, &output),
+        Command::Bench(BenchCommand::Ablate(args)) => commands::ablate::run(args, &output),
         Command::Bench(BenchCommand::Chart(args)) => commands::bench::chart(args, &output),
         Command::Bench(BenchCommand::Kernels(args)) => commands::kernels::run(args, &output),
         Command::Bench(BenchCommand::Ingest(args)) => commands::bench::ingest(args, &output),

@@ -106,3 +106,45 @@ fn what_cannot_be_is_refused_in_one_line() {
     common::stopped(elsewhere.env("PLAT_GPU_ADAPTER", "an adapter that nobody has"), 2, "--backend");
     common::stopped(&mut job(at, "gpu", &["--out", "o", "--exposure"]), 2, "--exposure");
 }
+
+const KERNELS: [&str; 6] = ["bench", "kernels", "--splats", "300", "--size", "96x64"];
+
+#[test]
+fn the_stages_of_a_gpu_are_timed_and_compared() {
+    let Some(name) = gpu() else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    let timed = common::done(at, &[&KERNELS[..], &["--backend", "gpu", "--passes", "3", "--results", "r"]].concat());
+    println!("{timed}");
+    assert_eq!((&timed["kind"], timed["backend"].as_str()), (&"kernels".into(), Some(&*name)));
+    assert!(
+        ["discrete", "integrated", "virtual", "software", "other"].contains(&timed["adapter_class"].as_str().unwrap())
+    );
+    assert!(["device", "wall"].contains(&timed["clock"].as_str().unwrap()));
+    assert!(timed["pairs"].as_u64() > Some(300) && timed["forward_wall_millis"].as_f64() > Some(0.0));
+    let stages = timed["stages"].as_array().unwrap();
+    let names: Vec<&str> = stages.iter().map(|stage| stage["stage"].as_str().unwrap()).collect();
+    assert_eq!(names, ["project", "sort", "bin", "rasterize", "rasterize_backward", "reduce", "project_backward"]);
+    assert!(stages.iter().all(|stage| stage["device_millis"].as_f64() >= Some(0.0) && stage["cpu_millis"].is_null()));
+    assert!(stages.iter().any(|stage| stage["device_millis"].as_f64() > Some(0.0)));
+    assert_eq!(std::fs::read_to_string(at.join("r/kernels.jsonl")).unwrap().lines().count(), 1);
+
+    let compared = common::done(at, &[&KERNELS[..], &["--from-stage", "project"]].concat());
+    println!("{compared}");
+    assert!(compared["first_mismatch"].is_null() && compared["stages"].as_array().unwrap().len() == 7);
+    assert!(compared["stages"].as_array().unwrap().iter().all(|stage| stage["within"] == true));
+    assert!(compared["stages"][2]["of"].as_u64() > Some(300), "tiles have splats");
+    let late = common::done(at, &[&KERNELS[..], &["--from-stage", "reduce"]].concat());
+    assert_eq!((late["stages"].as_array().unwrap().len(), &late["stages"][0]), (2, &compared["stages"][5]));
+}
+
+#[test]
+fn kernels_without_a_gpu_are_refused_in_one_line() {
+    let folder = tempfile::tempdir().unwrap();
+    for words in [["--backend", "gpu"], ["--from-stage", "bin"]] {
+        let mut elsewhere = common::command(folder.path(), &[&KERNELS[..], &words].concat());
+        common::stopped(elsewhere.env("PLAT_GPU_ADAPTER", "an adapter that nobody has"), 2, "no GPU adapter");
+    }
+    common::refused(folder.path(), &[&KERNELS[..], &["--from-stage", "blur"]].concat(), "rasterize_backward");
+    common::refused(folder.path(), &[&KERNELS[..], &["--from-stage", "bin", "--passes", "2"]].concat(), "--passes");
+}

@@ -245,7 +245,7 @@ impl Block<'_> {
 
     /// The splats as other blocks, viewers and the merged model draw them: at full resolution. Compensated opacity does not
     /// depend on the resolution.
-    fn handed_on(&self, mut splats: Splats, views: &[TrainView]) -> Splats {
+    pub(crate) fn handed_on(&self, mut splats: Splats, views: &[TrainView]) -> Splats {
         if !self.plan.settings.antialiased {
             train::blur::to_full_images(&mut splats, views);
         }
@@ -299,7 +299,7 @@ impl Block<'_> {
         Ok(found.is_some_and(|found| found <= plan.settings.residual * all))
     }
 
-    fn seed(&self) -> u64 {
+    pub(crate) fn seed(&self) -> u64 {
         let BlockId { level, x, y } = self.task.block;
         let place = u64::from(level) << 58 | u64::from(x) << 29 | u64::from(y);
         train::random::bits(self.plan.settings.seed, place)
@@ -310,7 +310,7 @@ impl Block<'_> {
         [self.task.rho_metres as f32 * 0.05, 2.0 * self.plan.ground.edge_metres as f32]
     }
 
-    fn windows(&self, uses: &[ViewUse]) -> Result<Vec<TrainView>, ExecuteError> {
+    pub(crate) fn windows(&self, uses: &[ViewUse]) -> Result<Vec<TrainView>, ExecuteError> {
         let window = |use_: &ViewUse| {
             let view = self.capture.views.get(use_.view as usize);
             let view = view.ok_or_else(|| failed(format!("the capture has no view {}", use_.view)))?;
@@ -320,7 +320,7 @@ impl Block<'_> {
     }
 
     /// Is this place a task's in the end? What is far is the root's.
-    fn owns(&self, task: &Task, place: glam::DVec3) -> bool {
+    pub(crate) fn owns(&self, task: &Task, place: glam::DVec3) -> bool {
         let ground = &self.plan.ground;
         ground.owns(task.block, place) && (task.parent.is_none() || !ground.is_far(place))
     }

@@ -78,6 +78,11 @@ impl BlockTrainer {
             .map_err(|error| format!("cannot start {} threads: {error}", options.threads))?;
         Ok(Self { store, options, shared, backend, pool })
     }
+
+    /// Does something on the trainer's threads.
+    pub(crate) fn install<T: Send>(&self, work: impl FnOnce() -> T + Send) -> T {
+        self.pool.install(work)
+    }
 }
 
 impl Execute for BlockTrainer {

@@ -19,6 +19,7 @@ mod memory;
 pub mod merged;
 mod refine;
 mod start;
+pub mod whole;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;

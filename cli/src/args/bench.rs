@@ -3,18 +3,22 @@
 use std::path::PathBuf;
 
 use clap::{Args, Subcommand};
+use render::cpu::Stage;
 use train::importance::Order;
 
-use super::{DemoArgs, PruneCapture, Size, TrainArgs, decibels, metres, order, share};
+use super::{Auto, Backend, DemoArgs, PruneCapture, Size, Sweep, decibels, metres, order, share};
+use crate::variants::{self, VARIANTS, Variant};
 
 #[derive(Debug, Subcommand)]
 pub(crate) enum BenchCommand {
-    /// Train with evaluations on the way, measure the result, and append it to the results
+    /// Train every combination of some captures and settings, measure the results, and append a line for each
     Pareto(ParetoArgs),
     /// Redraw the chart and the README's table from all results
     Chart(ChartArgs),
     /// Time the renderer's forward and backward passes
     Kernels(KernelsArgs),
+    /// Train one block by variants of the recipe, and append how long each took to reach what
+    Ablate(AblateArgs),
     /// Ingest a capture into a store of its own, and append what it took to the results
     Ingest(IngestArgs),
     /// Compare the orders to prune a model by, and append the figures to the results
@@ -29,20 +33,20 @@ pub(crate) enum BenchCommand {
 
 #[derive(Debug, Clone, Args)]
 pub(crate) struct ParetoArgs {
-    /// What the chart calls the run
+    /// What the chart calls the runs; of several backends, with theirs
     #[arg(long)]
     pub(crate) label: String,
-    /// What the chart calls the capture
+    /// What the chart calls the capture; as NAME=PATH says otherwise
     #[arg(long)]
-    pub(crate) scene: String,
-    /// Folder of the result lines; this one goes to plat.jsonl there
+    pub(crate) scene: Option<String>,
+    /// Folder of the result lines; these go to plat.jsonl there
     #[arg(long, value_name = "DIR", default_value = "bench/results")]
     pub(crate) results: PathBuf,
     /// Also measure LPIPS with this network (ONNX), see plat eval --help
     #[arg(long, value_name = "FILE")]
     pub(crate) lpips: Option<PathBuf>,
     #[command(flatten)]
-    pub(crate) train: TrainArgs,
+    pub(crate) sweep: Sweep,
 }
 
 #[derive(Debug, Clone, Args)]
@@ -93,6 +97,11 @@ pub(crate) struct BenchPruneArgs {
     pub(crate) results: PathBuf,
     #[command(flatten)]
     pub(crate) photos: PruneCapture,
+}
+
+fn stage(text: &str) -> Result<Stage, String> {
+    let names = || Stage::ALL.map(Stage::name).join(", ");
+    Stage::ALL.into_iter().find(|stage| stage.name() == text).ok_or_else(|| format!("give one of {}", names()))
 }
 
 fn healing(text: &str) -> Result<f32, String> {
@@ -155,13 +164,67 @@ pub(crate) struct ChartArgs {
     /// Folder of the result lines; chart.svg goes there too
     #[arg(long, value_name = "DIR", default_value = "bench/results")]
     pub(crate) results: PathBuf,
+    /// Folder of what other trainers reached; by default bench/reference where it is
+    #[arg(long, value_name = "DIR")]
+    pub(crate) reference: Option<PathBuf>,
     /// File whose table between the markers is replaced
     #[arg(long, value_name = "FILE", default_value = "README.md")]
     pub(crate) readme: PathBuf,
 }
 
 #[derive(Debug, Clone, Args)]
+pub(crate) struct AblateArgs {
+    /// Folder of the capture: COLMAP or transforms.json
+    pub(crate) capture: PathBuf,
+    /// Use photos at one N-th of their size
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
+    pub(crate) downscale: u32,
+    /// Optimiser steps; auto as plat train
+    #[arg(long, value_name = "N|auto", default_value_t)]
+    pub(crate) steps: Auto<u32>,
+    /// Splats to end with; auto as plat train
+    #[arg(long, value_name = "N|auto", default_value_t)]
+    pub(crate) budget: Auto<u32>,
+    /// Hold out every K-th view by name, starting with the first
+    #[arg(long, value_name = "K", default_value_t = 8, value_parser = clap::value_parser!(u32).range(1..))]
+    pub(crate) test_every: u32,
+    /// Seeds; every variant is trained with each
+    #[arg(long, value_name = "S", value_delimiter = ',', default_value = "0,1,2", value_parser = clap::value_parser!(u64).range(..=i64::MAX as u64))]
+    pub(crate) seeds: Vec<u64>,
+    /// PSNR to reach, dB
+    #[arg(long, value_name = "DB", value_delimiter = ',', value_parser = decibels)]
+    pub(crate) to: Vec<f64>,
+    /// Share to reach of what the variant default gains from its first splats to its end; 0.9 where no --to is given
+    #[arg(long, value_name = "F", value_parser = share)]
+    pub(crate) to_gain: Option<f64>,
+    /// Variants of the recipe; all by default
+    #[arg(long, value_name = "NAME", value_delimiter = ',', value_parser = variants::named, default_values = VARIANTS.map(|v| v.name))]
+    pub(crate) variants: Vec<Variant>,
+    /// Measurements on the way, evenly spaced over the steps; clocks stand still meanwhile
+    #[arg(long, value_name = "N", default_value_t = 40, value_parser = clap::value_parser!(u32).range(1..=100_000))]
+    pub(crate) looks: u32,
+    /// What computes
+    #[arg(long, value_enum, default_value = "auto")]
+    pub(crate) backend: Backend,
+    /// Threads
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=1024))]
+    pub(crate) threads: u32,
+    /// What the lines call the capture; by default the name of its folder
+    #[arg(long)]
+    pub(crate) scene: Option<String>,
+    /// Folder of the result lines; these go to ablation.jsonl there
+    #[arg(long, value_name = "DIR", default_value = "bench/results")]
+    pub(crate) results: PathBuf,
+}
+
+#[derive(Debug, Clone, Args)]
 pub(crate) struct KernelsArgs {
+    /// What draws
+    #[arg(long, value_enum, default_value = "auto")]
+    pub(crate) backend: Backend,
+    /// Compare the GPU's stages with the CPU's instead, from this one on, and name the first that differs
+    #[arg(long, value_name = "STAGE", value_parser = stage, conflicts_with_all = ["backend", "results", "passes"])]
+    pub(crate) from_stage: Option<Stage>,
     /// Draw this model instead of random splats (needs --cameras)
     #[arg(long, value_name = "MODEL", requires = "cameras", conflicts_with = "splats")]
     pub(crate) model: Option<PathBuf>,

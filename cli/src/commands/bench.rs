@@ -1,10 +1,11 @@
-//! `plat bench pareto`, `demo`, `ingest` and `chart`: figures that are kept, and pictures of them.
+//! `plat bench demo`, `adaptive`, `ingest`, `tree` and `chart`: figures that are kept, and pictures of them.
 
 use std::fs;
 use std::path::Path;
 
 use ::bench::parts::{Ingest, Tree, TreeFaces, TreeLevel};
-use ::bench::{CurvePoint, PartLine, append, append_part, read_folder, replace_table, table};
+use ::bench::reference::read_references;
+use ::bench::{CurvePoint, PartLine, append_part, read_folder, replace_table, table};
 use city::CitySettings;
 use dataset::rehearse::Settings;
 use serde::Serialize;
@@ -12,45 +13,24 @@ use store::Store;
 use store::file::save;
 
 use crate::args::{
-    AdaptiveArgs, Auto, BenchDemoArgs, BenchTreeArgs, ChartArgs, DemoArgs, EvalArgs, IngestArgs, Level, ParetoArgs,
-    PlanOptions, TrainArgs,
+    AdaptiveArgs, Auto, BenchDemoArgs, BenchTreeArgs, ChartArgs, DemoArgs, EvalArgs, IngestArgs, Level, PlanOptions,
+    TrainArgs,
 };
 use crate::cameras;
 use crate::clock::{self, Stopwatch};
-use crate::commands::demo;
 use crate::commands::eval::{self, evaluate};
 use crate::commands::train::{ingest_photos, make_folder, train};
+use crate::commands::{demo, pareto};
 use crate::cuts::CutFigures;
 use crate::failure::Failure;
-use crate::lpips::Lpips;
 use crate::model::{self, save_json};
 use crate::output::Output;
 use crate::record::{Record, commit};
 
-/// The file of our own runs.
-const RUNS: &str = "plat.jsonl";
 /// The file of what trees lose.
 const TREES: &str = "tree.jsonl";
 /// The file of ingests alone.
 const INGESTS: &str = "ingest.jsonl";
-
-/// Trains, measures the merged model, and appends a line.
-pub(crate) fn pareto(args: &ParetoArgs, output: &Output) -> Result<(), Failure> {
-    let lpips = args.lpips.as_deref().map(Lpips::load).transpose()?;
-    // A line says what all of the work took.
-    let trained = train(&TrainArgs { fresh: true, ..args.train.clone() }, output)?;
-    let store_url = args.train.store.clone().unwrap_or_else(|| args.train.out.join("store").display().to_string());
-    let store = Store::open(&store_url)?.blocking();
-    let out = args.train.out.join("eval");
-    let mut record = trained.report.record.clone();
-    let every = args.train.plan.test_every;
-    let model = model::read(&args.train.out)?;
-    let evaluated = evaluate(&model, trained.capture, store, every, lpips.as_ref(), &out, output)?;
-    save_json(&out.join("report.json"), &evaluated)?;
-    record.scene.clone_from(&args.scene);
-    record.measured(&evaluated.record);
-    keep_run(&args.results, &args.label, &record, trained.curve, eval::text(&evaluated), output)
-}
 
 /// Builds the demo, and appends a line.
 pub(crate) fn demo(args: &BenchDemoArgs, output: &Output) -> Result<(), Failure> {
@@ -92,23 +72,18 @@ pub(crate) fn adaptive(args: &AdaptiveArgs, output: &Output) -> Result<(), Failu
     Ok(())
 }
 
-/// Appends a run, whose curve ends with the merged model at the end of all work.
+/// Appends a run.
 fn keep_run(
     results: &Path,
     label: &str,
     record: &Record,
-    mut curve: Vec<CurvePoint>,
+    curve: Vec<CurvePoint>,
     text: String,
     output: &Output,
 ) -> Result<(), Failure> {
-    if let (Some(cpu_seconds), Some(psnr)) = (record.cpu_seconds, record.psnr) {
-        curve.pop();
-        curve.push(CurvePoint { cpu_seconds, psnr, splats: Some(record.splats) });
-    }
-    let line = record.line(label, invoked(), curve);
-    make_folder(results)?;
-    append(&results.join(RUNS), &line)?;
-    output.result(&line, &format!("{text}\nappended to {}", results.join(RUNS).display()))
+    let line = pareto::line_of(label, record, curve);
+    let file = pareto::keep(results, &line)?;
+    output.result(&line, &format!("{text}\nappended to {}", file.display()))
 }
 
 /// Ingests a capture into an empty store, and appends a line. This process does nothing else, so its peak is the ingest's.
@@ -209,19 +184,28 @@ pub(crate) fn invoked() -> String {
 #[derive(Serialize)]
 struct Drawn<'a> {
     command: &'static str,
+    /// Of runs of plat.
     lines: usize,
+    /// Of runs of other trainers.
+    references: usize,
     chart: &'a Path,
     readme: &'a Path,
 }
 
-/// Redraws what is a function of the results.
+/// Redraws what is a function of the results and the references.
 pub(crate) fn chart(args: &ChartArgs, output: &Output) -> Result<(), Failure> {
-    let lines = read_folder(&args.results)?;
-    let (references, runs): (Vec<_>, Vec<_>) = lines.iter().cloned().partition(|line| line.source.is_some());
+    let runs = read_folder(&args.results)?;
+    let usual = Path::new("bench/reference");
+    let references = match &args.reference {
+        Some(folder) => read_references(folder)?,
+        None if usual.is_dir() => read_references(usual)?,
+        None => Vec::new(),
+    };
     let readme = args.readme.display().to_string();
     let document = fs::read_to_string(&args.readme).map_err(|error| {
         scene::BadInput::new(readme.clone(), format!("cannot be read ({error})"), "name it with --readme")
     })?;
+    let lines = [&references[..], &runs[..]].concat();
     let document = replace_table(&document, &table(&lines)).ok_or_else(|| {
         let advice = "put <!-- bench:begin --> and <!-- bench:end --> where the table goes";
         scene::BadInput::new(readme, "has no place for the table", advice)
@@ -229,6 +213,8 @@ pub(crate) fn chart(args: &ChartArgs, output: &Output) -> Result<(), Failure> {
     let path = args.results.join("chart.svg");
     save(&path, ::bench::chart(&runs, &references).as_bytes())?;
     save(&args.readme, document.as_bytes())?;
-    let drawn = Drawn { command: "bench chart", lines: lines.len(), chart: &path, readme: &args.readme };
-    output.result(&drawn, &format!("{} lines\n{}\n{}", lines.len(), path.display(), args.readme.display()))
+    let (count, others) = (runs.len(), references.len());
+    let drawn = Drawn { command: "bench chart", lines: count, references: others, chart: &path, readme: &args.readme };
+    let text = format!("{count} lines, {others} of other trainers\n{}\n{}", path.display(), args.readme.display());
+    output.result(&drawn, &text)
 }

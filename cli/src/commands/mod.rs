@@ -1,11 +1,13 @@
 //! One file for each command; each takes its arguments and says its result through [`crate::output::Output`].
 
+pub(crate) mod ablate;
 pub(crate) mod bench;
 pub(crate) mod demo;
 pub(crate) mod eval;
 pub(crate) mod export;
 pub(crate) mod inspect;
 pub(crate) mod kernels;
+pub(crate) mod pareto;
 pub(crate) mod plan;
 pub(crate) mod prune;
 pub(crate) mod render;

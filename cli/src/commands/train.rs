@@ -32,7 +32,7 @@ use crate::record::Record;
 use crate::{cameras, config, journal::Journal};
 
 /// Windows of photos that each worker keeps decoded; the planner's estimate of memory counts on it.
-const CACHE_BYTES: usize = 128 << 20;
+pub(crate) const CACHE_BYTES: usize = 128 << 20;
 
 /// What training left, beside the model's folder.
 pub(crate) struct Trained {
@@ -96,11 +96,7 @@ pub(crate) fn train(args: &TrainArgs, output: &Output) -> Result<Trained, Failur
 
     let Ingested { capture, id: capture_id, .. } = ingested;
     let plan = Plan { capture: capture_id, ..plan };
-    let mut resolved = args.clone();
-    resolved.plan.budget.0 = Some(plan.settings.budget);
-    resolved.plan.steps.0 = Some(plan.settings.steps);
-    resolved.threads.0 = Some(threads);
-    let (config_text, config_hash) = config::resolved(&resolved);
+    let (config_text, config_hash) = resolved(args, &plan);
     save(&args.out.join("config.toml"), config_text.as_bytes())?;
     save_json(&args.out.join("plan.json"), &plan)?;
     save(&args.out.join("plan.svg"), blocks::draw(&plan, &capture).as_bytes())?;
@@ -144,6 +140,9 @@ pub(crate) fn train(args: &TrainArgs, output: &Output) -> Result<Trained, Failur
         scene: cameras::name_of(&args.capture),
         downscale: args.plan.downscale,
         config_hash: Some(config_hash.to_string()),
+        steps: Some(plan.settings.steps),
+        budget: Some(plan.settings.budget),
+        tolerance_db: Some(plan.settings.tolerance_db),
         backend: plan.backend.clone(),
         workers: args.workers,
         threads,
@@ -184,17 +183,36 @@ fn cap_of(minutes: f64, clock: Stopwatch, plan: &Plan, workers: u32) -> Cap {
     Cap::new(clock, seconds - writing.min(0.1 * seconds), workers)
 }
 
-/// What computes. The backend has run on a software adapter only, slower than the CPU's own: it serves who asks for it.
+/// What computes. The GPU's backend has run on a software adapter only, slower than the CPU's own: it serves who asks for it.
 fn backend_of(args: &TrainArgs) -> Result<train::Backend, BadInput> {
-    match args.backend {
-        Backend::Auto | Backend::Cpu => Ok(train::Backend::Cpu),
-        Backend::Gpu if args.plan.exposure => {
-            Err(BadInput::new("--exposure", "is not trained on a GPU", "leave it, or give --backend cpu"))
-        }
-        Backend::Gpu => Gpu::open().map(train::Backend::Gpu).map_err(|error| {
-            BadInput::new("--backend", error.to_string(), "give --backend cpu, or name an adapter by PLAT_GPU_ADAPTER")
-        }),
+    if args.backend == Backend::Gpu && args.plan.exposure {
+        return Err(BadInput::new("--exposure", "is not trained on a GPU", "leave it, or give --backend cpu"));
     }
+    compute_on(args.backend)
+}
+
+/// What was asked to compute.
+pub(crate) fn compute_on(backend: Backend) -> Result<train::Backend, BadInput> {
+    match backend {
+        Backend::Auto | Backend::Cpu => Ok(train::Backend::Cpu),
+        Backend::Gpu => open_gpu().map(train::Backend::Gpu),
+    }
+}
+
+/// The GPU that was asked for.
+pub(crate) fn open_gpu() -> Result<Arc<Gpu>, BadInput> {
+    Gpu::open().map_err(|error| {
+        BadInput::new("--backend", error.to_string(), "give --backend cpu, or name an adapter by PLAT_GPU_ADAPTER")
+    })
+}
+
+/// What a run is configured to once its plan has chosen, as a file, and the file's hash.
+pub(crate) fn resolved(args: &TrainArgs, plan: &Plan) -> (String, ArtefactId) {
+    let mut resolved = args.clone();
+    resolved.plan.budget.0 = Some(plan.settings.budget);
+    resolved.plan.steps.0 = Some(plan.settings.steps);
+    resolved.threads.0 = Some(threads_of(args));
+    config::resolved(&resolved)
 }
 
 /// Threads of each worker.

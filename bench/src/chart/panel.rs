@@ -1,0 +1,277 @@
+//! One panel of the chart: a measure of quality over what it costs.
+
+use std::fmt::Write;
+
+use super::escape;
+use crate::{CurvePoint, ResultLine};
+
+/// Height of a panel.
+pub(super) const ROW: f64 = 232.0;
+/// Between two panels.
+pub(super) const GAP: f64 = 6.0;
+const LEFT: f64 = 52.0;
+const RIGHT: f64 = 14.0;
+const TOP: f64 = 26.0;
+const BOTTOM: f64 = 46.0;
+
+/// What a panel shows.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) enum Measure {
+    /// PSNR over CPU seconds, along the way too.
+    PsnrOverTime,
+    /// PSNR over splats, at the end.
+    PsnrOverSplats,
+    /// SSIMULACRA2 over CPU seconds, at the end.
+    Ssimulacra2,
+    /// LPIPS likewise.
+    Lpips,
+}
+
+/// A point of a panel.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Point {
+    /// CPU seconds or splats.
+    pub(super) x: f64,
+    pub(super) y: f64,
+    /// What it is.
+    pub(super) title: String,
+}
+
+/// A line of a panel.
+#[derive(Debug, Clone)]
+pub(super) struct Series {
+    pub(super) label: String,
+    pub(super) class: String,
+    pub(super) points: Vec<Point>,
+}
+
+impl Measure {
+    pub(super) const ALL: [Self; 4] = [Self::PsnrOverTime, Self::PsnrOverSplats, Self::Ssimulacra2, Self::Lpips];
+
+    pub(super) fn width(self) -> f64 {
+        if self == Self::PsnrOverTime { 400.0 } else { 250.0 }
+    }
+
+    fn names(self) -> (&'static str, &'static str) {
+        match self {
+            Self::PsnrOverTime => ("CPU time, seconds", "PSNR, dB"),
+            Self::PsnrOverSplats => ("splats", "PSNR, dB"),
+            Self::Ssimulacra2 => ("CPU time, seconds", "SSIMULACRA2"),
+            Self::Lpips => ("CPU time, seconds", "LPIPS, lower is better"),
+        }
+    }
+
+    /// The least that the axis spans, and digits of a figure.
+    fn span(self) -> (f64, usize) {
+        match self {
+            Self::PsnrOverTime | Self::PsnrOverSplats => (4.0, 2),
+            Self::Ssimulacra2 => (10.0, 1),
+            Self::Lpips => (0.1, 3),
+        }
+    }
+
+    /// What a run has to show: its curve, where the measure was taken along the way.
+    pub(super) fn curve(self, line: &ResultLine) -> Vec<Point> {
+        if self != Self::PsnrOverTime || line.curve.is_empty() {
+            return self.end(line, "").into_iter().collect();
+        }
+        let point = |p: &CurvePoint| {
+            let splats = p.splats.map(|n| format!(", {n} splats")).unwrap_or_default();
+            let title = format!("{}: {:.2} dB after {:.1} CPU s{splats}", line.label, p.psnr, p.cpu_seconds);
+            Point { x: p.cpu_seconds, y: p.psnr, title }
+        };
+        line.curve.iter().filter(|p| p.cpu_seconds > 0.0).map(point).collect()
+    }
+
+    /// A run's last figure, if it was taken.
+    pub(super) fn end(self, line: &ResultLine, variant: &str) -> Option<Point> {
+        let (x, y) = match self {
+            Self::PsnrOverTime => (line.cpu_seconds, line.psnr),
+            Self::PsnrOverSplats => (line.splats? as f64, line.psnr),
+            Self::Ssimulacra2 => (line.cpu_seconds, line.perceptual?),
+            Self::Lpips => (line.cpu_seconds, line.lpips?),
+        };
+        let digits = self.span().1;
+        let splats = line.splats.map(|n| format!(", {n} splats")).unwrap_or_default();
+        let variant = if variant.is_empty() { String::new() } else { format!(", {variant}") };
+        let title = format!("{}{variant}: {y:.digits$} after {:.1} CPU s{splats}", line.label, line.cpu_seconds);
+        (x > 0.0).then_some(Point { x, y, title })
+    }
+}
+
+/// Maps values to pixels of the panel.
+struct Axes {
+    width: f64,
+    /// log10.
+    x: (f64, f64),
+    y: (f64, f64),
+    step: f64,
+}
+
+impl Axes {
+    fn around(measure: Measure, series: &[Series]) -> Self {
+        let points = || series.iter().flat_map(|s| &s.points);
+        let range = |value: fn(&Point) -> f64| {
+            points().map(value).fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), v| (low.min(v), high.max(v)))
+        };
+        let (x, y) = (range(|p| p.x.log10()), range(|p| p.y));
+        // at least a decade wide
+        let wider = ((1.0 - (x.1 - x.0)) / 2.0).max(0.06);
+        let x = (x.0 - wider, x.1 + wider);
+        let (least, middle) = (measure.span().0, 0.5 * (y.0 + y.1));
+        let y = (y.0.min(middle - 0.5 * least), y.1.max(middle + 0.5 * least));
+        const STEPS: [f64; 9] = [0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0];
+        let step = STEPS.into_iter().find(|step| (y.1 - y.0) / step <= 6.0).unwrap_or(20.0);
+        Self { width: measure.width(), x, y: ((y.0 / step).floor() * step, (y.1 / step + 0.25).ceil() * step), step }
+    }
+
+    fn px(&self, x: f64) -> f64 {
+        LEFT + (x.log10() - self.x.0) / (self.x.1 - self.x.0) * (self.width - LEFT - RIGHT)
+    }
+
+    fn py(&self, y: f64) -> f64 {
+        ROW - BOTTOM - (y - self.y.0) / (self.y.1 - self.y.0) * (ROW - TOP - BOTTOM)
+    }
+
+    /// 1, 2 and 5 times the powers of ten within the range, or 1 and 3 times, or powers of ten alone: as many as keep clear of each
+    /// other.
+    fn ticks(&self) -> Vec<f64> {
+        let room = (self.width - LEFT - RIGHT) / (self.x.1 - self.x.0);
+        let factors: &[f64] = match room {
+            ..60.0 => &[1.0],
+            60.0..120.0 => &[1.0, 3.0],
+            _ => &[1.0, 2.0, 5.0],
+        };
+        let decades = self.x.0.floor() as i32..=self.x.1.ceil() as i32;
+        // Divided, as 3 / 10 is 0.3 and 3 * 0.1 is not.
+        let at = |f: f64, d: i32| if d < 0 { f / 10f64.powi(-d) } else { f * 10f64.powi(d) };
+        let ticks = decades.flat_map(|d| factors.iter().map(move |&f| at(f, d)));
+        ticks.filter(|t| (self.x.0..=self.x.1).contains(&t.log10())).collect()
+    }
+}
+
+/// Draws a panel of series of which each has a point.
+pub(super) fn panel(measure: Measure, series: &[Series]) -> String {
+    let axes = Axes::around(measure, series);
+    let (right, bottom) = (axes.width - RIGHT, ROW - BOTTOM);
+    let (cost, quality) = measure.names();
+    // writing to a String cannot fail
+    let mut svg = String::new();
+    let _ = writeln!(svg, "<text class=\"panel\" x=\"{LEFT}\" y=\"15\">{quality}</text>");
+    for tick in axes.ticks() {
+        let x = axes.px(tick);
+        let _ = writeln!(svg, "<line class=\"grid\" x1=\"{x:.1}\" y1=\"{TOP}\" x2=\"{x:.1}\" y2=\"{bottom}\"/>");
+        let _ = writeln!(
+            svg,
+            "<text class=\"tick\" x=\"{x:.1}\" y=\"{}\" text-anchor=\"middle\">{}</text>",
+            bottom + 15.0,
+            short(tick)
+        );
+    }
+    let steps = ((axes.y.1 - axes.y.0) / axes.step).round() as i32;
+    let digits = (0..3).find(|&d| (axes.step * 10f64.powi(d)).fract().abs() < 1e-9).unwrap_or(3) as usize;
+    for k in 0..=steps {
+        let value = axes.y.0 + f64::from(k) * axes.step;
+        let y = axes.py(value);
+        let _ = writeln!(svg, "<line class=\"grid\" x1=\"{LEFT}\" y1=\"{y:.1}\" x2=\"{right}\" y2=\"{y:.1}\"/>");
+        let _ = writeln!(
+            svg,
+            "<text class=\"tick\" x=\"{}\" y=\"{:.1}\" text-anchor=\"end\">{value:.digits$}</text>",
+            LEFT - 6.0,
+            y + 4.0
+        );
+    }
+    let _ = writeln!(svg, "<path class=\"axis\" d=\"M{LEFT} {TOP}V{bottom}H{right}\"/>");
+    let middle = 0.5 * (LEFT + right);
+    let _ = writeln!(
+        svg,
+        "<text class=\"label\" x=\"{middle}\" y=\"{}\" text-anchor=\"middle\">{cost} (log scale)</text>",
+        bottom + 32.0
+    );
+    series.iter().for_each(|one| line(&mut svg, &axes, one));
+    let mut values: Vec<(f64, f64)> = Vec::new();
+    series.iter().for_each(|one| value(&mut svg, &axes, measure, one, &mut values));
+    svg
+}
+
+/// Draws a line through points.
+fn line(svg: &mut String, axes: &Axes, series: &Series) {
+    let places: Vec<String> =
+        series.points.iter().map(|p| format!("{:.1} {:.1}", axes.px(p.x), axes.py(p.y))).collect();
+    let class = &series.class;
+    if places.len() > 1 {
+        let _ = writeln!(svg, "<path class=\"line {class}\" d=\"M{}\"/>", places.join("L"));
+    }
+    for p in &series.points {
+        let (x, y) = (axes.px(p.x), axes.py(p.y));
+        let _ = writeln!(
+            svg,
+            "<circle class=\"dot {class}\" cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"2.6\"><title>{}</title></circle>",
+            escape(&p.title)
+        );
+    }
+}
+
+/// Writes the value at a line's end, clear of the `values` written before.
+fn value(svg: &mut String, axes: &Axes, measure: Measure, series: &Series, values: &mut Vec<(f64, f64)>) {
+    let class = &series.class;
+    if let Some(last) = series.points.last() {
+        let digits = measure.span().1;
+        let (x, dot) = (axes.px(last.x).clamp(LEFT + 34.0, axes.width - RIGHT), axes.py(last.y));
+        let taken = |y: f64| values.iter().any(|v| (v.0 - x).abs() < 36.0 && (v.1 - y).abs() < 12.0);
+        let inside = |y: f64| (TOP..ROW - BOTTOM - 2.0).contains(&y);
+        let y = [-8.0, 16.0, -20.0, 28.0, -32.0, 40.0].map(|shift| dot + shift);
+        let y = y.into_iter().find(|&y| !taken(y) && inside(y)).unwrap_or(dot - 8.0);
+        values.push((x, y));
+        let _ = writeln!(
+            svg,
+            "<text class=\"value {class}\" x=\"{x:.1}\" y=\"{y:.1}\" text-anchor=\"end\">{:.digits$}</text>",
+            last.y
+        );
+    }
+}
+
+/// A number in few letters: 12000 is 12k.
+fn short(value: f64) -> String {
+    match value {
+        1e6.. => format!("{}M", value / 1e6),
+        1e4.. => format!("{}k", value / 1e3),
+        _ => format!("{value}"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::tests::line;
+
+    fn axes(points: &[(f64, f64)]) -> Axes {
+        let points = Measure::PsnrOverTime.curve(&line("plat", "fox", points));
+        Axes::around(Measure::PsnrOverTime, &[Series { label: "plat".into(), class: "c0".into(), points }])
+    }
+
+    #[test]
+    fn faster_is_further_left_and_better_is_higher() {
+        let narrow = axes(&[(1.0, 15.0), (100.0, 28.0)]);
+        assert!(narrow.px(1.0) < narrow.px(10.0) && narrow.py(28.0) < narrow.py(15.0));
+        assert!(narrow.px(1.0) >= LEFT && narrow.py(28.0) >= TOP);
+        let middle = 0.5 * (narrow.px(1.0) + narrow.px(100.0));
+        assert!((narrow.px(10.0) - middle).abs() < 1e-9, "the axis is logarithmic");
+        let ticks = axes(&[(0.2, 15.0), (1000.0, 28.0)]).ticks();
+        assert!(ticks.iter().all(|tick| tick.to_string().len() <= 4), "{ticks:?}");
+    }
+
+    #[test]
+    fn ticks_of_splats_are_short_and_keep_clear() {
+        let mut run = line("plat", "fox", &[(1.0, 15.0)]);
+        run.splats = Some(2_000);
+        let mut other = run.clone();
+        other.splats = Some(3_000_000);
+        let points = [run, other].iter().flat_map(|run| Measure::PsnrOverSplats.end(run, "")).collect();
+        let series = [Series { label: "plat".into(), class: "c0".into(), points }];
+        let axes = Axes::around(Measure::PsnrOverSplats, &series);
+        let ticks = axes.ticks();
+        assert!(ticks.windows(2).all(|w| axes.px(w[1]) - axes.px(w[0]) > 20.0), "{ticks:?}");
+        assert!(ticks.len() > 2 && ticks.iter().all(|&tick| short(tick).len() <= 4), "{ticks:?}");
+    }
+}

@@ -1,0 +1,209 @@
+//! Time of the stages on a GPU: by the device's own clock where it can be read within a pass; else by the wall, as a pass that ends
+//! with the stage less one that ends before it, each submitted and waited for.
+//!
+//! What whole passes take is measured beside that, with nobody watching.
+
+use std::sync::Arc;
+
+use ::render::cpu::Stage;
+use ::render::gpu::{Gpu, GpuError, GpuRenderer, GpuSplats, UpstreamPlanes};
+use bench::parts::{Kernels, StageTime};
+use scene::Camera;
+
+use super::{Scene, WARM_UP, bytes, median};
+use crate::args::KernelsArgs;
+use crate::clock::Stopwatch;
+use crate::commands::bench::invoked;
+use crate::failure::Failure;
+use crate::record::commit;
+
+pub(super) fn time(gpu: &Arc<Gpu>, args: &KernelsArgs, scene: &Scene) -> Result<Kernels, Failure> {
+    let mut bench = Bench::new(gpu, scene).map_err(failed)?;
+    let mut millis: [Vec<f64>; 4] = Default::default();
+    let mut stages: Vec<(Stage, Vec<f64>)> = Vec::new();
+    for pass in 0..WARM_UP + args.passes as usize {
+        let camera = &scene.cameras[pass % scene.cameras.len()];
+        let of_pass = bench.pass(camera).map_err(failed)?;
+        if pass >= WARM_UP {
+            millis.iter_mut().zip(of_pass.millis).for_each(|(all, value)| all.push(value));
+            for (stage, value) in of_pass.stages {
+                match stages.iter_mut().find(|(of, _)| *of == stage) {
+                    Some((_, all)) => all.push(value),
+                    None => stages.push((stage, vec![value])),
+                }
+            }
+        }
+    }
+    let [forward_cpu_millis, backward_cpu_millis, forward_wall_millis, backward_wall_millis] = millis.map(median);
+    let pairs = u64::from(bench.renderer.status().map_err(failed)?.pairs);
+    let at = |(stage, all): (Stage, Vec<f64>)| {
+        let device_millis = median(all);
+        let gbytes = bytes(stage, &scene.splats, pairs as f64).map(|bytes| bytes / (1e6 * device_millis.max(1e-9)));
+        let stage = stage.name().to_owned();
+        StageTime {
+            stage,
+            cpu_millis: None,
+            device_millis: Some(device_millis),
+            gflops: None,
+            gbytes,
+            of_ceiling: None,
+        }
+    };
+    Ok(Kernels {
+        commit: commit().to_owned(),
+        machine: bench::machine(),
+        backend: gpu.name().to_owned(),
+        adapter_class: Some(gpu.class().to_owned()),
+        threads: args.threads,
+        splats: scene.splats.len() as u64,
+        width: args.size.width,
+        height: args.size.height,
+        pairs,
+        visits: None,
+        ceiling_gflops: None,
+        ceiling_gbytes: None,
+        stages: stages.into_iter().map(at).collect(),
+        clock: Some(if bench.has_clock { "device" } else { "wall" }.to_owned()),
+        forward_cpu_millis,
+        backward_cpu_millis,
+        forward_wall_millis,
+        backward_wall_millis,
+        command: invoked(),
+    })
+}
+
+/// Forward and backward of a scene.
+struct Bench<'a> {
+    gpu: &'a Arc<Gpu>,
+    renderer: GpuRenderer,
+    splats: GpuSplats,
+    scene: &'a Scene,
+    /// Whether the device's clock is read.
+    has_clock: bool,
+}
+
+/// What a view took, milliseconds.
+struct Pass {
+    /// Forward and backward: CPU, then wall.
+    millis: [f64; 4],
+    stages: Vec<(Stage, f64)>,
+}
+
+#[derive(Clone, Copy)]
+enum Direction {
+    Forward,
+    Backward,
+}
+
+impl<'a> Bench<'a> {
+    fn new(gpu: &'a Arc<Gpu>, scene: &'a Scene) -> Result<Self, GpuError> {
+        let renderer = GpuRenderer::new(gpu.clone())?;
+        let splats = GpuSplats::upload(gpu, &scene.splats, 0)?;
+        Ok(Self { gpu, renderer, splats, scene, has_clock: gpu.has_clock() })
+    }
+
+    fn pass(&mut self, camera: &Camera) -> Result<Pass, GpuError> {
+        // Makes room, so that what is timed is drawn.
+        self.renderer.draw(&self.splats, None, camera, &self.scene.options)?;
+        let area = camera.pinhole.width as usize * camera.pinhole.height as usize;
+        let mut encoder = self.gpu.encoder();
+        self.gpu.write(&mut encoder, self.renderer.upstream(), 0, &vec![1e-3f32; 3 * area]);
+        self.gpu.submit(encoder)?;
+        self.gpu.wait()?;
+        let (forward, mut stages) = self.timed(Direction::Forward, camera)?;
+        let (backward, of_backward) = self.timed(Direction::Backward, camera)?;
+        stages.extend(of_backward);
+        Ok(Pass { millis: [forward[0], backward[0], forward[1], backward[1]], stages })
+    }
+
+    /// CPU and wall milliseconds of all of it, and those of each stage.
+    fn timed(&mut self, direction: Direction, camera: &Camera) -> Result<([f64; 2], Vec<(Stage, f64)>), GpuError> {
+        let all = self.once(direction, camera)?;
+        self.gpu.watch(usize::MAX);
+        self.once(direction, camera)?;
+        let dispatched = self.gpu.watched()?;
+        // The place of each stage's last dispatch.
+        let mut ends: Vec<(Stage, usize)> = Vec::new();
+        for (n, dispatch) in dispatched.iter().enumerate() {
+            match ends.last_mut().filter(|(stage, _)| *stage == dispatch.stage) {
+                Some((_, end)) => *end = n,
+                None => ends.push((dispatch.stage, n)),
+            }
+        }
+        let (mut stages, mut before) = (Vec::new(), 0.0);
+        if !self.has_clock {
+            before = self.up_to(direction, camera, 0)?;
+        }
+        for (stage, last) in ends {
+            let ended = match dispatched[last].ended_nanos.filter(|_| self.has_clock) {
+                Some(nanos) => 1e-6 * nanos,
+                None => self.up_to(direction, camera, last + 1)?,
+            };
+            // By the wall, noise may be more than a short stage takes.
+            stages.push((stage, (ended - before).max(0.0)));
+            before = ended;
+        }
+        if !self.has_clock {
+            // The backward pass goes on from a whole view.
+            self.once(Direction::Forward, camera)?;
+        }
+        Ok((all, stages))
+    }
+
+    /// Wall milliseconds of so many dispatches.
+    fn up_to(&mut self, direction: Direction, camera: &Camera, most: usize) -> Result<f64, GpuError> {
+        self.gpu.watch(most);
+        let [_, wall] = self.once(direction, camera)?;
+        self.gpu.watched().map(|_| wall)
+    }
+
+    /// CPU and wall milliseconds, from the first command to the end.
+    fn once(&mut self, direction: Direction, camera: &Camera) -> Result<[f64; 2], GpuError> {
+        let clock = Stopwatch::start();
+        let mut encoder = self.gpu.encoder();
+        match direction {
+            Direction::Forward => {
+                self.renderer.forward(&mut encoder, &self.splats, None, camera, &self.scene.options)?;
+            }
+            Direction::Backward => self.renderer.backward(&mut encoder, &self.splats, UpstreamPlanes::default())?,
+        }
+        self.gpu.submit(encoder)?;
+        self.gpu.wait()?;
+        Ok([1e3 * clock.cpu_seconds(), 1e3 * clock.wall_seconds()])
+    }
+}
+
+pub(super) fn failed(error: GpuError) -> Failure {
+    Failure::Work(error.to_string())
+}
+
+#[cfg(test)]
+mod tests {
+    use ::render::Options;
+
+    use super::*;
+    use crate::args::Size;
+    use crate::commands::kernels::{cloud, front};
+
+    #[test]
+    fn the_wall_clock_knows_the_same_stages_and_changes_no_picture() {
+        let gpu = match Gpu::open() {
+            Ok(gpu) => gpu,
+            Err(error) if std::env::var("PLAT_GPU").is_ok_and(|value| value == "required") => panic!("{error}"),
+            Err(error) => return println!("skipped: no adapter ({error})"),
+        };
+        let camera = front(Size { width: 48, height: 32 });
+        let scene = Scene { splats: cloud(100), options: Options::default(), cameras: vec![camera] };
+        let mut bench = Bench::new(&gpu, &scene).unwrap();
+        let usual = bench.renderer.draw(&bench.splats, None, &camera, &scene.options).unwrap();
+        for has_clock in [gpu.has_clock(), false] {
+            bench.has_clock = has_clock;
+            let pass = bench.pass(&camera).unwrap();
+            let stages: Vec<Stage> = pass.stages.iter().map(|(stage, _)| *stage).collect();
+            assert_eq!(stages, Stage::ALL);
+            assert!(pass.stages.iter().map(|(_, millis)| millis).sum::<f64>() > 0.0, "{:?}", pass.stages);
+            assert!(pass.millis.iter().all(|&millis| millis > 0.0));
+            assert!(bench.renderer.read_frame().unwrap() == usual, "timing leaves half a picture");
+        }
+    }
+}

@@ -1,0 +1,77 @@
+//! The variants of training that `plat bench ablate` compares: each takes away one of the recipe's accelerations, or turns on one
+//! that it has a switch for.
+//!
+//! To add one: a row here.
+
+use train::Recipe;
+use train::growth::Growth;
+
+/// A variant.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Variant {
+    /// What the lines call it.
+    pub(crate) name: &'static str,
+    /// What it is, and where what it takes away or adds comes from.
+    pub(crate) about: &'static str,
+    /// The usual recipe made into this one.
+    pub(crate) recipe: fn(Recipe) -> Recipe,
+}
+
+/// What the others are compared with.
+pub(crate) const DEFAULT: &str = "default";
+
+/// All of them.
+pub(crate) const VARIANTS: [Variant; 6] = [
+    Variant { name: DEFAULT, about: "the recipe as it is", recipe: |recipe| recipe },
+    Variant {
+        name: "fine",
+        about: "full resolution from the first step; without coarse-to-fine resolution (DashGaussian, Chen et al. 2025)",
+        recipe: |recipe| Recipe { coarse: Vec::new(), ..recipe },
+    },
+    Variant {
+        name: "by-the-clock",
+        about: "finer pixels after fixed shares of the steps, not once the error has come down to what they show (train/src/need.rs)",
+        recipe: |recipe| Recipe { closer_at: 0.0, ..recipe },
+    },
+    Variant {
+        name: "all-at-once",
+        about: "all splats within a tenth of the steps, as fast as doubling goes; without a growth schedule (Taming 3DGS, Mallick et al. 2024)",
+        recipe: |recipe| {
+            // Worth is judged over a long growth: here it would only cut the short one off.
+            let growth = Growth { from: 0.0, until: 0.1, at_most: 1.0, worth_db: 0.0, ..recipe.growth };
+            Recipe { growth, ..recipe }
+        },
+    },
+    Variant {
+        name: "all-colours",
+        about: "SH degree 3 from the first step; without degrees that join later (3DGS, Kerbl et al. 2023)",
+        recipe: |recipe| Recipe { sh_from: [0.0; 3], ..recipe },
+    },
+    Variant {
+        name: "all-growth",
+        about: "growth to the budget, whatever it brings; without its early end (train/src/need.rs)",
+        recipe: |recipe| Recipe { growth: Growth { worth_db: 0.0, ..recipe.growth }, ..recipe },
+    },
+];
+
+/// The variant of this name.
+pub(crate) fn named(name: &str) -> Result<Variant, String> {
+    let names = || VARIANTS.map(|variant| variant.name).join(", ");
+    VARIANTS.into_iter().find(|variant| variant.name == name).ok_or_else(|| format!("give one of {}", names()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_variant_has_a_name_of_its_own_and_changes_the_recipe() {
+        let recipes: Vec<Recipe> = VARIANTS.iter().map(|variant| (variant.recipe)(Recipe::default())).collect();
+        for (i, variant) in VARIANTS.iter().enumerate() {
+            assert_eq!(named(variant.name).unwrap().about, variant.about);
+            assert!(recipes[..i].iter().all(|before| *before != recipes[i]), "{} is another", variant.name);
+        }
+        assert_eq!(recipes[0], Recipe::default());
+        assert!(named("fast").unwrap_err().contains("all-at-once"));
+    }
+}
