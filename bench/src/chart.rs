@@ -23,6 +23,9 @@ const COLOURS: [(&str, &str); 6] = [
     ("#5b4bc4", "#a99cff"),
 ];
 
+/// A scene and its panels.
+type Row<'a> = (&'a str, Vec<(Measure, Vec<Series>)>);
+
 /// Draws the latest run of each scene and label (of several seeds the mean), and the references dashed. A run with one
 /// configuration is its curve over time; of several, as a sweep leaves, each is a point and a line joins them. Measures that nobody has of a scene
 /// have no panel there, scenes with neither run nor reference no row.
@@ -30,7 +33,7 @@ pub fn chart(lines: &[ResultLine], reference: &[ResultLine]) -> String {
     let [runs, references] = [lines, reference].map(averaged);
     let scenes = scenes(runs.iter().chain(&references).map(|run| &run.line));
     let labels = labels(&runs);
-    let rows: Vec<(&str, Vec<(Measure, Vec<Series>)>)> = (scenes.iter())
+    let rows: Vec<Row> = (scenes.iter())
         .map(|&scene| {
             let with_points = Measure::ALL.into_iter().map(|measure| {
                 let series = |runs, labels| series_of(runs, scene, measure, labels);
@@ -39,9 +42,7 @@ pub fn chart(lines: &[ResultLine], reference: &[ResultLine]) -> String {
             (scene, with_points.filter(|(_, series)| !series.is_empty()).collect())
         })
         .collect();
-    let width_of = |(_, panels): &(&str, Vec<(Measure, Vec<Series>)>)| -> f64 {
-        panels.iter().map(|(measure, _)| measure.width() + GAP).sum()
-    };
+    let width_of = |(_, panels): &Row| -> f64 { panels.iter().map(|(measure, _)| measure.width() + GAP).sum() };
     let width = rows.iter().map(width_of).fold(Measure::ALL[0].width(), f64::max) + 2.0 * LEFT;
     let names: Vec<&str> = references.iter().map(|run| run.line.label.as_str()).collect();
     let (legend, header) = legend(&labels, &names, width - 26.0);

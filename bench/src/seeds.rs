@@ -34,9 +34,9 @@ pub fn averaged(lines: &[ResultLine]) -> Vec<Averaged> {
         let distinct: Vec<&ResultLine> =
             all.iter().enumerate().filter(|&(i, line)| new((i, line))).map(|(_, line)| *line).collect();
         let of_settings = |of: &&ResultLine| {
-            let alike = all.iter().filter(|line| settings(line) == settings(of));
-            let by_seed: BTreeMap<Option<u64>, &ResultLine> = alike.clone().map(|line| (line.seed, *line)).collect();
-            let last = alike.last().expect("it is one");
+            let mut alike = all.iter().copied().filter(|line| settings(line) == settings(of));
+            let by_seed: BTreeMap<Option<u64>, &ResultLine> = alike.clone().map(|line| (line.seed, line)).collect();
+            let last = alike.next_back().expect("it is one");
             mean(last, &by_seed.into_values().collect::<Vec<_>>(), variant(of, &distinct))
         };
         distinct.iter().map(of_settings).collect()

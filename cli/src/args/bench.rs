@@ -12,7 +12,7 @@ use crate::variants::{self, VARIANTS, Variant};
 #[derive(Debug, Subcommand)]
 pub(crate) enum BenchCommand {
     /// Train every combination of some captures and settings, measure the results, and append a line for each
-    Pareto(ParetoArgs),
+    Pareto(Box<ParetoArgs>),
     /// Redraw the chart and the README's table from all results
     Chart(ChartArgs),
     /// Time the renderer's forward and backward passes

@@ -299,7 +299,8 @@ mod tests {
         let scene = scene();
         let sound = drawn(&scene);
         assert!(within(&sound, &sound).iter().all(|&within| within));
-        let damages: [(Stage, fn(&mut Drawn)); 7] = [
+        type Damage = fn(&mut Drawn);
+        let damages: [(Stage, Damage); 7] = [
             (Stage::Project, |d| d.stages.records[7][4] += 0.1),
             (Stage::Sort, |d| {
                 d.stages.order.swap(3, 200);

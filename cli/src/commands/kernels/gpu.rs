@@ -82,11 +82,14 @@ struct Bench<'a> {
     has_clock: bool,
 }
 
+/// Milliseconds of each stage, in their order.
+type Stages = Vec<(Stage, f64)>;
+
 /// What a view took, milliseconds.
 struct Pass {
     /// Forward and backward: CPU, then wall.
     millis: [f64; 4],
-    stages: Vec<(Stage, f64)>,
+    stages: Stages,
 }
 
 #[derive(Clone, Copy)]
@@ -117,7 +120,7 @@ impl<'a> Bench<'a> {
     }
 
     /// CPU and wall milliseconds of all of it, and those of each stage.
-    fn timed(&mut self, direction: Direction, camera: &Camera) -> Result<([f64; 2], Vec<(Stage, f64)>), GpuError> {
+    fn timed(&mut self, direction: Direction, camera: &Camera) -> Result<([f64; 2], Stages), GpuError> {
         let all = self.once(direction, camera)?;
         self.gpu.watch(usize::MAX);
         self.once(direction, camera)?;
