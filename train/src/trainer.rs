@@ -45,6 +45,10 @@ pub struct Recipe {
     pub needle_pull: f32,
     /// Each entry is the share of the steps after which the next SH degree joins.
     pub sh_from: [f32; 3],
+    /// Coefficients beyond the constant one move every so many steps.
+    pub sh_every: u32,
+    /// How much views that are off get more steps than others: 0 all alike, 1 in proportion to their error.
+    pub by_error: f32,
     /// Each entry is the largest share of the steps that is trained at one mip coarser than the next, coarsest first.
     pub coarse: Vec<f32>,
     /// Finer pixels are looked at once the error is this many times what coarse photos lack (see [`crate::need`]); with 0 only
@@ -71,6 +75,8 @@ impl Default for Recipe {
             opacity_pull: 0.0,
             needle_pull: 0.01,
             sh_from: [0.3, 0.45, 0.6],
+            sh_every: 1,
+            by_error: 0.0,
             coarse: vec![0.2, 0.5],
             closer_at: 2.0,
             initial_opacity: 0.1,
@@ -305,7 +311,11 @@ pub fn train_on(
             return Err(TrainError::Empty(step));
         }
         let progress = step as f32 / steps as f32;
-        let view = pick(views, job.seed, step);
+        let picked = match recipe.by_error > 0.0 {
+            true => now.need.next_view(views.len(), recipe.by_error),
+            false => pick(views.len(), job.seed, step),
+        };
+        let view = &views[picked];
         let coarser = (recipe.coarse.len() as u8).saturating_sub(now.need.stage);
         let (mip, rect, camera) = (0..=coarser).rev().find_map(|c| view.at(c)).expect("at(0) always is");
         let photo = job.source.window(view.view, mip, rect).map_err(TrainError::Source)?;
@@ -318,8 +328,10 @@ pub fn train_on(
             extras: context.is_some(),
         };
         let visits = (steps as f32 / views.len() as f32).max(1.0);
+        let moved = if step.is_multiple_of(recipe.sh_every.max(1)) { options.sh_degree } else { 0 };
         let drawn = Step {
             view: view.view,
+            moved_degree: moved,
             photo,
             camera,
             options,
@@ -328,6 +340,10 @@ pub fn train_on(
             exposure_rate: between(recipe.exposure, progress) / visits,
         };
         side.step(&mut now, drawn)?;
+        if recipe.by_error > 0.0 {
+            side.fetch(&mut now, Part::Tally)?;
+            now.need.saw(picked);
+        }
 
         let growth = &recipe.growth;
         now.step = step + 1;
@@ -356,6 +372,22 @@ pub fn train_on(
         if now.step.is_multiple_of(every) && progress >= growth.from && now.step <= until + every && now.step < steps {
             let target = growth.target(now.step, steps, now.start_count, budget);
             side.fetch(&mut now, Part::All)?;
+            if growth.consistent_views > 0 {
+                let seed = random::bits(job.seed, u64::from(now.step) | 1 << 40);
+                let order = random::shuffle(seed, views.len());
+                let some: Vec<TrainView> =
+                    order.iter().take(growth.consistent_views as usize).map(|&i| views[i as usize]).collect();
+                let options = Options { sh_degree: now.splats.sh_degree(), ..options };
+                growth::only_where_views_agree(
+                    &mut now.evidence,
+                    &now.splats,
+                    context,
+                    &some,
+                    coarser,
+                    &options,
+                    job.source,
+                )?;
+            }
             let (grown, rows, _) = growth::refine(&now.splats, &mut now.evidence, growth, target, counts, keeps);
             now.splats = grown;
             now.adam.rearrange(&rows);
@@ -377,10 +409,10 @@ pub fn train_on(
 }
 
 /// Every view once per epoch, each epoch in another order.
-fn pick(views: &[TrainView], seed: u64, step: u32) -> &TrainView {
-    let n = views.len() as u32;
-    let order = random::shuffle(random::bits(seed, u64::from(step / n)), views.len());
-    &views[order[(step % n) as usize] as usize]
+fn pick(views: usize, seed: u64, step: u32) -> usize {
+    let n = views as u32;
+    let order = random::shuffle(random::bits(seed, u64::from(step / n)), views);
+    order[(step % n) as usize] as usize
 }
 
 /// A step size at a share of the way: geometric between first and last.
