@@ -1,7 +1,7 @@
 //! Hosts the scheduler on the wire: takes jobs in, hands tasks out, commits results, tells whoever watches.
 //!
 //! ```text
-//! gRPC calls (service) ──▶ one channel ──▶ the owner task (jobs: cluster::Scheduler per job) ──▶ replies, watch streams
+//! gRPC calls (service) ──▶ one channel ──▶ the owner task (jobs: one cluster::Scheduler) ──▶ replies, watch streams (news)
 //! ```
 //!
 //! Architecture invariant: it links no GPU and no trainer and never touches splat bytes; the only artefact that it reads
@@ -9,6 +9,7 @@
 
 mod jobs;
 mod local;
+mod news;
 mod service;
 
 use std::future::Future;
@@ -46,12 +47,16 @@ pub struct Options {
     pub wait_millis: u32,
     /// Whether workers may go home once all jobs are over; otherwise they wait for the next job.
     pub drain: bool,
+    /// What tells its grants from those of any earlier coordinator of the same workers: higher than theirs, at least 1.
+    pub epoch: u64,
+    /// Gets what the scheduler hears, line by line, as `cluster::journal` replays it. It ends where the channel is full.
+    pub journal: Option<mpsc::Sender<String>>,
 }
 
 impl Options {
-    /// The defaults: 30 s leases, 200 ms waits, workers stay.
+    /// The defaults: 30 s leases, 200 ms waits, workers stay, no journal.
     pub fn new(store: Store) -> Self {
-        Self { store, settings: Settings::default(), wait_millis: 200, drain: false }
+        Self { store, settings: Settings::default(), wait_millis: 200, drain: false, epoch: 1, journal: None }
     }
 }
 

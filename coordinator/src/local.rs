@@ -34,7 +34,8 @@ pub enum LocalError {
 
 /// Runs a plan that lies in `options.store` to its end: hosts a coordinator on 127.0.0.1, starts `workers` workers with
 /// `start_worker(coordinator_url, number, shutdown)`, submits the plan and hands every news of the job to `on_news`.
-/// Returns the tasks' results in the plan's order. `options.drain` is taken as true.
+/// Returns the tasks' results in the plan's order. `options.drain` is taken as true, and the workers are taken to share
+/// one machine ([`Settings::one_machine`](cluster::Settings::one_machine)).
 ///
 /// When `stop` is cancelled the job is cancelled and the workers are told. (The workers come in as a function because a
 /// coordinator must not depend on what trains.)
@@ -60,8 +61,8 @@ where
     let home = CancellationToken::new();
     // If this future is dropped, everything that it started ends.
     let _dropped = home.clone().drop_guard();
-    let server =
-        tokio::spawn(serve(listener, Options { drain: true, ..options }, home.child_token().cancelled_owned()));
+    let hosting = Options { drain: true, settings: options.settings.one_machine(), ..options };
+    let server = tokio::spawn(serve(listener, hosting, home.child_token().cancelled_owned()));
 
     let channel = Endpoint::from_shared(url.clone()).map_err(failed("the coordinator's address"))?.connect_lazy();
     let mut client = proto::client(channel);

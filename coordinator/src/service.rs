@@ -1,14 +1,15 @@
 //! The calls of the wire: checks what came in, asks the owner of the state, answers.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::pin::Pin;
 
 use blocks::Plan;
-use cluster::{FailureKind, TaskIndex, TaskNode};
+use cluster::{Failure, FailureKind, JobSpec, Offer, TaskIndex, TaskNode};
 use proto::coordinator_server::Coordinator;
 use proto::{
-    AttemptReply, CancelReply, CancelRequest, CompleteRequest, FailRequest, LeaseReply, LeaseRequest, ReportReply,
-    ReportRequest, StatusReply, StatusRequest, SubmitReply, SubmitRequest, WatchEvent, WatchRequest,
+    AttemptReply, CancelReply, CancelRequest, CompleteRequest, ControlReply, ControlRequest, FailRequest, LeaseReply,
+    LeaseRequest, ReportReply, ReportRequest, StatusReply, StatusRequest, SubmitReply, SubmitRequest, WatchEvent,
+    WatchRequest,
 };
 use scene::{ArtefactId, BlockId, CodecError};
 use store::{Store, StoreError};
@@ -51,8 +52,8 @@ impl Service {
         answer.await.map_err(|_| gone())?
     }
 
-    /// Reads a plan: its backend and its tasks' dependencies.
-    async fn read_plan(&self, id: ArtefactId) -> Result<(String, Vec<TaskNode>), Status> {
+    /// Reads a plan as the scheduler sees it.
+    async fn read_plan(&self, id: ArtefactId) -> Result<JobSpec, Status> {
         match self.store.size(id).await.map_err(store_status)? {
             Some(bytes) if bytes > PLAN_BYTES_LIMIT => {
                 return Err(Status::invalid_argument(format!("artefact {id} is too large for a plan: {bytes} bytes")));
@@ -62,7 +63,7 @@ impl Service {
         let bytes = self.store.get(id).await.map_err(store_status)?;
         let read = tokio::task::spawn_blocking(move || {
             let plan = Plan::from_frame(&bytes)?;
-            Ok((plan.backend.clone(), dag_of(&plan)?))
+            Ok(JobSpec { backend: plan.backend.clone(), priority: 0, weight: 1, tasks: dag_of(&plan)? })
         });
         read.await
             .map_err(|_| Status::internal("the plan could not be read"))?
@@ -79,9 +80,21 @@ fn dag_of(plan: &Plan) -> Result<Vec<TaskNode>, CodecError> {
             let missing = || CodecError::new(format!("task {} needs block {block}, which has no task", task.block));
             index.get(block).copied().map(TaskIndex).ok_or_else(missing)
         });
-        Ok(TaskNode { dependencies: found.collect::<Result<_, CodecError>>()? })
+        Ok(TaskNode {
+            dependencies: found.collect::<Result<_, CodecError>>()?,
+            work: work_of(task),
+            memory_bytes: task.memory_bytes,
+        })
     };
     plan.tasks.iter().map(node).collect()
+}
+
+/// About the CPU milliseconds that a task takes, by the prices of a step: ARCHITECTURE, "a step is priced". What counts are the
+/// ratios between tasks; speeds are learnt in the same measure.
+fn work_of(task: &blocks::Task) -> u64 {
+    let pixels = task.window_pixels() / task.views.len().max(1) as u64;
+    let tenth_micros = 2 * pixels + u64::from(task.drawn) + 2 * u64::from(task.budget);
+    u64::from(task.steps).saturating_mul(tenth_micros) / 10_000
 }
 
 fn store_status(error: StoreError) -> Status {
@@ -106,17 +119,24 @@ impl Coordinator for Service {
             return Err(Status::failed_precondition(problem));
         }
         let plan = proto::artefact_id(&request.plan)?;
-        let (backend, dag) = self.read_plan(plan).await?;
-        let tasks = dag.len() as u32;
-        let job = self.ask(move |jobs, now| jobs.submit(now, plan, backend, dag)).await?;
+        let spec = self.read_plan(plan).await?;
+        let tasks = spec.tasks.len() as u32;
+        let job = self.ask(move |jobs, now| jobs.submit(now, plan, spec)).await?;
         Ok(Response::new(SubmitReply { job, tasks }))
     }
 
     async fn lease(&self, request: Request<LeaseRequest>) -> Answer<LeaseReply> {
-        let LeaseRequest { worker, backend } = request.into_inner();
+        let LeaseRequest { worker, backend, memory_bytes, cached } = request.into_inner();
         proto::check_name("worker", &worker)?;
         proto::check_name("backend", &backend)?;
-        let reply = self.ask(move |jobs, now| jobs.lease(now, &worker, &backend)).await?;
+        if cached.len() > cluster::CACHED_LIMIT {
+            let problem = format!("a call names {} cached artefacts, at most {}", cached.len(), cluster::CACHED_LIMIT);
+            return Err(Status::invalid_argument(problem));
+        }
+        let cached = cached.iter().map(|id| proto::artefact_id(id)).collect::<Result<BTreeSet<_>, Status>>()?;
+        let cached = cached.into_iter().collect();
+        let offer = Offer { backend, memory_bytes, cached };
+        let reply = self.ask(move |jobs, now| jobs.lease(now, &worker, offer)).await?;
         Ok(Response::new(LeaseReply { reply: Some(reply) }))
     }
 
@@ -144,9 +164,11 @@ impl Coordinator for Service {
             proto::FailureKind::Work => FailureKind::Work,
             proto::FailureKind::Input => FailureKind::Input,
             proto::FailureKind::GivenBack => FailureKind::GivenBack,
+            proto::FailureKind::Infrastructure => FailureKind::Infrastructure,
+            proto::FailureKind::OutOfMemory => FailureKind::OutOfMemory,
         };
         let (attempt, message) = (attempt_of(request.attempt)?, proto::one_line(&request.message));
-        let accepted = self.ask(move |jobs, now| jobs.fail(now, attempt, kind, message)).await?;
+        let accepted = self.ask(move |jobs, now| jobs.fail(now, attempt, Failure { kind, message })).await?;
         Ok(Response::new(AttemptReply { accepted }))
     }
 
@@ -171,5 +193,12 @@ impl Coordinator for Service {
         let job = request.into_inner().job;
         self.ask(move |jobs, now| jobs.cancel(now, job)).await?;
         Ok(Response::new(CancelReply {}))
+    }
+
+    async fn control(&self, request: Request<ControlRequest>) -> Answer<ControlReply> {
+        let ControlRequest { job, what } = request.into_inner();
+        let what = what.ok_or_else(|| Status::invalid_argument("the call says nothing that this coordinator knows"))?;
+        self.ask(move |jobs, now| jobs.control(now, job, what)).await?;
+        Ok(Response::new(ControlReply {}))
     }
 }

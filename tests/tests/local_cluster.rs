@@ -241,7 +241,7 @@ async fn host(lease_millis: u64) -> (CoordinatorClient<Channel>, String, u64, Ca
 /// Asks until there is a grant, though not for ever.
 async fn lease(client: &mut CoordinatorClient<Channel>, worker: &str) -> proto::Attempt {
     for _ in 0..10_000 {
-        let request = proto::LeaseRequest { worker: worker.into(), backend: BACKEND.into() };
+        let request = proto::LeaseRequest { worker: worker.into(), backend: BACKEND.into(), ..Default::default() };
         match client.lease(request).await.unwrap().into_inner().reply.unwrap() {
             Reply::Grant(grant) => return grant.attempt.unwrap(),
             Reply::WaitMillis(millis) => tokio::time::sleep(Duration::from_millis(millis.into())).await,
@@ -319,15 +319,65 @@ async fn a_quiet_executor_keeps_its_lease() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn a_job_is_paused_resumed_and_retried_and_its_journal_replays() {
+    let (store, plan) = stored_plan().await;
+    let (journal, mut lines) = tokio::sync::mpsc::channel(10_000);
+    let options = Options { wait_millis: 5, epoch: 7, journal: Some(journal), ..Options::new(store.clone()) };
+    let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let url = format!("http://{}", listener.local_addr().unwrap());
+    let stop = CancellationToken::new();
+    let hosted = tokio::spawn(serve(listener, options, stop.clone().cancelled_owned()));
+    let mut client = proto::client(Endpoint::from_shared(url).unwrap().connect_lazy());
+    let request = proto::SubmitRequest { plan: plan.0.to_vec(), store_url: store.url().into() };
+    let job = client.submit(request).await.unwrap().into_inner().job;
+
+    use proto::control_request::What;
+    let control = |what| proto::ControlRequest { job, what: Some(what) };
+    client.control(control(What::Pause(proto::Pause {}))).await.unwrap();
+    let idle = proto::LeaseRequest { worker: "idle".into(), backend: BACKEND.into(), ..Default::default() };
+    assert_eq!(client.lease(idle.clone()).await.unwrap().into_inner().reply, Some(Reply::WaitMillis(5)));
+    client.control(control(What::Resume(proto::Resume {}))).await.unwrap();
+    let attempt = lease(&mut client, "idle").await;
+    assert_eq!(attempt, proto::Attempt { job, task: 0, number: 1, epoch: 7 });
+    let earlier = proto::Attempt { epoch: 6, ..attempt };
+    let complete = proto::CompleteRequest { attempt: Some(earlier), artefact: vec![0; 32] };
+    assert!(!client.complete(complete).await.unwrap().into_inner().accepted, "of an earlier coordinator");
+    let wrong = proto::FailRequest {
+        attempt: Some(attempt),
+        message: "photo 7 is no photo".into(),
+        kind: proto::FailureKind::Input.into(),
+    };
+    assert!(client.fail(wrong).await.unwrap().into_inner().accepted);
+    client.control(control(What::RetryTask(0))).await.unwrap();
+    let refused = client.control(control(What::RetryTask(1))).await.unwrap_err();
+    assert_eq!(refused.code(), Code::FailedPrecondition);
+    let urgent = proto::Reprioritise { priority: 256, weight: 1 };
+    let refused = client.control(control(What::Reprioritise(urgent))).await.unwrap_err();
+    assert_eq!(refused.code(), Code::InvalidArgument);
+    assert_eq!(lease(&mut client, "idle").await.number, 2);
+
+    drop(client);
+    stop.cancel();
+    hosted.await.unwrap().unwrap();
+    let mut text = Vec::new();
+    while let Some(line) = lines.recv().await {
+        text.push(line);
+    }
+    let replayed = cluster::journal::replay(text.iter().map(String::as_str), |_| {}).unwrap();
+    assert!(replayed.steps >= 9, "{replayed:?}");
+    assert_eq!(replayed.last.jobs[0].tasks[0].attempts, 2);
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn what_comes_off_the_wire_is_checked() {
     let (mut client, _, job, stop) = host(3_600_000).await;
     let code = |result: Result<(), tonic::Status>| result.unwrap_err().code();
 
-    let other = proto::LeaseRequest { worker: "other".into(), backend: "gpu".into() };
+    let other = proto::LeaseRequest { worker: "other".into(), backend: "gpu".into(), ..Default::default() };
     let reply = client.lease(other).await.unwrap().into_inner().reply;
     assert_eq!(reply, Some(Reply::WaitMillis(5)), "a job pins its backend");
 
-    let nameless = proto::LeaseRequest { worker: String::new(), backend: BACKEND.into() };
+    let nameless = proto::LeaseRequest { worker: String::new(), backend: BACKEND.into(), ..Default::default() };
     assert_eq!(code(client.lease(nameless).await.map(|_| ())), Code::InvalidArgument);
     let elsewhere = proto::SubmitRequest { plan: vec![0; 32], store_url: "file:///elsewhere".into() };
     assert_eq!(code(client.submit(elsewhere).await.map(|_| ())), Code::FailedPrecondition);

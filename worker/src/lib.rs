@@ -143,7 +143,8 @@ pub async fn run(options: Options, executor: Arc<dyn Execute>, shutdown: Cancell
     let mut client = proto::client(channel);
     let mut backoff = Backoff::default();
     loop {
-        let request = proto::LeaseRequest { worker: options.worker_id.clone(), backend: options.backend.clone() };
+        let (worker, backend) = (options.worker_id.clone(), options.backend.clone());
+        let request = proto::LeaseRequest { worker, backend, ..Default::default() };
         let answer = tokio::select! {
             biased;
             () = shutdown.cancelled() => return Ok(()),

@@ -1,0 +1,78 @@
+//! The durable state of the simulated cluster: records that one coordinator after another writes, fenced by epoch.
+
+use std::collections::BTreeMap;
+
+use crate::snapshot::{JobHeader, JobSnapshot, Snapshot};
+use crate::words::{JobId, TaskIndex, TaskRecord, TaskState};
+
+/// What one step writes, all or nothing.
+#[derive(Debug, Default)]
+pub(crate) struct Batch {
+    /// `None`: forget the job.
+    pub(crate) headers: BTreeMap<JobId, Option<JobHeader>>,
+    pub(crate) records: BTreeMap<(JobId, TaskIndex), TaskRecord>,
+}
+
+/// A writer of an older epoch than the newest.
+#[derive(Debug, PartialEq, Eq)]
+pub(crate) struct Fenced;
+
+#[derive(Debug, Default)]
+pub(crate) struct Store {
+    pub(crate) epoch: u64,
+    headers: BTreeMap<JobId, JobHeader>,
+    records: BTreeMap<(JobId, TaskIndex), TaskRecord>,
+}
+
+impl Store {
+    /// Takes over: writers of older epochs are refused from now on. Returns the new epoch and what is there.
+    pub(crate) fn take_over(&mut self) -> (u64, Snapshot) {
+        let epoch = self.epoch;
+        self.epoch += 1;
+        let tasks = |id: JobId| {
+            let range = (id, TaskIndex(0))..=(id, TaskIndex(u32::MAX));
+            self.records.range(range).map(|(_, record)| record.clone()).collect()
+        };
+        let jobs = self.headers.iter().map(|(id, header)| JobSnapshot { header: header.clone(), tasks: tasks(*id) });
+        (self.epoch, Snapshot { epoch, jobs: jobs.collect() })
+    }
+
+    /// Writes a batch under an epoch.
+    ///
+    /// The outer error is a broken promise: a committed result that would change.
+    pub(crate) fn write(&mut self, epoch: u64, batch: Batch) -> Result<Result<(), Fenced>, String> {
+        if epoch < self.epoch {
+            return Ok(Err(Fenced));
+        }
+        for ((job, task), record) in &batch.records {
+            let old = self.records.get(&(*job, *task)).map(|old| &old.state);
+            if let Some(TaskState::Done { .. }) = old
+                && old != Some(&record.state)
+            {
+                return Err(format!("the result of {}/{task} is committed twice: {old:?}, {:?}", job.0, record.state));
+            }
+        }
+        for (id, header) in batch.headers {
+            match header {
+                Some(header) => {
+                    self.headers.insert(id, header);
+                }
+                None => {
+                    self.headers.remove(&id);
+                    self.records.retain(|(job, _), _| *job != id);
+                }
+            }
+        }
+        self.records.extend(batch.records);
+        Ok(Ok(()))
+    }
+
+    pub(crate) fn record(&self, job: JobId, task: TaskIndex) -> Option<&TaskRecord> {
+        self.records.get(&(job, task))
+    }
+
+    /// How many tasks a job has.
+    pub(crate) fn len(&self, job: JobId) -> usize {
+        self.records.range((job, TaskIndex(0))..=(job, TaskIndex(u32::MAX))).count()
+    }
+}
