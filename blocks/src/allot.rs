@@ -3,10 +3,12 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
+use glam::DVec3;
 use scene::{BlockId, Camera, Capture};
 
 use crate::ground::{Ground, HALO_SCALE};
 use crate::plan::{PlanSettings, Task};
+use crate::price::Price;
 use crate::select::Sightings;
 use crate::shown::Shown;
 
@@ -23,14 +25,9 @@ const SEEN_AGAIN: f64 = 0.05;
 const INNER_COUNTS: f64 = 2.0;
 /// A block that keeps this share of its own need, because too few of its children have a task, is worked on as a leaf.
 const KEEPS_MUCH: f64 = 0.25;
-/// A step costs its pixels and this many for each splat that its window shows (as `worker`'s estimate was fitted, at the mean
-/// resolution and number of splats of a block's schedule) ...
-const PIXELS_PER_SHOWN: f64 = 1.0;
-/// ... and for each splat at all.
-const PIXELS_PER_SPLAT: f64 = 2.0;
-/// A step of a tree takes this much of what is counted, against a step on the whole scene: its blocks begin with fewer of their
-/// splats, and with coarser pixels for longer (0.81 to 1.0 on the bench's five scenes).
-pub(crate) const CHEAPER: f64 = 0.9;
+/// A step of a tree takes this much of what is counted, against a step on the whole scene: small windows have more rim, and every
+/// block begins anew (1.10 to 1.22 on the bench's five scenes).
+pub(crate) const TREE_STEP: f64 = 1.18;
 /// Steps of a task at least.
 const MIN_STEPS: u32 = 50;
 /// Levels below the leaves of the cells in which ground is counted as seen: 16 a side (see [`Needs`]).
@@ -121,6 +118,7 @@ pub(crate) fn set_means(
     let standings = standings(tasks, needs);
     set_budgets(tasks, &standings, settings);
     set_drawn(tasks, capture, ground);
+    set_context_drawn(tasks, capture, ground);
     let mut whole = [Task { budget: settings.budget.min(BLOCK_SPLATS), ..whole }];
     set_drawn(&mut whole, capture, ground);
     set_steps(tasks, &whole[0], &standings, capture, settings);
@@ -174,17 +172,17 @@ fn set_steps(tasks: &mut [Task], whole: &Task, standings: &[Standing], capture: 
         task.steps = settings.steps;
         return;
     }
-    let work = f64::from(settings.steps) * cost_of_visits(whole, false) / whole.views.len().max(1) as f64;
+    let work = f64::from(settings.steps) * cost_of_visits(whole) / whole.views.len().max(1) as f64;
     // Where splats and pixels are few a visit costs next to nothing, but needs no end of them.
     let most = INNER_COUNTS * f64::from(settings.steps) / whole.views.len().max(1) as f64;
     let parents = parents(tasks);
-    let work = if parents.is_empty() { work } else { work / CHEAPER };
+    let work = if parents.is_empty() { work } else { work / TREE_STEP };
     let shown = first_shown(tasks, standings, capture);
     let all: f64 = shown.values().sum();
     for (height, shown) in shown {
         let rows: Vec<usize> = (0..tasks.len()).filter(|&i| standings[i].height == height).collect();
         // One visit to every window of the height.
-        let visit: f64 = rows.iter().map(|&i| cost_of_visits(&tasks[i], parents.contains(&tasks[i].block))).sum();
+        let visit: f64 = rows.iter().map(|&i| cost_of_visits(&tasks[i])).sum();
         let visits = (work * shown / all.max(1.0) / visit.max(1.0)).min(most);
         for task in rows {
             let task = &mut tasks[task];
@@ -194,9 +192,8 @@ fn set_steps(tasks: &mut [Task], whole: &Task, standings: &[Standing], capture: 
 }
 
 /// What a step on each of its windows costs a task, in pixels.
-pub(crate) fn cost_of_visits(task: &Task, has_children: bool) -> f64 {
-    let splats = PIXELS_PER_SHOWN * f64::from(task.drawn) + PIXELS_PER_SPLAT * trained_splats(task, has_children);
-    task.window_pixels() as f64 + splats * task.views.len() as f64
+pub(crate) fn cost_of_visits(task: &Task) -> f64 {
+    Price::of(task).total() * task.views.len() as f64
 }
 
 /// Blocks below which there are others.
@@ -225,30 +222,38 @@ fn first_shown(tasks: &[Task], standings: &[Standing], capture: &Capture) -> BTr
 /// Points and windows of a task that [`set_drawn`] looks at, at most.
 const DRAWN_POINTS: usize = 20_000;
 const DRAWN_WINDOWS: usize = 8;
+/// Points that [`set_context_drawn`] looks at, at most: each of them for every task.
+const CONTEXT_POINTS: usize = 4096;
+
+/// Finite sparse points, so many at most.
+fn sample(capture: &Capture, most: usize) -> Vec<DVec3> {
+    let points = &capture.points.positions;
+    points.iter().step_by(points.len().div_ceil(most).max(1)).filter(|p| p.is_finite()).copied().collect()
+}
+
+/// Some of a task's windows.
+fn some_windows(task: &Task, capture: &Capture) -> Vec<Camera> {
+    let some = task.views.iter().step_by(task.views.len().div_ceil(DRAWN_WINDOWS).max(1));
+    some.map(|used| capture.views[used.view as usize].camera.mip(used.mip).window(used.window)).collect()
+}
+
+/// Is the point before the camera and inside its image?
+fn shows(camera: &Camera, point: DVec3) -> bool {
+    let (pixel, depth) = camera.project(point);
+    let size = [f64::from(camera.pinhole.width), f64::from(camera.pinhole.height)];
+    depth > 0.0 && (0.0..size[0]).contains(&pixel.x) && (0.0..size[1]).contains(&pixel.y)
+}
 
 /// Estimates how many splats of core and halo each task's windows show: as large a share as of the sparse points there.
 fn set_drawn(tasks: &mut [Task], capture: &Capture, ground: &Ground) {
-    let points = &capture.points.positions;
-    let sample: Vec<_> =
-        points.iter().step_by(points.len().div_ceil(DRAWN_POINTS).max(1)).filter(|p| p.is_finite()).collect();
     let levels: BTreeSet<u8> = tasks.iter().map(|task| task.block.level).collect();
     let places: BTreeMap<BlockId, usize> = tasks.iter().enumerate().map(|(i, task)| (task.block, i)).collect();
-    let windows: Vec<Vec<Camera>> = (tasks.iter())
-        .map(|task| {
-            let some = task.views.iter().step_by(task.views.len().div_ceil(DRAWN_WINDOWS).max(1));
-            some.map(|used| capture.views[used.view as usize].camera.mip(used.mip).window(used.window)).collect()
-        })
-        .collect();
+    let windows: Vec<Vec<Camera>> = tasks.iter().map(|task| some_windows(task, capture)).collect();
     // Of each task, points that a window shows, and points times windows.
     let mut shown = vec![[0u64; 2]; tasks.len()];
-    for point in sample {
-        for task in levels.iter().flat_map(|&level| ground.halos_at(level, *point)).filter_map(|b| places.get(&b)) {
-            let inside = |camera: &&Camera| {
-                let (pixel, depth) = camera.project(*point);
-                let size = [f64::from(camera.pinhole.width), f64::from(camera.pinhole.height)];
-                depth > 0.0 && (0.0..size[0]).contains(&pixel.x) && (0.0..size[1]).contains(&pixel.y)
-            };
-            shown[*task][0] += windows[*task].iter().filter(inside).count() as u64;
+    for point in sample(capture, DRAWN_POINTS) {
+        for task in levels.iter().flat_map(|&level| ground.halos_at(level, point)).filter_map(|b| places.get(&b)) {
+            shown[*task][0] += windows[*task].iter().filter(|camera| shows(camera, point)).count() as u64;
             shown[*task][1] += windows[*task].len() as u64;
         }
     }
@@ -256,6 +261,33 @@ fn set_drawn(tasks: &mut [Task], capture: &Capture, ground: &Ground) {
     for (task, [inside, all]) in tasks.iter_mut().zip(shown) {
         let share = inside as f64 / all.max(1) as f64;
         task.drawn = (trained_splats(task, parents.contains(&task.block)) * share).round() as u32;
+    }
+}
+
+/// Estimates how many frozen splats each task's windows show: sparse points outside its halo, each for as many splats as the
+/// block that is drawn there has for each of its own points.
+fn set_context_drawn(tasks: &mut [Task], capture: &Capture, ground: &Ground) {
+    let points = sample(capture, CONTEXT_POINTS);
+    let mut own: BTreeMap<BlockId, f64> = BTreeMap::new();
+    let levels: BTreeSet<u8> = tasks.iter().map(|task| task.block.level).collect();
+    for block in levels.iter().flat_map(|&level| points.iter().map(move |&p| ground.block_at(level, p))) {
+        *own.entry(block).or_default() += 1.0;
+    }
+    let splats_per_point: BTreeMap<BlockId, f64> =
+        tasks.iter().map(|t| (t.block, f64::from(t.budget) / own.get(&t.block).copied().unwrap_or(1.0))).collect();
+    for task in tasks.iter_mut().filter(|task| task.parent.is_some()) {
+        let (cut, windows) = (task.context_cut(), some_windows(task, capture));
+        let mut shown = 0.0;
+        for &point in &points {
+            let seen = windows.iter().filter(|camera| shows(camera, point)).count();
+            let owner = if seen > 0 { cut.owner_of(ground, point) } else { None };
+            let Some(owner) = owner else { continue };
+            let trained = owner.level < task.block.level && ground.in_halo(task.block, point) && !ground.is_far(point);
+            if !trained {
+                shown += seen as f64 * splats_per_point.get(&owner).copied().unwrap_or(0.0);
+            }
+        }
+        task.context_drawn = (shown / windows.len().max(1) as f64).round() as u32;
     }
 }
 

@@ -10,7 +10,7 @@ use crate::ground::{Ground, HALO_SCALE};
 use crate::lod::{Cut, training_order};
 
 /// The version of [`Plan`] that this program writes and reads.
-pub const VERSION: u32 = 2;
+pub const VERSION: u32 = 3;
 /// The frame that carries a plan.
 pub const PLAN: Kind = Kind(*b"plan", VERSION);
 /// The deepest level a plan may have: 65,536 blocks a side.
@@ -116,6 +116,8 @@ pub struct Task {
     pub budget: u32,
     /// Splats that a window shows at the end, halo included, mean over the windows; an estimate.
     pub drawn: u32,
+    /// Frozen splats of the context that a window shows, mean over the windows; an estimate.
+    pub context_drawn: u32,
     /// Optimiser steps, one window each.
     pub steps: u32,
     /// Metres per pixel that the block is to resolve.

@@ -258,6 +258,7 @@ impl Survey<'_> {
                 steps: 0,
                 rho_metres,
                 drawn: 0,
+                context_drawn: 0,
                 memory_bytes: 0,
             })
             .collect();
@@ -272,7 +273,7 @@ mod tests {
     use scene::Camera;
 
     use super::*;
-    use crate::allot::{CHEAPER, cost_of_visits};
+    use crate::allot::{TREE_STEP, cost_of_visits};
     use crate::lint::{Severity, lint};
     use crate::testing::{aerial, capture, look, noise, street};
 
@@ -359,16 +360,15 @@ mod tests {
     fn all_modes_cost_about_the_same() {
         let capture = aerial(8, 300.0, 8000);
         let work = |plan: &Plan| -> f64 {
-            let has_children = |task: &Task| plan.tasks.iter().any(|t| t.parent == Some(task.block));
             let visits = |t: &Task| f64::from(t.steps) / t.views.len() as f64;
-            plan.tasks.iter().map(|t| visits(t) * cost_of_visits(t, has_children(t))).sum()
+            plan.tasks.iter().map(|t| visits(t) * cost_of_visits(t)).sum()
         };
         let whole = plan_of(&capture, Mode::Whole, None);
         assert_eq!(whole.tasks[0].steps, 4000);
         for (mode, levels) in [(Mode::Tree, 0), (Mode::Tree, 1), (Mode::Tree, 2), (Mode::Flat, 1), (Mode::Flat, 2)] {
             let plan = plan_of(&capture, mode, Some(levels));
             let is_tree = plan.tasks.iter().any(|task| task.parent.is_some());
-            let ratio = work(&plan) / work(&whole) * if is_tree { CHEAPER } else { 1.0 };
+            let ratio = work(&plan) / work(&whole) * if is_tree { TREE_STEP } else { 1.0 };
             assert!((0.95..1.10).contains(&ratio), "{mode:?} {levels}: {ratio}");
         }
     }
@@ -403,14 +403,11 @@ mod tests {
         let visits = |budget: u32| -> f64 {
             let settings = PlanSettings { budget, ..settings(Mode::Tree, Some(2)) };
             let plan = plan(&capture, ArtefactId::of(b"capture"), &settings, "cpu").unwrap();
-            let cost = |t: &Task| {
-                let has_children = plan.tasks.iter().any(|child| child.parent == Some(t.block));
-                f64::from(t.steps) / t.views.len() as f64 * cost_of_visits(t, has_children)
-            };
-            plan.tasks.iter().map(cost).sum()
+            plan.tasks.iter().map(|t| f64::from(t.steps) / t.views.len() as f64 * cost_of_visits(t)).sum()
         };
         let [few, many, more] = [BLOCK_SPLATS / 16, BLOCK_SPLATS, 4 * BLOCK_SPLATS].map(visits);
-        assert!(many > 1.5 * few && (0.95..1.05).contains(&(more / many)), "{few} {many} {more}");
+        // Most of the price is pixels here.
+        assert!(many > 1.1 * few && (0.95..1.05).contains(&(more / many)), "{few} {many} {more}");
     }
 
     #[test]

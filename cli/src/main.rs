@@ -70,11 +70,14 @@ fn fail(failure: &Failure) -> ExitCode {
 
 /// Buffers of a megabyte and more go back to the system once a task is done with them. glibc moves that border up to 32 MB by
 /// itself when such are freed, and what the tasks of a city left behind piled up in the heap: a third of the most memory it took.
+/// Smaller ones share one heap: with one for each thread every heap keeps what the largest task left in it, half of what a city took
+/// at its end.
 fn give_buffers_back() {
     #[cfg(all(target_os = "linux", target_env = "gnu"))]
-    // SAFETY: it sets a number of the allocator, before there is another thread.
+    // SAFETY: it sets numbers of the allocator, before there is another thread.
     unsafe {
         libc::mallopt(libc::M_MMAP_THRESHOLD, 1 << 20);
+        libc::mallopt(libc::M_ARENA_MAX, 1);
     }
 }
 

@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::pin::Pin;
 
-use blocks::Plan;
+use blocks::{Plan, Price};
 use cluster::{Failure, FailureKind, JobSpec, Offer, TaskIndex, TaskNode};
 use proto::coordinator_server::Coordinator;
 use proto::{
@@ -89,12 +89,10 @@ fn dag_of(plan: &Plan) -> Result<Vec<TaskNode>, CodecError> {
     plan.tasks.iter().map(node).collect()
 }
 
-/// About the CPU milliseconds that a task takes, by the prices of a step: ARCHITECTURE, "a step is priced". What counts are the
-/// ratios between tasks; speeds are learnt in the same measure.
+/// About the CPU milliseconds that a task takes. What counts are the ratios between tasks; speeds are learnt in the same measure.
 fn work_of(task: &blocks::Task) -> u64 {
-    let pixels = task.window_pixels() / task.views.len().max(1) as u64;
-    let tenth_micros = 2 * pixels + u64::from(task.drawn) + 2 * u64::from(task.budget);
-    u64::from(task.steps).saturating_mul(tenth_micros) / 10_000
+    // `as` saturates: a plan may ask for any number of steps.
+    (f64::from(task.steps) * Price::of(task).total() * Price::CPU_SECONDS * 1e3) as u64
 }
 
 fn store_status(error: StoreError) -> Status {

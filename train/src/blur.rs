@@ -7,11 +7,10 @@
 //! on coarser mips starts by taking out what those hide ([`from_full_images`]). At mip 0 both change nothing.
 //! (Mip-Splatting, Yu et al. 2024, bounds scales by the finest sampling rate likewise, during training.)
 
-use glam::DVec3;
-use rayon::prelude::*;
 use scene::{Splats, column};
 
 use crate::TrainView;
+use crate::sight::finest;
 
 /// Variance that the renderer adds, px².
 const PIXEL_VARIANCE: f64 = 0.3;
@@ -32,8 +31,10 @@ fn shift(splats: &mut Splats, views: &[TrainView], sign: f64) {
     if views.iter().all(|view| view.mip == 0) {
         return;
     }
-    let hidden: Vec<f64> =
-        (0..splats.len()).into_par_iter().map(|i| hidden_variance(splats.mean(i).as_dvec3(), views)).collect();
+    // Square metres by which the mip of the window with the finest pixels here blurs more than its image at full size does.
+    let hidden: Vec<f64> = (finest(splats, views, 0.0).into_iter())
+        .map(|finest| if finest.is_seen() { PIXEL_VARIANCE * f64::from(finest.area * finest.coarser) } else { 0.0 })
+        .collect();
     for column in &mut splats.columns_mut()[column::LOG_SCALE..column::LOG_SCALE + 3] {
         for (log_scale, hidden) in column.iter_mut().zip(&hidden) {
             let variance = (2.0 * f64::from(*log_scale)).exp();
@@ -41,23 +42,6 @@ fn shift(splats: &mut Splats, views: &[TrainView], sign: f64) {
             *log_scale = (0.5 * shifted.ln()) as f32;
         }
     }
-}
-
-/// Square metres by which the mip of the window with the finest pixels here blurs more than its image at full size does.
-fn hidden_variance(place: DVec3, views: &[TrainView]) -> f64 {
-    let mut finest = (f64::INFINITY, 0.0);
-    for view in views {
-        let camera = view.camera.mip(view.mip).window(view.rect);
-        let (pixel, depth) = camera.project(place);
-        let inside = |v: f64, size: u32| v >= 0.0 && v < f64::from(size);
-        if depth > 0.0 && inside(pixel.x, view.rect.width) && inside(pixel.y, view.rect.height) {
-            let area = depth * depth / (camera.pinhole.fx * camera.pinhole.fy);
-            if area < finest.0 {
-                finest = (area, area * (1.0 - 0.25f64.powi(i32::from(view.mip))));
-            }
-        }
-    }
-    PIXEL_VARIANCE * finest.1
 }
 
 #[cfg(test)]

@@ -17,6 +17,7 @@ pub mod optimiser;
 pub mod prune;
 pub mod random;
 mod side;
+pub mod sight;
 pub mod source;
 pub mod trainer;
 

@@ -242,6 +242,7 @@ mod tests {
             steps: steps[i],
             rho_metres: 1.0,
             drawn: 1000,
+            context_drawn: 0,
             memory_bytes: 0,
         };
         Plan {

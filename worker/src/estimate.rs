@@ -1,37 +1,28 @@
 //! What a plan will take, before anything runs. An estimate: no result depends on it.
 //!
-//! A training step costs its pixels and the splats that its window shows. Both change over a task's schedule (coarse mips
-//! first, growth towards the budget), which the means here follow. The constants were fitted to runs on the bench's captures
-//! on an AVX-512 core: other machines are as much slower as they are, and
-//! that one was 1.4 times faster at another hour.
+//! A training step is priced as in the plan ([`Price`]). Pixels and splats change over a task's schedule (coarse mips first, growth
+//! towards the budget), which the means here follow. Other machines are as much slower or faster as they are; one and the same
+//! was 1.4 times faster at another hour.
 
 use std::collections::BTreeSet;
 
-use blocks::{Plan, Task};
+use blocks::{Plan, Price, Task};
 use scene::BlockId;
 use serde::Serialize;
 use train::prune::{self, Pruning};
 
 use crate::block::recipe_of;
 
-/// CPU seconds of a pixel in a step.
-const PER_PIXEL: f64 = 0.2e-6;
-/// CPU seconds of a splat that is shown in a step.
-const PER_SHOWN: f64 = 0.1e-6;
-/// CPU seconds of a splat in a step, shown or not.
-const PER_SPLAT: f64 = 0.22e-6;
+/// Pixels of a window at the mean resolution of a schedule of coarse mips, which the price is of, against all of them.
+const MEAN_PIXELS: f64 = 0.475;
 /// CPU seconds of reading a pixel of a window the first time.
-const PER_READ_PIXEL: f64 = 0.16e-6;
+const PER_READ_PIXEL: f64 = 0.3e-6;
 /// Drawing a window without training on it, against a step.
 const LOOKING: f64 = 0.45;
 /// Splats on the way through pruning, against those before.
 const PRUNED: f64 = 0.75;
 /// Splats that a parent leaves where a child starts, against the child's budget.
 const INHERITED: f64 = 0.4;
-/// Core and halo, against the core.
-const HALO_AREA: f64 = blocks::ground::HALO_SCALE * blocks::ground::HALO_SCALE;
-/// Splats of the backdrop.
-const BACKDROP: f64 = 1024.0;
 /// Bytes of a splat of SH degree 0 to 3 in a merged PLY: floats of position, normal, colour, opacity, scale and rotation.
 const PLY_FLOATS: [u64; 4] = [17, 26, 41, 62];
 
@@ -68,7 +59,7 @@ pub(crate) fn parents(plan: &Plan) -> BTreeSet<BlockId> {
 /// What a task will take on the CPU backend, CPU seconds.
 pub(crate) fn cpu_seconds(plan: &Plan, task: &Task, leaf: bool) -> f64 {
     let settings = &plan.settings;
-    let pixels = task.window_pixels() as f64 / task.views.len().max(1) as f64;
+    let price = Price::of(task);
     let recipe = recipe_of(settings, task);
     let first = match task.parent {
         Some(_) => INHERITED,
@@ -84,11 +75,10 @@ pub(crate) fn cpu_seconds(plan: &Plan, task: &Task, leaf: bool) -> f64 {
         left -= f64::from(*share);
     }
     mean_pixels += left;
-    // The halo's splats, and a backdrop.
-    let trained_splats = f64::from(task.budget) * if task.parent.is_some() { HALO_AREA } else { 1.0 } + BACKDROP;
-    // The plan's count of what is drawn is of whenever there are most.
-    let [shown, all] = [PER_SHOWN * f64::from(task.drawn), PER_SPLAT * trained_splats];
-    let step = PER_PIXEL * pixels * mean_pixels + shown * mean_splats.min(1.0) + all * mean_splats;
+    let seconds = |pixels: f64, splats: f64| {
+        Price::CPU_SECONDS * (price.pixels * pixels / MEAN_PIXELS + price.trained * splats + price.context)
+    };
+    let step = seconds(mean_pixels, mean_splats);
     let read = PER_READ_PIXEL * task.window_pixels() as f64;
     if settings.tolerance_db == 0.0 || !leaf {
         return read + f64::from(task.steps) * step;
@@ -96,5 +86,5 @@ pub(crate) fn cpu_seconds(plan: &Plan, task: &Task, leaf: bool) -> f64 {
     let trained = f64::from(prune::steps_before(task.steps));
     let looks = Pruning::within(settings.tolerance_db).looks(task.steps, task.views.len());
     let healing = f64::from(task.steps) - trained + LOOKING * looks as f64;
-    read + trained * step + healing * (PER_PIXEL * pixels + (shown + all) * PRUNED)
+    read + trained * step + healing * seconds(1.0, PRUNED)
 }

@@ -214,6 +214,7 @@ mod tests {
             points: 0,
             budget: 1,
             drawn: 0,
+            context_drawn: 0,
             steps: 1,
             rho_metres: 1.0,
             memory_bytes: 0,

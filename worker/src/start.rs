@@ -4,7 +4,6 @@ use std::collections::BTreeMap;
 
 use blocks::Mode;
 use glam::Vec3;
-use rayon::prelude::*;
 use scene::{BlockId, SparsePoints, Splats};
 use train::{Recipe, TrainView};
 
@@ -49,20 +48,21 @@ impl Block<'_> {
         let mut initial = Splats::new(sh_degree);
         let mut context = Splats::new(sh_degree);
         let lender = |place: Vec3| task.lender(&plan.ground, place.as_dvec3());
-        for (block, mut splats) in results {
+        let for_mips = |mut splats: Splats| {
             if !plan.settings.antialiased {
                 train::blur::from_full_images(&mut splats, views);
             }
-            initial.append(&splats.filter(|i| lender(splats.mean(i)) == Some(block)));
+            splats
+        };
+        for (block, splats) in results {
+            initial.append(&for_mips(splats.filter(|i| lender(splats.mean(i)) == Some(block))));
             let splats = cut.keep(&splats, &plan.ground, block);
             let inside = |i: usize| self.trains(&cut, splats.mean(i).as_dvec3());
-            initial.append(&splats.filter(|i| inside(i) && lender(splats.mean(i)).is_none()));
+            initial.append(&for_mips(splats.filter(|i| inside(i) && lender(splats.mean(i)).is_none())));
             // Only what a window can show is worth keeping in memory.
-            let shown: Vec<bool> = (0..splats.len())
-                .into_par_iter()
-                .map(|i| !inside(i) && views.iter().any(|view| sees(view, splats.mean(i).as_dvec3(), 0.2)))
-                .collect();
-            context.append(&splats.filter(|i| shown[i]));
+            let frozen = splats.filter(|i| !inside(i));
+            let seen = train::sight::finest(&frozen, views, 0.2);
+            context.append(&for_mips(frozen.filter(|i| seen[i].is_seen())));
         }
         let context = (!context.is_empty()).then_some(context);
         Ok((initial, context))
