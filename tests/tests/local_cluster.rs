@@ -35,6 +35,7 @@ fn plan() -> Plan {
             steps: 1,
             rho_metres: 1.0,
             drawn: 0,
+            context_drawn: 0,
             memory_bytes: 0,
         }
     };
