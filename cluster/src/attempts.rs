@@ -196,9 +196,12 @@ impl Scheduler {
             largest: self.lanes.get(&job.backend).and_then(Lane::largest_memory),
         };
         let (now, settings) = (self.now_millis, self.settings);
+        // Attempts under way at once have the same rate and the same results: where one diverges the other will, too. It is
+        // no second try, so it ends here; counted as one, a task would be quarantined without ever having had its lower rate.
+        let speaks_for_all = matches!(&trouble, Trouble::Said(Failure { kind: FailureKind::Numeric, .. }));
         self.move_on(id, task, actions, |record| {
             let next = retry::after(record, trouble, site, &settings);
-            let others = record.state.leases().iter().filter(|lease| lease.fence != fence).cloned();
+            let others = record.state.leases().iter().filter(|lease| lease.fence != fence && !speaks_for_all).cloned();
             let leases: Vec<Lease> = others.collect();
             record.state = match next {
                 Next::Failed(message) => TaskState::Failed { fence, message },

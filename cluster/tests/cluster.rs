@@ -155,6 +155,31 @@ fn a_straggler_gets_a_second_attempt_and_the_first_result_wins() {
 }
 
 #[test]
+fn two_attempts_that_diverge_at_once_are_one_divergence() {
+    let mut cluster = Cluster::new();
+    cluster.join(1, 0, &[]);
+    cluster.join(2, 0, &[]);
+    cluster.teach(1, 8000);
+    cluster.teach(2, 1000);
+    cluster.submit(1, 0, 1, vec![node(&[], 20_000, 0)]);
+    let (slow, fast) = (cluster.ask(1).unwrap(), cluster.ask(2).unwrap());
+    assert_eq!(
+        (slow.task, fast.fence.number),
+        (fast.task, 2),
+        "a straggler's second attempt, at the full rate as well"
+    );
+    let failure = Failure { kind: FailureKind::Numeric, message: "the loss is not finite".into() };
+    let actions = cluster.step(Event::Failed { attempt: fast, failure: failure.clone() });
+    assert!(actions.contains(&Action::Stop { worker: WorkerId(1), attempt: slow }), "{actions:?}");
+    assert_eq!(cluster.step(Event::Failed { attempt: slow, failure }), [Action::Refused { attempt: slow }]);
+    // The next one has the lower rate, and only if that diverges, too, it is enough.
+    assert_eq!((cluster.record(0).divergences, cluster.record(0).rate_permille()), (1, FULL_RATE / 2));
+    let last = cluster.ask(2).unwrap();
+    cluster.fail(last, FailureKind::Numeric);
+    assert!(matches!(cluster.record(0).state, TaskState::Quarantined { .. }), "{:?}", cluster.record(0));
+}
+
+#[test]
 fn each_class_of_trouble_has_its_way_on() {
     let mut cluster = Cluster::new();
     cluster.submit(1, 0, 1, vec![node(&[], 1, 2 * MIB)]);
