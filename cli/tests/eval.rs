@@ -10,7 +10,7 @@ fn cuts_and_seams_of_a_tree_are_measured() {
     let at = folder.path();
     city(at, 24, 96, 72);
     let train = |out: &str, blocks: &str| {
-        let options = ["--steps", "600", "--budget", "3000", "--levels", "1", "--threads", "1", "--tolerance-db", "0"];
+        let options = ["--steps", "900", "--budget", "3000", "--levels", "1", "--threads", "1", "--tolerance-db", "0"];
         done(at, &[&["train", "city", "--out", out, "--blocks", blocks][..], &options].concat())
     };
     train("tree", "tree");
