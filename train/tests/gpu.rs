@@ -40,7 +40,7 @@ fn a_gpu_trains_as_well_as_the_cpu() {
     let before = psnr(&initial, &photos, |_| true);
     let run = |backend: &Backend| {
         let setup = Setup::new(initial.clone(), &photos);
-        Setup { backend: backend.clone(), budget: 300, steps: 160, ..setup }.run()
+        Setup { backend: backend.clone(), budget: 300, steps: 100, ..setup }.run()
     };
     let [cpu, gpu] = [run(&Backend::Cpu), run(&gpu)];
     let [cpu_db, gpu_db] = [&cpu, &gpu].map(|splats| psnr(splats, &photos, |_| true));
