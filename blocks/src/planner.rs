@@ -399,15 +399,16 @@ mod tests {
 
     #[test]
     fn splats_beyond_a_blocks_worth_do_not_raise_the_work() {
-        let capture = aerial(8, 300.0, 8000);
+        // Small photos, as splats are to be most of the price.
+        let mut capture = aerial(8, 300.0, 8000);
+        capture.views.iter_mut().for_each(|view| view.camera = view.camera.mip(2));
         let visits = |budget: u32| -> f64 {
             let settings = PlanSettings { budget, ..settings(Mode::Tree, Some(2)) };
             let plan = plan(&capture, ArtefactId::of(b"capture"), &settings, "cpu").unwrap();
             plan.tasks.iter().map(|t| f64::from(t.steps) / t.views.len() as f64 * cost_of_visits(t)).sum()
         };
         let [few, many, more] = [BLOCK_SPLATS / 16, BLOCK_SPLATS, 4 * BLOCK_SPLATS].map(visits);
-        // Most of the price is pixels here.
-        assert!(many > 1.1 * few && (0.95..1.05).contains(&(more / many)), "{few} {many} {more}");
+        assert!(many > 1.5 * few && (0.95..1.05).contains(&(more / many)), "{few} {many} {more}");
     }
 
     #[test]
