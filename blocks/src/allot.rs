@@ -6,9 +6,9 @@ use std::collections::{BTreeMap, BTreeSet};
 use glam::DVec3;
 use scene::{BlockId, Camera, Capture};
 
-use crate::ground::{Ground, HALO_SCALE};
+use crate::ground::Ground;
 use crate::plan::{PlanSettings, Task};
-use crate::price::Price;
+use crate::price::{HALO_AREA, Price};
 use crate::select::Sightings;
 use crate::shown::Shown;
 
@@ -306,8 +306,6 @@ fn trained_splats(task: &Task, has_children: bool) -> f64 {
 
 /// Columns of a splat of SH degree 3.
 const COLUMNS: [u64; 4] = [14, 23, 38, 59];
-/// Halo splats come on top of the core's: the area of halo over core.
-const HALO_AREA: f64 = HALO_SCALE * HALO_SCALE;
 /// Parameter, gradient and two moments, f32 each.
 const BYTES_PER_TRAINED_COLUMN: u64 = 16;
 /// A frozen parameter.

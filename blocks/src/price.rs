@@ -8,8 +8,8 @@ use crate::plan::Task;
 const PER_SHOWN: f64 = 1.0;
 /// What a splat under training costs, shown or not.
 const PER_TRAINED: f64 = 0.5;
-/// Core and halo, against the core.
-const HALO_AREA: f64 = HALO_SCALE * HALO_SCALE;
+/// Splats of core and halo, against the core's: as their areas.
+pub(crate) const HALO_AREA: f64 = HALO_SCALE * HALO_SCALE;
 
 /// What one step of a task costs, by what it is spent on, in pixels of its windows at the mean resolution and number of splats of
 /// its schedule. Fitted to the 127 tasks of three cities of 0.3, 0.6 and 1.2 km² at one step a view.
