@@ -17,7 +17,9 @@ pub(crate) const HALO_AREA: f64 = HALO_SCALE * HALO_SCALE;
 pub struct Price {
     /// The window's pixels.
     pub pixels: f64,
-    /// Splats under training, those that are shown and all.
+    /// Splats of core and halo that are shown, of whenever there are most.
+    pub shown: f64,
+    /// Splats under training, shown or not.
     pub trained: f64,
     /// Frozen splats that are shown.
     pub context: f64,
@@ -32,13 +34,14 @@ impl Price {
         let splats = f64::from(task.budget) * if task.block.level == 0 { 1.0 } else { HALO_AREA };
         Self {
             pixels: task.window_pixels() as f64 / task.views.len().max(1) as f64,
-            trained: PER_SHOWN * f64::from(task.drawn) + PER_TRAINED * splats,
+            shown: PER_SHOWN * f64::from(task.drawn),
+            trained: PER_TRAINED * splats,
             context: PER_SHOWN * f64::from(task.context_drawn),
         }
     }
 
     /// All of it.
     pub fn total(&self) -> f64 {
-        self.pixels + self.trained + self.context
+        self.pixels + self.shown + self.trained + self.context
     }
 }

@@ -76,7 +76,9 @@ pub(crate) fn cpu_seconds(plan: &Plan, task: &Task, leaf: bool) -> f64 {
     }
     mean_pixels += left;
     let seconds = |pixels: f64, splats: f64| {
-        Price::CPU_SECONDS * (price.pixels * pixels / MEAN_PIXELS + price.trained * splats + price.context)
+        // What is shown is of whenever there are most splats: a root that begins with more than its budget shows no more than that.
+        let splats = price.shown * splats.min(1.0) + price.trained * splats;
+        Price::CPU_SECONDS * (price.pixels * pixels / MEAN_PIXELS + splats + price.context)
     };
     let step = seconds(mean_pixels, mean_splats);
     let read = PER_READ_PIXEL * task.window_pixels() as f64;
