@@ -20,6 +20,8 @@ pub(crate) struct Pair {
     pub(crate) rank: u32,
     /// The 4×4 blocks that it touches.
     pub(crate) blocks: u16,
+    /// Whether the splat is under training.
+    pub(crate) own: bool,
 }
 
 /// For each tile, its splats front to back.
@@ -177,7 +179,7 @@ fn emit_lanes<L: Lanes>(records: &[Projected], first_rank: u32, tiles: (usize, u
                 let blocks = on_vertical.min(on_horizontal).le(reach);
                 if blocks != 0 {
                     let tile = (row * tiles.0 + column) as u32;
-                    out.pairs.push((tile, Pair { rank: first_rank + n as u32, blocks }));
+                    out.pairs.push((tile, Pair { rank: first_rank + n as u32, blocks, own: r[at::OWN] > 0.0 }));
                 }
             }
         }

@@ -112,6 +112,24 @@ impl TileInput<'_> {
     }
 }
 
+/// Of each block the last pair of a splat under training that touches it, `u32::MAX` where there is none; and the mask of the
+/// blocks that have one. What lies behind it, or where there is none, is of no gradient.
+pub(crate) fn last_own(pairs: &[Pair]) -> ([u32; BLOCKS], u32) {
+    let (mut last, mut found) = ([u32::MAX; BLOCKS], 0);
+    for (n, pair) in pairs.iter().enumerate().rev().filter(|(_, pair)| pair.own) {
+        let mut blocks = u32::from(pair.blocks) & !found;
+        found |= blocks;
+        while blocks != 0 {
+            last[blocks.trailing_zeros() as usize & (BLOCKS - 1)] = n as u32;
+            blocks &= blocks - 1;
+        }
+        if found == 0xffff {
+            break;
+        }
+    }
+    (last, found)
+}
+
 /// What a tile's pixels took before all of them were finished.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Visited {
@@ -278,8 +296,8 @@ impl<'a> BackwardBand<'a> {
 }
 
 kernel!(
-    /// The gradient of each pair of a tile, into `out` (one entry a pair; context splats and pairs that no pixel saw get
-    /// zeros).
+    /// The gradient of each pair of a tile, into `out` (one entry a pair; pairs that no pixel saw get zeros, those of context
+    /// splats are left as they are).
     pub(crate) fn rasterize_backward(tile: &TileInput, band: &BackwardBand, out: &mut [Moments]) = rasterize_backward_lanes
 );
 
@@ -295,6 +313,11 @@ fn rasterize_backward_lanes<L: Lanes>(tile: &TileInput, band: &BackwardBand, out
 #[inline(always)]
 fn rasterize_backward_tile<L: Lanes, const DEPTH: bool>(tile: &TileInput, band: &BackwardBand, out: &mut [Moments]) {
     let (mut live, mut alive) = tile.start();
+    let (last, owned) = last_own(tile.pairs);
+    alive &= owned;
+    if alive == 0 {
+        return out.iter_mut().zip(tile.pairs).filter(|(_, pair)| pair.own).for_each(|(out, _)| *out = Moments::default());
+    }
     let mut d_colour = [[[0.0; 16]; BLOCKS]; 3];
     let mut d_depth: Plane = [[0.0; 16]; BLOCKS];
     for c in 0..3 {
@@ -321,15 +344,16 @@ fn rasterize_backward_tile<L: Lanes, const DEPTH: bool>(tile: &TileInput, band: 
     }
 
     let (lane_x, lane_y) = lane_offsets::<L>();
-    for (pair, out) in tile.pairs.iter().zip(out) {
-        *out = Moments::default();
+    for (n, (pair, out)) in tile.pairs.iter().zip(out).enumerate() {
+        if pair.own {
+            *out = Moments::default();
+        }
         let mut blocks = u32::from(pair.blocks) & alive;
         if blocks == 0 {
             continue;
         }
         let r = &tile.ranked[pair.rank as usize].0;
         let spread = Spread::<L>::new(r, tile);
-        let own = r[at::OWN] > 0.0;
         // dα/d(mean) / α, for the absolute sums: the exponent's derivative in natural units.
         let ln2 = std::f32::consts::LN_2;
         let (a, b, c) = (r[at::A], r[at::B], r[at::C]);
@@ -346,7 +370,7 @@ fn rasterize_backward_tile<L: Lanes, const DEPTH: bool>(tile: &TileInput, band: 
             let end = L::splat(TRANSMITTANCE_MIN);
             let weight = weight.unless_le(next, end);
             next.unless_le(next, end).store(&mut live[b]);
-            if next.all_le(end) {
+            if last[b] == n as u32 || next.all_le(end) {
                 alive &= !(1 << b);
             }
             let gradient = each!(c in [0, 1, 2] => L::load(&d_colour[c][b]));
@@ -360,7 +384,7 @@ fn rasterize_backward_tile<L: Lanes, const DEPTH: bool>(tile: &TileInput, band: 
             }
             let rest = L::load(&behind[b]) - weight * along;
             rest.store(&mut behind[b]);
-            if !own {
+            if !pair.own {
                 continue;
             }
             // α dL/dα = α (T·along - rest / (1 - α)); zero where clamped, finished or skipped.
@@ -383,7 +407,7 @@ fn rasterize_backward_tile<L: Lanes, const DEPTH: bool>(tile: &TileInput, band: 
             sums[moment::ABS_X] = sums[moment::ABS_X] + a2.fma(vx, b1 * vy).abs();
             sums[moment::ABS_Y] = sums[moment::ABS_Y] + c2.fma(vy, b1 * vx).abs();
         }
-        if own {
+        if pair.own {
             L::sums(&sums).store(&mut out.0);
         }
     }
