@@ -1,6 +1,7 @@
 //! The command line, as data. Options without a meaning yet are not accepted.
 
 mod bench;
+mod cluster;
 mod sweep;
 mod synth;
 
@@ -17,6 +18,9 @@ use train::importance::Order;
 pub(crate) use bench::{
     AblateArgs, AdaptiveArgs, BenchCommand, BenchDemoArgs, BenchPruneArgs, BenchTreeArgs, ChartArgs, IngestArgs,
     KernelsArgs, ParetoArgs,
+};
+pub(crate) use cluster::{
+    Connection, CoordinatorArgs, JobArgs, JobsArgs, LogsArgs, RetryArgs, StatusArgs, SubmitArgs, TaskName, WorkerArgs,
 };
 pub(crate) use sweep::{Named, Sweep};
 pub(crate) use synth::SynthArgs;
@@ -61,6 +65,30 @@ pub(crate) enum Command {
     Prune(PruneArgs),
     /// Write a model in a format that other programs read
     Export(ExportArgs),
+    /// Host the jobs of a cluster, until it is told to stop
+    Coordinator(CoordinatorArgs),
+    /// Train blocks for a coordinator, until it is told to stop
+    Worker(WorkerArgs),
+    /// Give a capture to a cluster
+    Submit(SubmitArgs),
+    /// List a cluster's jobs
+    Jobs(JobsArgs),
+    /// Say how a job stands
+    Status(StatusArgs),
+    /// End a job; what is done stays done
+    Cancel(JobArgs),
+    /// Start no further task of a job; those under way go on
+    Pause(JobArgs),
+    /// Go on with a job that was paused
+    Resume(JobArgs),
+    /// Try a task again that failed
+    Retry(RetryArgs),
+    /// Forget a job that is over, and delete from the store what nothing else needs
+    Forget(JobArgs),
+    /// Say what happened in a job
+    Logs(LogsArgs),
+    /// Try out whether a store does what a cluster relies on, and how quick it is
+    Doctor(DoctorArgs),
     /// Measure plat itself
     #[command(subcommand)]
     Bench(BenchCommand),
@@ -228,6 +256,14 @@ pub(crate) struct DemoArgs {
     /// A smaller city, trained for under a minute
     #[arg(long)]
     pub(crate) quick: bool,
+}
+
+#[derive(Debug, Clone, Args)]
+pub(crate) struct DoctorArgs {
+    /// The store: a folder, file:///path or s3://bucket/prefix (reached as AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY, AWS_REGION
+    /// and AWS_ENDPOINT_URL say)
+    #[arg(long, value_name = "URL")]
+    pub(crate) store: String,
 }
 
 #[derive(Debug, Clone, Args)]

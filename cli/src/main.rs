@@ -11,12 +11,15 @@ mod config;
 mod cuts;
 mod failure;
 mod journal;
+mod live;
 mod lpips;
 mod maps;
 mod model;
 mod output;
 mod record;
+mod remote;
 mod seams;
+mod signals;
 mod variants;
 
 use std::process::ExitCode;
@@ -35,8 +38,11 @@ fn main() -> ExitCode {
         }
         Err(config::Stop::Usage(line)) => return fail(&Failure::Input(line)),
     };
-    if std::env::var_os("RUST_LOG").is_some() {
-        let filter = tracing_subscriber::EnvFilter::from_default_env();
+    // Who serves for days says what happens without being asked; whoever runs a command sees its notes.
+    let serves = matches!(cli.command, Command::Coordinator(_) | Command::Worker(_)) && !cli.quiet;
+    if std::env::var_os("RUST_LOG").is_some() || serves {
+        let filter = tracing_subscriber::EnvFilter::try_from_default_env();
+        let filter = filter.unwrap_or_else(|_| "warn,coordinator=info,worker=info".into());
         tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
     }
     let output = Output::new(cli.json, cli.quiet);
@@ -50,6 +56,18 @@ fn main() -> ExitCode {
         Command::Render(args) => commands::render::run(args, &output),
         Command::Prune(args) => commands::prune::run(args, &output),
         Command::Export(args) => commands::export::run(args, &output),
+        Command::Coordinator(args) => commands::coordinator::run(args, &output),
+        Command::Worker(args) => commands::worker::run(args, &output),
+        Command::Submit(args) => commands::submit::run(args, &output),
+        Command::Jobs(args) => commands::jobs::list(args, &output),
+        Command::Status(args) => commands::jobs::status(args, &output),
+        Command::Cancel(args) => commands::jobs::cancel(args, &output),
+        Command::Pause(args) => commands::jobs::pause(args, &output),
+        Command::Resume(args) => commands::jobs::resume(args, &output),
+        Command::Retry(args) => commands::jobs::retry(args, &output),
+        Command::Forget(args) => commands::jobs::forget(args, &output),
+        Command::Logs(args) => commands::jobs::logs(args, &output),
+        Command::Doctor(args) => commands::doctor::run(args, &output),
         Command::Bench(BenchCommand::Pareto(args)) => commands::pareto::run(args, &output),
         Command::Bench(BenchCommand::Ablate(args)) => commands::ablate::run(args, &output),
         Command::Bench(BenchCommand::Chart(args)) => commands::bench::chart(args, &output),

@@ -25,6 +25,11 @@ impl Output {
         Self { json, quiet, terminal: std::io::stderr().is_terminal() }
     }
 
+    /// Whether the result is an object for a program.
+    pub(crate) fn is_json(&self) -> bool {
+        self.json
+    }
+
     /// A line on the way, on stderr.
     pub(crate) fn note(&self, line: impl Display) {
         if !self.quiet {
@@ -42,6 +47,11 @@ impl Output {
         }
     }
 
+    /// A part of the terminal that is drawn again and again; `None` where stderr is no terminal, or quiet is asked for.
+    pub(crate) fn screen(&self) -> Option<Screen> {
+        (self.terminal && !self.quiet).then_some(Screen { lines: 0 })
+    }
+
     /// Progress of something with this many parts.
     pub(crate) fn progress(&self, what: &str, total: u64) -> Progress {
         let bar = (self.terminal && !self.quiet).then(|| {
@@ -57,6 +67,21 @@ impl Output {
     /// Progress of something whose stages become known on the way.
     pub(crate) fn stages(&self) -> Stages {
         Stages { output: *self, now: Mutex::new(None) }
+    }
+}
+
+/// The last lines of the terminal.
+#[derive(Debug)]
+pub(crate) struct Screen {
+    lines: usize,
+}
+
+impl Screen {
+    /// Draws these lines in the place of those before.
+    pub(crate) fn draw(&mut self, lines: &[String]) {
+        let up = if self.lines > 0 { format!("\x1b[{}A", self.lines) } else { String::new() };
+        to_stderr(&format!("{up}\x1b[J{}\n", lines.join("\n")));
+        self.lines = lines.len();
     }
 }
 

@@ -23,10 +23,11 @@
 //! - **C15** Every change of a task's record that must be durable is announced.
 //! - **C16** The end of a job is announced when it comes, once.
 //! - **C17** Time does not go back. What a task depends on does not change, and tasks do not disappear.
+//! - **C18** News is accepted only of an attempt that held its lease before, or of the result that was accepted already.
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use crate::events::Action;
+use crate::events::{Action, Event};
 use crate::job::{Counts, Indices, Job};
 use crate::lanes::Lane;
 use crate::retry;
@@ -178,11 +179,11 @@ fn check_lanes(scheduler: &Scheduler) -> Result<(), Violation> {
     Ok(())
 }
 
-/// Checks C11 to C17 of a step from `before` to `after`, which answered with `actions`.
+/// Checks C11 to C18 of a step from `before` to `after`, which heard `event` and answered with `actions`.
 ///
 /// # Errors
 /// The first invariant that does not hold.
-pub fn check_step(before: &Scheduler, after: &Scheduler, actions: &[Action]) -> Result<(), Violation> {
+pub fn check_step(before: &Scheduler, after: &Scheduler, event: &Event, actions: &[Action]) -> Result<(), Violation> {
     let (mut grants, mut announced, mut ends) = (BTreeMap::new(), BTreeSet::new(), BTreeMap::<JobId, usize>::new());
     for action in actions {
         match action {
@@ -195,6 +196,7 @@ pub fn check_step(before: &Scheduler, after: &Scheduler, actions: &[Action]) -> 
                 announced.insert((*job, *task));
             }
             Action::JobFinished { job, .. } => *ends.entry(*job).or_default() += 1,
+            Action::Accepted { attempt } => check_accepted(before, event, *attempt)?,
             _ => {}
         }
     }
@@ -228,6 +230,20 @@ pub fn check_step(before: &Scheduler, after: &Scheduler, actions: &[Action]) -> 
         ensure(16, said == due, || format!("the end of job {} was announced {said} times, due {due}", id.0))?;
     }
     ensure(17, before.now_millis <= after.now_millis, || "time went back".to_string())
+}
+
+fn check_accepted(before: &Scheduler, event: &Event, attempt: AttemptId) -> Result<(), Violation> {
+    let record = before.record(attempt.job, attempt.task);
+    let (of, result) = match event {
+        Event::Completed { attempt, artefact, .. } => (Some(*attempt), Some(*artefact)),
+        Event::Progressed { attempt, .. } | Event::Failed { attempt, .. } => (Some(*attempt), None),
+        _ => (None, None),
+    };
+    let held = record.is_some_and(|record| record.lease(attempt.fence).is_some());
+    let again = |artefact| TaskState::Done { fence: attempt.fence, artefact };
+    let said_before = record.zip(result).is_some_and(|(record, artefact)| record.state == again(artefact));
+    let right = of == Some(attempt) && (held || said_before);
+    ensure(18, right, || format!("news of {attempt} was accepted after {event:?}, it was {record:?}"))
 }
 
 fn check_grant(before: &Scheduler, after: &Scheduler, id: WorkerId, attempt: AttemptId) -> Result<(), Violation> {

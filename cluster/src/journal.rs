@@ -102,7 +102,7 @@ pub fn replay<'a>(lines: impl Iterator<Item = &'a str>, mut trace: impl FnMut(&s
                 let actions = scheduler.step(now_millis, event.clone());
                 trace(&format!("{now_millis} {event:?} -> {actions:?}"));
                 if let Some(before) = before {
-                    let held = check(scheduler).and_then(|()| check_step(&before, scheduler, &actions));
+                    let held = check(scheduler).and_then(|()| check_step(&before, scheduler, &event, &actions));
                     held.map_err(|violation| wrong(violation.to_string()))?;
                 }
                 if digest(&actions) != said {

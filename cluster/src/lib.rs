@@ -5,12 +5,13 @@
 //! never splats, files or sockets.
 //!
 //! - [`Scheduler`] is the state machine; `job`, `dag`, `queue`, `lanes`, `placement` and `retry` are its parts.
-//! - [`Snapshot`] is what must be durable of it, [`journal`] what it heard as lines of JSON.
+//! - [`Snapshot`] is what must be durable of it, [`Changes`] what a step changes of that, [`journal`] what it heard as lines of JSON.
 //! - [`check`] and [`check_step`] are the numbered invariants, [`sim`] plays faults by seed.
 
 mod attempts;
 mod control;
 mod dag;
+mod durable;
 mod events;
 mod invariants;
 mod job;
@@ -26,6 +27,7 @@ mod upkeep;
 mod words;
 
 pub use dag::DagError;
+pub use durable::Changes;
 pub use events::{Action, Event, Failure, FailureKind, Outcome};
 pub use invariants::{Violation, check, check_step};
 pub use scheduler::Scheduler;

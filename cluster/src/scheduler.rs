@@ -32,7 +32,7 @@ use scene::ArtefactId;
 use crate::events::{Action, Event, Outcome};
 use crate::job::{Indices, Job};
 use crate::lanes::{Lane, Worker};
-use crate::words::{JobId, Offer, Settings, TaskIndex, TaskRecord, WorkerId};
+use crate::words::{AttemptId, JobId, Offer, Settings, TaskIndex, TaskRecord, WorkerId};
 
 /// The scheduler of all jobs.
 #[derive(Debug, Clone)]
@@ -137,6 +137,11 @@ impl Scheduler {
     /// What is remembered of a task; `None` if there is no such.
     pub fn record(&self, job: JobId, task: TaskIndex) -> Option<&TaskRecord> {
         self.jobs.get(&job)?.task(task).map(|task| &task.record)
+    }
+
+    /// Whether an attempt holds its lease, so that what it says counts.
+    pub fn holds(&self, attempt: AttemptId) -> bool {
+        self.holder(attempt).is_some()
     }
 
     /// What is remembered of all tasks of a job, in their order.

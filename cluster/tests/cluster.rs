@@ -22,7 +22,8 @@ impl Cluster {
         let before = self.scheduler.clone();
         let actions = self.scheduler.step(self.now, event.clone());
         check(&self.scheduler).unwrap_or_else(|violation| panic!("{violation} after {event:?}"));
-        check_step(&before, &self.scheduler, &actions).unwrap_or_else(|violation| panic!("{violation} in {event:?}"));
+        check_step(&before, &self.scheduler, &event, &actions)
+            .unwrap_or_else(|violation| panic!("{violation} in {event:?}"));
         actions
     }
 

@@ -30,7 +30,7 @@ impl Checked {
         let before = self.0.clone();
         let actions = self.0.step(now, event.clone());
         check(&self.0).unwrap_or_else(|violation| panic!("{violation} after {event:?}"));
-        check_step(&before, &self.0, &actions).unwrap_or_else(|violation| panic!("{violation} in {event:?}"));
+        check_step(&before, &self.0, &event, &actions).unwrap_or_else(|violation| panic!("{violation} in {event:?}"));
         actions
     }
 

@@ -1,16 +1,28 @@
 //! Hosts the scheduler on the wire: takes jobs in, hands tasks out, commits results, tells whoever watches.
 //!
 //! ```text
-//! gRPC calls (service) ──▶ one channel ──▶ the owner task (jobs: one cluster::Scheduler) ──▶ replies, watch streams (news)
+//! gRPC calls (service) ──▶ one channel ──▶ the owner (jobs: one cluster::Scheduler) ──▶ replies, watch streams (news)
+//!                          leader: who owns │   ▲
+//!                                           ▼   │ once durable
+//!                                           state (slatedb on the job's store)
 //! ```
 //!
 //! Architecture invariant: it links no GPU and no trainer and never touches splat bytes; the only artefact that it reads
-//! is the plan. All state has one owner, and the time is read in one place: `own`. Jobs live in memory.
+//! is the plan. All state has one owner, and the scheduler's time is read in one place: `own`. Jobs live in memory, and with
+//! [`Options::durable`] in the store before anything is said that depends on them; the last lines of what happened in them (`log`)
+//! live in memory alone. Beyond this machine it listens only with a certificate and a token (`security`).
 
+mod collect;
 mod jobs;
+mod leader;
 mod local;
+mod log;
 mod news;
+mod owner;
+mod results;
+mod security;
 mod service;
+mod state;
 
 use std::future::Future;
 use std::time::Duration;
@@ -20,19 +32,25 @@ use scene::BadInput;
 use store::Store;
 use tokio::net::TcpListener;
 use tokio::sync::mpsc;
-use tokio::time::Instant;
+use tokio::task::{JoinError, JoinSet};
 use tokio_util::sync::CancellationToken;
 use tonic::transport::server::TcpIncoming;
 
 use jobs::Jobs;
-pub use local::{LocalError, run_local};
+pub use local::run_local;
+use owner::{Inbox, own};
+pub use results::{LocalError, Results, of_status};
+pub use security::Security;
+pub use state::StateError;
 
 /// Calls that may wait for the owner; further ones wait at the wire.
 const CALLS_LIMIT: usize = 1024;
 /// Open calls of one connection.
 const STREAMS_LIMIT: u32 = 256;
-/// How often time goes by for the scheduler when nothing else happens.
-const TICK: Duration = Duration::from_millis(100);
+/// A call that has no answer after this long is given up: the longest reads a plan of a hundred thousand tasks.
+const CALL_LIMIT: Duration = Duration::from_secs(60);
+/// The largest header of a call, in bytes.
+const HEADER_BYTES_LIMIT: u32 = 16 << 10;
 /// After a shutdown, open connections have this long to end.
 const GRACE: Duration = Duration::from_secs(2);
 
@@ -47,16 +65,51 @@ pub struct Options {
     pub wait_millis: u32,
     /// Whether workers may go home once all jobs are over; otherwise they wait for the next job.
     pub drain: bool,
-    /// What tells its grants from those of any earlier coordinator of the same workers: higher than theirs, at least 1.
+    /// What tells its grants from those of any earlier coordinator of the same workers: higher than theirs, at least 1. A
+    /// durable coordinator finds its own.
     pub epoch: u64,
+    /// Keeps jobs in the store and shares it with other coordinators, one of which leads; otherwise they live in memory.
+    pub durable: Option<Durable>,
     /// Gets what the scheduler hears, line by line, as `cluster::journal` replays it. It ends where the channel is full.
     pub journal: Option<mpsc::Sender<String>>,
+    /// Encryption and proofs: needed beyond this machine.
+    pub security: Security,
 }
 
 impl Options {
-    /// The defaults: 30 s leases, 200 ms waits, workers stay, no journal.
+    /// The defaults: 30 s leases, 200 ms waits, workers stay, jobs in memory, no journal, for this machine alone.
     pub fn new(store: Store) -> Self {
-        Self { store, settings: Settings::default(), wait_millis: 200, drain: false, epoch: 1, journal: None }
+        let (settings, security) = (Settings::default(), Security::default());
+        Self { store, settings, wait_millis: 200, drain: false, epoch: 1, durable: None, journal: None, security }
+    }
+}
+
+/// How a coordinator keeps its jobs in the store, beside others on the same store.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Durable {
+    /// How workers reach this coordinator, as the lease says it to them: `http://host:port` or `https://host:port`.
+    pub address: String,
+    /// How long a write waits for others to go with it.
+    pub flush: Duration,
+    /// The leader shows this often that it lives, and others look this often.
+    pub beat: Duration,
+    /// A leader that is silent for this long is followed by another.
+    pub patience: Duration,
+}
+
+impl Durable {
+    /// The defaults: writes every 50 ms, a beat each second, followed after four of silence.
+    ///
+    /// # Errors
+    /// An address that is no URL of a host and a port.
+    pub fn new(address: &str) -> Result<Self, BadInput> {
+        let plain = address.bytes().all(|byte| byte.is_ascii_graphic()) && address.len() <= 512;
+        if !plain || !(address.starts_with("http://") || address.starts_with("https://")) {
+            let problem = "is not where a worker could reach a coordinator";
+            return Err(BadInput::new(address.escape_default().to_string(), problem, "give it as http://host:port"));
+        }
+        let (flush, beat) = (Duration::from_millis(50), Duration::from_secs(1));
+        Ok(Self { address: address.into(), flush, beat, patience: Duration::from_secs(4) })
     }
 }
 
@@ -72,62 +125,80 @@ pub enum ServeError {
     /// The server failed.
     #[error("the coordinator's server failed: {0}")]
     Server(#[from] tonic::transport::Error),
+    /// The durable state failed: what it holds is not known to this process any more, and a new one reads it.
+    #[error(transparent)]
+    State(#[from] StateError),
 }
 
-/// Serves until `shutdown` ends. Jobs that still run are forgotten then, and their watchers' streams end.
+/// Serves until `shutdown` ends. Jobs in memory that still run are forgotten then, and their watchers' streams end; durable ones
+/// go on under the next coordinator. Dropped before, it stops at once and says nothing more, as if it had been killed.
 ///
 /// # Errors
-/// An address beyond this machine (the wire has no encryption and no token yet), or a listener that fails.
+/// An address beyond this machine without certificate and token, a certificate that is none, a listener that fails, a durable state
+/// that cannot be read or written.
 pub async fn serve(
     listener: TcpListener,
     options: Options,
     shutdown: impl Future<Output = ()> + Send,
 ) -> Result<(), ServeError> {
     let address = listener.local_addr()?;
-    if !address.ip().is_loopback() {
-        let problem = "is reachable from other machines, and the wire is neither encrypted nor authenticated";
-        return Err(BadInput::new(address.to_string(), problem, "listen on 127.0.0.1 or [::1]").into());
+    options.security.check(address)?;
+    let guard = options.security.guard();
+    let mut builder = tonic::transport::Server::builder()
+        .max_concurrent_streams(STREAMS_LIMIT)
+        .timeout(CALL_LIMIT)
+        .http2_keepalive_interval(Some(proto::KEEP_ALIVE))
+        .http2_keepalive_timeout(Some(proto::KEEP_ALIVE_TIMEOUT))
+        .http2_max_header_list_size(HEADER_BYTES_LIMIT);
+    if let Some(tls) = options.security.tls() {
+        builder = builder.tls_config(tls).map_err(|error| security::unusable(&error))?;
     }
     let (calls, inbox) = mpsc::channel(CALLS_LIMIT);
     let stop = CancellationToken::new();
-    let store = options.store.clone();
-    let owner = tokio::spawn(own(Jobs::new(options), inbox, stop.clone()));
-    let server = tonic::transport::Server::builder()
-        .max_concurrent_streams(STREAMS_LIMIT)
-        .add_service(proto::server(service::Service::new(store, calls)))
-        .serve_with_incoming_shutdown(
-            TcpIncoming::from(listener).with_nodelay(Some(true)),
-            stop.clone().cancelled_owned(),
-        );
+    let service = proto::server(service::Service::new(options.store.clone(), calls), guard);
+    // Aborted when it is dropped.
+    let mut owner = JoinSet::new();
+    owner.spawn(host(options, inbox, stop.clone()));
+    // Whoever asks for the health learns that this is alive and nothing else, so no token is asked for.
+    let (health, health_service) = tonic_health::server::health_reporter();
+    health.set_service_status(proto::SERVICE_NAME, tonic_health::ServingStatus::Serving).await;
+    let server = builder.add_service(health_service).add_service(service).serve_with_incoming_shutdown(
+        TcpIncoming::from(listener).with_nodelay(Some(true)),
+        stop.clone().cancelled_owned(),
+    );
     tokio::pin!(server);
-    let result = tokio::select! {
-        result = &mut server => result,
-        () = shutdown => {
-            stop.cancel();
-            tokio::time::timeout(GRACE, server).await.unwrap_or(Ok(()))
-        }
-    };
+    let (mut served, mut owned) = (None, None);
+    tokio::select! {
+        ended = &mut server => served = Some(ended),
+        ended = owner.join_next() => owned = ended,
+        () = shutdown => {}
+    }
     stop.cancel();
-    let _ = owner.await;
-    Ok(result?)
+    if served.is_none() {
+        served = tokio::time::timeout(GRACE, server).await.ok();
+    }
+    if owned.is_none() {
+        owned = owner.join_next().await;
+    }
+    owned.map_or(Ok(()), of_owner)?;
+    Ok(served.unwrap_or(Ok(()))?)
 }
 
-/// A call to the owner of the state: what to do with it, at this many milliseconds since it began.
-type Call = Box<dyn FnOnce(&mut Jobs, u64) + Send>;
+async fn host(options: Options, mut inbox: Inbox, stop: CancellationToken) -> Result<(), ServeError> {
+    match options.durable.clone() {
+        Some(durable) => leader::host(options, durable, inbox, stop).await,
+        None => {
+            own(Jobs::new(options), None, &mut inbox, &stop, &CancellationToken::new()).await?;
+            Ok(())
+        }
+    }
+}
 
-/// Owns the state: carries out one call after the other. The only place that reads a clock.
-async fn own(mut jobs: Jobs, mut inbox: mpsc::Receiver<Call>, stop: CancellationToken) {
-    let began = Instant::now();
-    let mut tick = tokio::time::interval(TICK);
-    tick.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
-    loop {
-        let call = tokio::select! {
-            biased;
-            () = stop.cancelled() => return,
-            call = inbox.recv() => call,
-            _ = tick.tick() => Some(Box::new(|jobs: &mut Jobs, now| jobs.tick(now)) as Call),
-        };
-        let Some(call) = call else { return };
-        call(&mut jobs, began.elapsed().as_millis() as u64);
+/// The owner panics only where an invariant of the scheduler does not hold, in debug builds.
+fn of_owner(ended: Result<Result<(), ServeError>, JoinError>) -> Result<(), ServeError> {
+    match ended {
+        Ok(ended) => ended,
+        Err(error) if error.is_panic() => std::panic::resume_unwind(error.into_panic()),
+        Err(_) => Ok(()),
     }
 }

@@ -5,37 +5,24 @@ use std::future::Future;
 use std::time::Duration;
 
 use proto::watch_event::Event as News;
-use proto::{Outcome, TaskState};
+use proto::{Access, Outcome};
 use scene::ArtefactId;
 use tokio::net::TcpListener;
 use tokio::task::JoinSet;
 use tokio_util::sync::CancellationToken;
-use tonic::transport::Endpoint;
-use tonic::{Code, Status};
 
-use crate::{Options, serve};
+use crate::results::{LocalError, Results, of_status};
+use crate::{Options, Security, serve};
 
 /// After the job, workers have this long to put down what they do.
 const GOODBYE: Duration = Duration::from_secs(10);
-
-/// Why a local job has no result.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum LocalError {
-    /// The plan or a task's input is wrong: exit code 2.
-    #[error("{0}")]
-    Input(String),
-    /// The work failed.
-    #[error("{0}")]
-    Failed(String),
-    /// It was stopped.
-    #[error("the job was cancelled")]
-    Cancelled,
-}
 
 /// Runs a plan that lies in `options.store` to its end: hosts a coordinator on 127.0.0.1, starts `workers` workers with
 /// `start_worker(coordinator_url, number, shutdown)`, submits the plan and hands every news of the job to `on_news`.
 /// Returns the tasks' results in the plan's order. `options.drain` is taken as true, and the workers are taken to share
 /// one machine ([`Settings::one_machine`](cluster::Settings::one_machine)).
+///
+/// Nobody else has its port, so `options.security` is left out.
 ///
 /// When `stop` is cancelled the job is cancelled and the workers are told. (The workers come in as a function because a
 /// coordinator must not depend on what trains.)
@@ -61,11 +48,11 @@ where
     let home = CancellationToken::new();
     // If this future is dropped, everything that it started ends.
     let _dropped = home.clone().drop_guard();
-    let hosting = Options { drain: true, settings: options.settings.one_machine(), ..options };
+    let (settings, security) = (options.settings.one_machine(), Security::default());
+    let hosting = Options { drain: true, settings, security, ..options };
     let server = tokio::spawn(serve(listener, hosting, home.child_token().cancelled_owned()));
 
-    let channel = Endpoint::from_shared(url.clone()).map_err(failed("the coordinator's address"))?.connect_lazy();
-    let mut client = proto::client(channel);
+    let mut client = proto::connect(&url, &Access::default()).map_err(failed("the coordinator's address"))?;
     let request = proto::SubmitRequest { plan: plan.0.to_vec(), store_url };
     let job = client.submit(request).await.map_err(of_status)?.into_inner();
 
@@ -123,54 +110,6 @@ where
     }
 }
 
-/// The last known state of each task.
-struct Results {
-    tasks: Vec<proto::TaskChanged>,
-}
-
-impl Results {
-    fn new(tasks: u32) -> Self {
-        Self { tasks: (0..tasks).map(|task| proto::TaskChanged { task, ..Default::default() }).collect() }
-    }
-
-    fn note(&mut self, changed: proto::TaskChanged) -> Result<(), LocalError> {
-        let task = changed.task;
-        let unknown = || LocalError::Failed(format!("news of task {task}, which the plan does not have"));
-        *self.tasks.get_mut(task as usize).ok_or_else(unknown)? = changed;
-        Ok(())
-    }
-
-    fn all(self) -> Result<Vec<ArtefactId>, LocalError> {
-        self.tasks.iter().map(|task| proto::artefact_id(&task.artefact).map_err(of_status)).collect()
-    }
-
-    fn failure(&self) -> LocalError {
-        let count = |wanted: TaskState| self.tasks.iter().filter(|task| task.state() == wanted).count();
-        let first = self.tasks.iter().find(|task| matches!(task.state(), TaskState::Failed | TaskState::Quarantined));
-        let Some(first) = first else {
-            return LocalError::Failed("the job ended before all tasks were done".into());
-        };
-        let mut line = format!("task {} failed in attempt {}: {}", first.task, first.attempt, first.message);
-        let others = count(TaskState::Failed) + count(TaskState::Quarantined) - 1;
-        let blocked = count(TaskState::Waiting);
-        if others > 0 {
-            line += &format!("; {others} more failed");
-        }
-        if blocked > 0 {
-            line += &format!("; {blocked} that depend on such were not started");
-        }
-        if first.state() == TaskState::Failed { LocalError::Input(line) } else { LocalError::Failed(line) }
-    }
-}
-
 fn failed<E: fmt::Display>(what: &'static str) -> impl Fn(E) -> LocalError {
     move |error| LocalError::Failed(format!("{what}: {error}"))
-}
-
-fn of_status(status: Status) -> LocalError {
-    let line = status.message().to_string();
-    match status.code() {
-        Code::InvalidArgument | Code::NotFound | Code::FailedPrecondition => LocalError::Input(line),
-        _ => LocalError::Failed(line),
-    }
 }

@@ -5,11 +5,13 @@ use std::pin::Pin;
 
 use blocks::{Plan, Price};
 use cluster::{Failure, FailureKind, JobSpec, Offer, TaskIndex, TaskNode};
+use proto::control_request::What;
 use proto::coordinator_server::Coordinator;
 use proto::{
-    AttemptReply, CancelReply, CancelRequest, CompleteRequest, ControlReply, ControlRequest, FailRequest, LeaseReply,
-    LeaseRequest, ReportReply, ReportRequest, StatusReply, StatusRequest, SubmitReply, SubmitRequest, WatchEvent,
-    WatchRequest,
+    AboutReply, AboutRequest, AttemptReply, BlocksReply, BlocksRequest, CancelReply, CancelRequest, CompleteRequest,
+    ControlReply, ControlRequest, FailRequest, JobsReply, JobsRequest, LeaseReply, LeaseRequest, LeaveReply,
+    LeaveRequest, LogsReply, LogsRequest, ReportReply, ReportRequest, StatusReply, StatusRequest, SubmitReply,
+    SubmitRequest, WatchEvent, WatchRequest,
 };
 use scene::{ArtefactId, BlockId, CodecError};
 use store::{Store, StoreError};
@@ -18,13 +20,14 @@ use tokio_stream::wrappers::ReceiverStream;
 use tokio_stream::{Stream, StreamExt};
 use tonic::{Request, Response, Status};
 
-use crate::Call;
 use crate::jobs::Jobs;
+use crate::owner::Call;
 
 /// The largest plan that is read, in bytes: 100,000 tasks with 300 windows each fit twice.
 const PLAN_BYTES_LIMIT: u64 = 1 << 30;
 
 /// The wire's side of the coordinator.
+#[derive(Clone)]
 pub(crate) struct Service {
     store: Store,
     calls: mpsc::Sender<Call>,
@@ -37,23 +40,58 @@ impl Service {
         Self { store, calls }
     }
 
-    /// Has the owner of the state do this, and waits for its answer.
+    /// Has the owner of the state do this, and waits for its answer until what it says is durable.
     async fn ask<T: Send + 'static>(
         &self,
         what: impl FnOnce(&mut Jobs, u64) -> Result<T, Status> + Send + 'static,
     ) -> Result<T, Status> {
-        let gone = || Status::unavailable("the coordinator is shutting down");
         let (reply, answer) = oneshot::channel();
-        let call: Call = Box::new(move |jobs, now| {
-            // The caller may have hung up; what it asked for is done all the same.
-            let _ = reply.send(what(jobs, now));
+        let call: Call = Box::new(move |host| match host {
+            Ok((jobs, now)) => {
+                let said = what(jobs, now);
+                // The caller may have hung up; what it asked for is done all the same.
+                jobs.once_durable(move || drop(reply.send(said)));
+            }
+            Err(status) => drop(reply.send(Err(status))),
         });
+        self.wait_for(call, answer).await
+    }
+
+    /// As [`ask`](Self::ask), for a sign of life, which changes nothing that must be durable.
+    async fn ask_at_once<T: Send + 'static>(
+        &self,
+        what: impl FnOnce(&mut Jobs, u64) -> Result<T, Status> + Send + 'static,
+    ) -> Result<T, Status> {
+        let (reply, answer) = oneshot::channel();
+        let call: Call = Box::new(move |host| drop(reply.send(host.and_then(|(jobs, now)| what(jobs, now)))));
+        self.wait_for(call, answer).await
+    }
+
+    async fn wait_for<T>(&self, call: Call, answer: oneshot::Receiver<Result<T, Status>>) -> Result<T, Status> {
+        let gone = || Status::unavailable("the coordinator is shutting down or leads no more");
         self.calls.send(call).await.map_err(|_| gone())?;
         answer.await.map_err(|_| gone())?
     }
 
-    /// Reads a plan as the scheduler sees it.
-    async fn read_plan(&self, id: ArtefactId) -> Result<JobSpec, Status> {
+    /// Deletes what a job left, then forgets it. Goes on to its end if the caller hangs up.
+    async fn forget(&self, job: u64) -> Result<u32, Status> {
+        let service = self.clone();
+        let work = tokio::spawn(async move {
+            let left = service.ask(move |jobs, _| jobs.collect(job)).await?;
+            let deleted = left.delete(&service.store).await.map_err(store_status);
+            let whole = deleted.is_ok();
+            service.ask(move |jobs, now| jobs.collected(now, job, whole)).await?;
+            deleted
+        });
+        work.await.map_err(|_| Status::internal("the store could not be swept"))?
+    }
+
+    /// Reads of a plan what `look` finds in it.
+    async fn read_plan<T: Send + 'static>(
+        &self,
+        id: ArtefactId,
+        look: impl FnOnce(&Plan) -> Result<T, CodecError> + Send + 'static,
+    ) -> Result<T, Status> {
         match self.store.size(id).await.map_err(store_status)? {
             Some(bytes) if bytes > PLAN_BYTES_LIMIT => {
                 return Err(Status::invalid_argument(format!("artefact {id} is too large for a plan: {bytes} bytes")));
@@ -61,14 +99,16 @@ impl Service {
             _ => {}
         }
         let bytes = self.store.get(id).await.map_err(store_status)?;
-        let read = tokio::task::spawn_blocking(move || {
-            let plan = Plan::from_frame(&bytes)?;
-            Ok(JobSpec { backend: plan.backend.clone(), priority: 0, weight: 1, tasks: dag_of(&plan)? })
-        });
+        let read = tokio::task::spawn_blocking(move || look(&Plan::from_frame(&bytes)?));
         read.await
             .map_err(|_| Status::internal("the plan could not be read"))?
             .map_err(|error: CodecError| Status::invalid_argument(format!("artefact {id}: {error}")))
     }
+}
+
+/// A plan as the scheduler sees it.
+fn spec_of(plan: &Plan) -> Result<JobSpec, CodecError> {
+    Ok(JobSpec { backend: plan.backend.clone(), priority: 0, weight: 1, tasks: dag_of(plan)? })
 }
 
 /// A task depends on its parent's and its context's tasks.
@@ -109,6 +149,12 @@ fn attempt_of(attempt: Option<proto::Attempt>) -> Result<proto::Attempt, Status>
 
 #[tonic::async_trait]
 impl Coordinator for Service {
+    async fn about(&self, _: Request<AboutRequest>) -> Answer<AboutReply> {
+        let backends = self.ask(|jobs, _| Ok(jobs.backends())).await?;
+        let (store_url, version) = (self.store.url().to_string(), env!("CARGO_PKG_VERSION").to_string());
+        Ok(Response::new(AboutReply { store_url, version, backends }))
+    }
+
     async fn submit(&self, request: Request<SubmitRequest>) -> Answer<SubmitReply> {
         let request = request.into_inner();
         if request.store_url != self.store.url() {
@@ -117,14 +163,14 @@ impl Coordinator for Service {
             return Err(Status::failed_precondition(problem));
         }
         let plan = proto::artefact_id(&request.plan)?;
-        let spec = self.read_plan(plan).await?;
+        let spec = self.read_plan(plan, spec_of).await?;
         let tasks = spec.tasks.len() as u32;
         let job = self.ask(move |jobs, now| jobs.submit(now, plan, spec)).await?;
         Ok(Response::new(SubmitReply { job, tasks }))
     }
 
     async fn lease(&self, request: Request<LeaseRequest>) -> Answer<LeaseReply> {
-        let LeaseRequest { worker, backend, memory_bytes, cached } = request.into_inner();
+        let LeaseRequest { worker, backend, memory_bytes, cached, epoch } = request.into_inner();
         proto::check_name("worker", &worker)?;
         proto::check_name("backend", &backend)?;
         if cached.len() > cluster::CACHED_LIMIT {
@@ -134,7 +180,7 @@ impl Coordinator for Service {
         let cached = cached.iter().map(|id| proto::artefact_id(id)).collect::<Result<BTreeSet<_>, Status>>()?;
         let cached = cached.into_iter().collect();
         let offer = Offer { backend, memory_bytes, cached };
-        let reply = self.ask(move |jobs, now| jobs.lease(now, &worker, offer)).await?;
+        let reply = self.ask(move |jobs, now| jobs.lease(now, &worker, offer, epoch)).await?;
         Ok(Response::new(LeaseReply { reply: Some(reply) }))
     }
 
@@ -145,7 +191,7 @@ impl Coordinator for Service {
             let advice = format!("a call carries at most {} reports, of finite numbers", proto::REPORTS_LIMIT);
             return Err(Status::invalid_argument(advice));
         }
-        let accepted = self.ask(move |jobs, now| jobs.report(now, attempt, reports)).await?;
+        let accepted = self.ask_at_once(move |jobs, now| jobs.report(now, attempt, reports)).await?;
         Ok(Response::new(ReportReply { cancelled: !accepted }))
     }
 
@@ -196,7 +242,44 @@ impl Coordinator for Service {
     async fn control(&self, request: Request<ControlRequest>) -> Answer<ControlReply> {
         let ControlRequest { job, what } = request.into_inner();
         let what = what.ok_or_else(|| Status::invalid_argument("the call says nothing that this coordinator knows"))?;
+        if let What::Forget(_) = what {
+            return Ok(Response::new(ControlReply { deleted: self.forget(job).await? }));
+        }
         self.ask(move |jobs, now| jobs.control(now, job, what)).await?;
-        Ok(Response::new(ControlReply {}))
+        Ok(Response::new(ControlReply { deleted: 0 }))
+    }
+
+    async fn leave(&self, request: Request<LeaveRequest>) -> Answer<LeaveReply> {
+        let worker = request.into_inner().worker;
+        proto::check_name("worker", &worker)?;
+        let left = move |jobs: &mut Jobs, now| {
+            jobs.leave(now, &worker);
+            Ok(())
+        };
+        self.ask(left).await?;
+        Ok(Response::new(LeaveReply {}))
+    }
+
+    async fn jobs(&self, _: Request<JobsRequest>) -> Answer<JobsReply> {
+        Ok(Response::new(self.ask(|jobs, _| Ok(jobs.list())).await?))
+    }
+
+    async fn blocks(&self, request: Request<BlocksRequest>) -> Answer<BlocksReply> {
+        let job = request.into_inner().job;
+        let plan = self.ask(move |jobs, _| jobs.plan(job)).await?;
+        let columns = |plan: &Plan| {
+            let column = |of: fn(BlockId) -> u32| plan.tasks.iter().map(|task| of(task.block)).collect();
+            Ok(BlocksReply {
+                level: column(|block| block.level.into()),
+                x: column(|block| block.x),
+                y: column(|block| block.y),
+            })
+        };
+        Ok(Response::new(self.read_plan(plan, columns).await?))
+    }
+
+    async fn logs(&self, request: Request<LogsRequest>) -> Answer<LogsReply> {
+        let LogsRequest { job, after } = request.into_inner();
+        Ok(Response::new(self.ask(move |jobs, now| jobs.logs(now, job, after)).await?))
     }
 }

@@ -1,5 +1,5 @@
 //! The wire between coordinator, workers and command line: the types and the service of `proto/plat.proto`, the limits
-//! of a message, and checked conversions.
+//! of a message, who may call (`access`), and checked conversions.
 //!
 //! Architecture invariant: bulk data never goes through here, and generated types never enter floors 0 to 2.
 
@@ -8,12 +8,28 @@ mod generated {
     tonic::include_proto!("plat.v1");
 }
 
+mod access;
+pub mod leader;
+
+pub use access::{
+    Access, CALL_TIMEOUT, Client, Credentials, Guard, KEEP_ALIVE, KEEP_ALIVE_TIMEOUT, KeyPair, Token, VERSION_HEADER,
+    client, connect, explain, root_cause,
+};
 pub use generated::*;
+
+use std::collections::BTreeMap;
 
 use scene::ArtefactId;
 use tonic::Status;
-use tonic::transport::Channel;
+use tonic::service::interceptor::InterceptedService;
 
+/// The service's full name, by which its health is asked for.
+pub const SERVICE_NAME: &str = coordinator_server::SERVICE_NAME;
+
+/// The version of the wire that this program speaks. It grows where an older side would misunderstand a newer one.
+pub const VERSION: u32 = 2;
+/// The oldest version that a coordinator still serves. (The first one did not say its number.)
+pub const OLDEST: u32 = 2;
 /// The longest message that either side accepts, in bytes. The longest that is meant to occur is a grant: 40 bytes for
 /// each block of its context.
 pub const MESSAGE_BYTES_LIMIT: usize = 4 << 20;
@@ -24,18 +40,15 @@ pub const ERROR_BYTES_LIMIT: usize = 4096;
 /// The most reports in one call.
 pub const REPORTS_LIMIT: usize = 1024;
 
-/// A client whose messages are limited.
-pub fn client(channel: Channel) -> coordinator_client::CoordinatorClient<Channel> {
-    coordinator_client::CoordinatorClient::new(channel)
+/// A server whose messages are limited, for whom the guard lets in.
+pub fn server<S: coordinator_server::Coordinator>(
+    service: S,
+    guard: Guard,
+) -> InterceptedService<coordinator_server::CoordinatorServer<S>, Guard> {
+    let server = coordinator_server::CoordinatorServer::new(service)
         .max_decoding_message_size(MESSAGE_BYTES_LIMIT)
-        .max_encoding_message_size(MESSAGE_BYTES_LIMIT)
-}
-
-/// A server whose messages are limited.
-pub fn server<S: coordinator_server::Coordinator>(service: S) -> coordinator_server::CoordinatorServer<S> {
-    coordinator_server::CoordinatorServer::new(service)
-        .max_decoding_message_size(MESSAGE_BYTES_LIMIT)
-        .max_encoding_message_size(MESSAGE_BYTES_LIMIT)
+        .max_encoding_message_size(MESSAGE_BYTES_LIMIT);
+    InterceptedService::new(server, guard)
 }
 
 /// An artefact's name off the wire.
@@ -47,6 +60,13 @@ pub fn artefact_id(bytes: &[u8]) -> Result<ArtefactId, Status> {
         Status::invalid_argument(format!("an artefact's name has 32 bytes, this one has {}", bytes.len()))
     })?;
     Ok(ArtefactId(id))
+}
+
+/// Under which key a task's result and its checkpoints are remembered in the store: a result follows from its plan, which names
+/// the backend, and from the results that it is given, by task.
+pub fn memory_key(plan: ArtefactId, task: u32, inputs: &BTreeMap<u32, ArtefactId>) -> ArtefactId {
+    let inputs: Vec<String> = inputs.iter().map(|(task, id)| format!("{task}={id}")).collect();
+    ArtefactId::of(format!("{plan}/{task}/{}", inputs.join(",")).as_bytes())
 }
 
 /// A worker's or a backend's name off the wire: 1 to [`NAME_BYTES_LIMIT`] printable ASCII characters, so that it may
@@ -99,5 +119,17 @@ mod tests {
         assert!(one_line(&"ü".repeat(ERROR_BYTES_LIMIT)).len() <= ERROR_BYTES_LIMIT);
         assert!(Report { loss: Some(0.5), ..Report::default() }.is_finite());
         assert!(!Report { psnr: Some(f64::NAN), ..Report::default() }.is_finite());
+    }
+
+    /// What was once on the wire stays as it is; new lines are added to `wire.txt` with the change that needs them.
+    #[test]
+    fn nothing_on_the_wire_changes_its_meaning() {
+        let [kept, now] = [include_str!("../wire.txt"), include_str!(concat!(env!("OUT_DIR"), "/wire.txt"))];
+        for line in kept.lines() {
+            assert!(now.lines().any(|other| other == line), "'{line}' is no longer on the wire");
+        }
+        for line in now.lines() {
+            assert!(kept.lines().any(|other| other == line), "'{line}' is new: add it to proto/wire.txt");
+        }
     }
 }

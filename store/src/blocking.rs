@@ -4,8 +4,10 @@ use std::future::Future;
 use std::ops::Range;
 
 use bytes::Bytes;
+use futures::executor::block_on;
 use scene::ArtefactId;
 
+use crate::open::Network;
 use crate::{Store, StoreError};
 
 /// A [`Store`] whose calls return when the work is done. On a thread without an async runtime a folder is read and
@@ -30,7 +32,8 @@ impl BlockingStore {
     /// # Errors
     /// As there.
     pub fn put(&self, bytes: impl Into<Bytes>) -> Result<ArtefactId, StoreError> {
-        wait(self.store.put(bytes.into()))
+        let bytes = bytes.into();
+        self.wait(|store| async move { store.put(bytes).await })
     }
 
     /// See [`Store::get`].
@@ -38,7 +41,7 @@ impl BlockingStore {
     /// # Errors
     /// As there.
     pub fn get(&self, id: ArtefactId) -> Result<Bytes, StoreError> {
-        wait(self.store.get(id))
+        self.wait(|store| async move { store.get(id).await })
     }
 
     /// See [`Store::get_ranges`].
@@ -46,7 +49,8 @@ impl BlockingStore {
     /// # Errors
     /// As there.
     pub fn get_ranges(&self, id: ArtefactId, ranges: &[Range<u64>]) -> Result<Vec<Bytes>, StoreError> {
-        wait(self.store.get_ranges(id, ranges))
+        let ranges = ranges.to_vec();
+        self.wait(|store| async move { store.get_ranges(id, &ranges).await })
     }
 
     /// See [`Store::size`].
@@ -54,7 +58,7 @@ impl BlockingStore {
     /// # Errors
     /// As there.
     pub fn size(&self, id: ArtefactId) -> Result<Option<u64>, StoreError> {
-        wait(self.store.size(id))
+        self.wait(|store| async move { store.size(id).await })
     }
 
     /// See [`Store::exists`].
@@ -62,7 +66,7 @@ impl BlockingStore {
     /// # Errors
     /// As there.
     pub fn exists(&self, id: ArtefactId) -> Result<bool, StoreError> {
-        wait(self.store.exists(id))
+        self.wait(|store| async move { store.exists(id).await })
     }
 
     /// See [`Store::put_name`].
@@ -70,7 +74,8 @@ impl BlockingStore {
     /// # Errors
     /// As there.
     pub fn put_name(&self, name: &str, bytes: impl Into<Bytes>) -> Result<(), StoreError> {
-        wait(self.store.put_name(name, bytes.into()))
+        let (name, bytes) = (name.to_owned(), bytes.into());
+        self.wait(|store| async move { store.put_name(&name, bytes).await })
     }
 
     /// See [`Store::get_name`].
@@ -78,10 +83,23 @@ impl BlockingStore {
     /// # Errors
     /// As there.
     pub fn get_name(&self, name: &str) -> Result<Option<Bytes>, StoreError> {
-        wait(self.store.get_name(name))
+        let name = name.to_owned();
+        self.wait(|store| async move { store.get_name(&name).await })
     }
-}
 
-fn wait<T>(work: impl Future<Output = T>) -> T {
-    futures::executor::block_on(work)
+    /// What a network is needed for is done on the store's own runtime, as this thread may have none, or one that waits for us.
+    fn wait<T, W>(&self, work: impl FnOnce(Store) -> W) -> T
+    where
+        T: Send + 'static,
+        W: Future<Output = T> + Send + 'static,
+    {
+        let work = work(self.store.clone());
+        match self.store.network.as_deref().and_then(Network::handle) {
+            None => block_on(work),
+            Some(network) => match block_on(network.spawn(work)) {
+                Ok(done) => done,
+                Err(error) => std::panic::resume_unwind(error.into_panic()),
+            },
+        }
+    }
 }

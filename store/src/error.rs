@@ -44,7 +44,7 @@ pub enum StoreError {
     /// The place itself failed.
     #[error("cannot {action} {path} in the store {store}: {reason}")]
     Failed {
-        /// read, write, look for
+        /// read, write, create, delete, list, look for
         action: &'static str,
         /// The object's path below the store's URL.
         path: String,
@@ -77,6 +77,30 @@ pub(crate) fn reason(error: &(dyn Error + 'static)) -> String {
             None => return root.to_string().replace('\n', " "),
         }
     }
+}
+
+/// As [`reason`], with plain words for what object servers say.
+pub(crate) fn reason_of(error: &object_store::Error) -> String {
+    let said = reason(error);
+    let whole = error.to_string();
+    if whole.contains("NoSuchBucket") {
+        return "there is no such bucket; create it, or name another".into();
+    }
+    match error {
+        object_store::Error::PermissionDenied { .. } | object_store::Error::Unauthenticated { .. } => {
+            format!(
+                "{}; check AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY and AWS_REGION, and what they may do",
+                short(&said)
+            )
+        }
+        _ => short(&said),
+    }
+}
+
+/// What a server says may be a page.
+fn short(text: &str) -> String {
+    const LIMIT: usize = 300;
+    if text.chars().count() <= LIMIT { text.into() } else { text.chars().take(LIMIT).chain("...".chars()).collect() }
 }
 
 #[cfg(test)]

@@ -7,32 +7,38 @@
 //! Architecture invariant: nothing here knows what the bytes mean.
 
 mod blocking;
+pub mod doctor;
 mod error;
 pub mod file;
+mod names;
+mod open;
 
-use std::error::Error;
+use std::ffi::OsString;
 use std::ops::Range;
-use std::path::Path as FilePath;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use bytes::Bytes;
-use object_store::local::LocalFileSystem;
-use object_store::memory::InMemory;
 use object_store::path::Path;
-use object_store::{ObjectStore, ObjectStoreExt};
-use scene::{ArtefactId, BadInput};
+use object_store::{ObjectStore, ObjectStoreExt, PutMode};
+use scene::ArtefactId;
+
+use names::is_missing;
+use open::{Network, Surroundings};
 
 pub use blocking::BlockingStore;
 pub use error::StoreError;
 
 /// The longest name of a record, in bytes.
 pub const NAME_LIMIT: usize = 200;
+/// A request to a server that fails in a way that may pass is tried so often again.
+const RETRIES: usize = 10;
 
 /// A place for artefacts and names. Clones are cheap and share the place.
 #[derive(Debug, Clone)]
 pub struct Store {
     objects: Arc<dyn ObjectStore>,
+    network: Option<Arc<Network>>,
     url: Arc<str>,
     read: Arc<AtomicU64>,
     written: Arc<AtomicU64>,
@@ -48,28 +54,33 @@ pub struct Traffic {
 }
 
 impl Store {
-    /// Opens a store: the path of a folder, which is made if it is missing, `file:///path` likewise, or `memory://`,
-    /// which is empty, and gone with its last clone.
+    /// Opens a store: the path of a folder, which is made if it is missing, `file:///path` likewise, `s3://bucket/prefix`, or
+    /// `memory://`, which is empty, and gone with its last clone.
+    ///
+    /// S3 is reached as the environment says: `AWS_ACCESS_KEY_ID`, `AWS_SECRET_ACCESS_KEY`, `AWS_SESSION_TOKEN`, `AWS_REGION`,
+    /// `AWS_ENDPOINT_URL` and the others of `object_store::aws::AmazonS3ConfigKey`. An endpoint without encryption beyond this
+    /// machine needs `AWS_ALLOW_HTTP=true`. Nothing is asked of the server yet.
     ///
     /// # Errors
-    /// A URL that is none, or of a kind that this program does not know; a folder that cannot be made or opened.
+    /// A URL that is none, or of a kind that this program does not know; a folder that cannot be made or opened; variables
+    /// that make no sense together.
     pub fn open(url: &str) -> Result<Self, StoreError> {
-        const ADVICE: &str = "give the path of a folder, file:///path or memory://";
-        let objects: Arc<dyn ObjectStore> = match url.split_once("://") {
-            None if url.is_empty() => return Err(BadInput::new("the store", "has an empty URL", ADVICE).into()),
-            None => Arc::new(folder(url, FilePath::new(url))?),
-            Some(("memory", "")) => Arc::new(InMemory::new()),
-            Some(("file", _)) => {
-                let path = url::Url::parse(url).ok().and_then(|url| url.to_file_path().ok());
-                let path = path.ok_or_else(|| BadInput::new(url, "is not the URL of a local folder", ADVICE))?;
-                Arc::new(folder(url, &path)?)
-            }
-            Some((scheme, _)) => {
-                let problem = format!("stores of the kind {scheme}:// are not supported by this version");
-                return Err(BadInput::new(url, problem, ADVICE).into());
-            }
-        };
-        Ok(Self { objects, url: url.into(), read: Arc::default(), written: Arc::default() })
+        let text = |(name, value): (OsString, OsString)| Some((name.into_string().ok()?, value.into_string().ok()?));
+        let variables = std::env::vars_os().filter_map(text);
+        Self::open_with(url, Surroundings { variables, retries: RETRIES })
+    }
+
+    /// A store in any other place; `url` is what errors and [`Store::url`] call it.
+    pub fn over(objects: Arc<dyn ObjectStore>, url: &str) -> Self {
+        Self { objects, network: None, url: url.into(), read: Arc::default(), written: Arc::default() }
+    }
+
+    fn open_with(
+        url: &str,
+        surroundings: Surroundings<impl Iterator<Item = (String, String)>>,
+    ) -> Result<Self, StoreError> {
+        let open::Place { objects, network } = open::open(url, surroundings)?;
+        Ok(Self { network, ..Self::over(objects, url) })
     }
 
     /// The same place with a count of its own, from 0, that its clones share.
@@ -93,18 +104,28 @@ impl Store {
     }
 
     /// Stores bytes under their hash. An artefact that is there already, at its full length, is left alone; otherwise
-    /// it appears whole or not at all.
+    /// it appears whole or not at all, and where it is not there it is created, never replaced.
     ///
     /// # Errors
     /// The store refuses the write: full, read-only, not reachable.
     pub async fn put(&self, bytes: Bytes) -> Result<ArtefactId, StoreError> {
         let id = ArtefactId::of(&bytes);
         let path = artefact_path(id);
-        if matches!(self.objects.head(&path).await, Ok(found) if found.size == bytes.len() as u64) {
-            return Ok(id);
+        let mode = match self.objects.head(&path).await {
+            Ok(found) if found.size == bytes.len() as u64 => return Ok(id),
+            // One that was cut is mended.
+            Ok(_) => PutMode::Overwrite,
+            Err(_) => PutMode::Create,
+        };
+        match self.write(&path, bytes.clone(), mode).await {
+            // Whoever was faster wrote the same bytes.
+            Ok(()) | Err(object_store::Error::AlreadyExists { .. }) => return Ok(id),
+            // A file system without links cannot create without replacing; what would be replaced is the same.
+            Err(_) if self.network.is_none() => {}
+            Err(error) => return Err(self.failed("write", &path, &error)),
         }
-        self.write(&path, bytes).await?;
-        Ok(id)
+        let written = self.write(&path, bytes, PutMode::Overwrite).await;
+        written.map(|()| id).map_err(|error| self.failed("write", &path, &error))
     }
 
     /// The bytes of an artefact, checked against its hash.
@@ -144,7 +165,7 @@ impl Store {
         let path = artefact_path(id);
         match self.objects.head(&path).await {
             Ok(found) => Ok(Some(found.size)),
-            Err(object_store::Error::NotFound { .. }) => Ok(None),
+            Err(error) if is_missing(&error) => Ok(None),
             Err(error) => Err(self.failed("look for", &path, &error)),
         }
     }
@@ -157,26 +178,18 @@ impl Store {
         Ok(self.size(id).await?.is_some())
     }
 
-    /// Stores a small record under a name, over whatever was there; readers see the old record or the new one.
+    /// Forgets an artefact; one that is not there is forgotten already. Whoever calls it knows that nothing refers to it.
     ///
     /// # Errors
-    /// A name that is not made of ASCII letters, digits, `.`, `_`, `-` and `/`, or a store that refuses the write.
-    pub async fn put_name(&self, name: &str, bytes: Bytes) -> Result<(), StoreError> {
-        let path = name_path(name)?;
-        self.write(&path, bytes).await
+    /// The store refuses it.
+    pub async fn remove(&self, id: ArtefactId) -> Result<(), StoreError> {
+        self.delete(&artefact_path(id)).await
     }
 
-    /// The record of this name, `None` if there is none.
-    ///
-    /// # Errors
-    /// A name as [`Store::put_name`] refuses it, or a store that cannot be read.
-    pub async fn get_name(&self, name: &str) -> Result<Option<Bytes>, StoreError> {
-        let path = name_path(name)?;
-        match self.read(&path).await {
-            Ok(bytes) => Ok(Some(bytes)),
-            Err(object_store::Error::NotFound { .. }) => Ok(None),
-            Err(error) => Err(self.failed("read", &path, &error)),
-        }
+    /// What lies below the store's URL, for a database that keeps itself there, below a folder that is neither `artefacts`
+    /// nor `names`. What it moves is not metered.
+    pub fn objects(&self) -> Arc<dyn ObjectStore> {
+        self.objects.clone()
     }
 
     async fn read(&self, path: &Path) -> object_store::Result<Bytes> {
@@ -185,47 +198,34 @@ impl Store {
         Ok(bytes)
     }
 
-    async fn write(&self, path: &Path, bytes: Bytes) -> Result<(), StoreError> {
+    async fn write(&self, path: &Path, bytes: Bytes, mode: PutMode) -> object_store::Result<()> {
         let length = bytes.len() as u64;
-        self.objects.put(path, bytes.into()).await.map_err(|error| self.failed("write", path, &error))?;
+        self.objects.put_opts(path, bytes.into(), mode.into()).await?;
         self.written.fetch_add(length, Ordering::Relaxed);
         Ok(())
     }
 
     fn artefact_failed(&self, id: ArtefactId, path: &Path, error: &object_store::Error) -> StoreError {
-        match error {
-            object_store::Error::NotFound { .. } => StoreError::Missing { id, store: self.url.to_string() },
-            other => self.failed("read", path, other),
+        if is_missing(error) {
+            StoreError::Missing { id, store: self.url.to_string() }
+        } else {
+            self.failed("read", path, error)
         }
     }
 
     fn failed(&self, action: &'static str, path: &Path, error: &object_store::Error) -> StoreError {
-        StoreError::Failed { action, path: path.to_string(), store: self.url.to_string(), reason: error::reason(error) }
+        StoreError::Failed {
+            action,
+            path: path.to_string(),
+            store: self.url.to_string(),
+            reason: error::reason_of(error),
+        }
     }
-}
-
-fn folder(url: &str, path: &FilePath) -> Result<LocalFileSystem, StoreError> {
-    let closed = |error: &(dyn Error + 'static)| StoreError::Closed { store: url.into(), reason: error::reason(error) };
-    std::fs::create_dir_all(path).map_err(|error| closed(&error))?;
-    LocalFileSystem::new_with_prefix(path).map_err(|error| closed(&error))
 }
 
 fn artefact_path(id: ArtefactId) -> Path {
     let hex = id.to_string();
     Path::from_iter(["artefacts", &hex[..2], &hex])
-}
-
-/// `names/<name>`, where no name can leave the folder.
-fn name_path(name: &str) -> Result<Path, StoreError> {
-    let plain = |part: &str| {
-        !part.is_empty()
-            && !part.starts_with('.')
-            && part.bytes().all(|b| b.is_ascii_alphanumeric() || matches!(b, b'.' | b'_' | b'-'))
-    };
-    if name.len() > NAME_LIMIT || !name.split('/').all(plain) {
-        return Err(StoreError::BadName(name.chars().take(NAME_LIMIT).collect()));
-    }
-    Ok(Path::from_iter(std::iter::once("names").chain(name.split('/'))))
 }
 
 #[cfg(test)]

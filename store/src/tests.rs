@@ -1,4 +1,9 @@
+use futures::StreamExt;
+use futures::future::join_all;
+use object_store::memory::InMemory;
+
 use super::*;
+use crate::doctor::examine;
 
 fn stores() -> (tempfile::TempDir, Vec<BlockingStore>) {
     let folder = tempfile::tempdir().unwrap();
@@ -8,7 +13,7 @@ fn stores() -> (tempfile::TempDir, Vec<BlockingStore>) {
     (folder, vec![open("memory://"), open(path.to_str().unwrap()), open(url.as_str())])
 }
 
-fn artefact_file(root: &FilePath, id: ArtefactId) -> std::path::PathBuf {
+fn artefact_file(root: &std::path::Path, id: ArtefactId) -> std::path::PathBuf {
     root.join(artefact_path(id).as_ref())
 }
 
@@ -102,8 +107,7 @@ fn other_urls_are_refused() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("file");
     std::fs::write(&file, "x").unwrap();
-    for bad in ["", "s3://bucket/key", "gs://b", "az://b", "file://relative/path", "memory://x", file.to_str().unwrap()]
-    {
+    for bad in ["", "gs://b", "az://b", "file://relative/path", "memory://x", file.to_str().unwrap()] {
         let line = Store::open(bad).unwrap_err().to_string();
         assert_eq!(line.lines().count(), 1, "{line}");
     }
@@ -115,4 +119,198 @@ async fn the_blocking_store_works_on_a_runtime_thread_too() {
     let store = Store::open(folder.path().to_str().unwrap()).unwrap();
     let id = store.blocking().put("some bytes").unwrap();
     assert_eq!(store.get(id).await.unwrap(), "some bytes");
+}
+
+#[test]
+fn the_url_of_a_bucket_and_its_variables_are_checked() {
+    let vars = |vars: &[(&str, &str)]| -> Vec<(String, String)> {
+        vars.iter().map(|(name, value)| ((*name).to_owned(), (*value).to_owned())).collect()
+    };
+    let open = |url: &str, of: &[(&str, &str)]| {
+        Store::open_with(url, Surroundings { variables: vars(of).into_iter(), retries: 0 })
+    };
+    let keys = [("AWS_ACCESS_KEY_ID", "k"), ("AWS_SECRET_ACCESS_KEY", "s3cret")];
+    let at = |endpoint: &'static str| [keys[0], keys[1], ("AWS_ENDPOINT_URL", endpoint)];
+    for url in ["s3://bucket", "s3://bucket/", "s3://my.bucket-1/a/b_c", "s3://bucket/prefix/"] {
+        assert_eq!(open(url, &keys).unwrap().url(), url);
+        // Of the server nothing is asked yet.
+        assert!(open(url, &at("http://127.0.0.1:1")).is_ok() && open(url, &at("https://far.example:9000")).is_ok());
+    }
+    for url in
+        ["s3://", "s3:///key", "s3://bucket//key", "s3://bucket/../other", "s3://b?x", "s3://b/k e y", "s3://b/#"]
+    {
+        assert!(matches!(open(url, &keys), Err(StoreError::BadUrl(_))), "{url}");
+    }
+    let line = |url: &str, of: &[(&str, &str)]| open(url, of).unwrap_err().to_string();
+    let secret = line("s3://key:s3cret@server/bucket", &keys);
+    assert!(secret.contains("AWS_SECRET_ACCESS_KEY") && !secret.contains("s3cret"), "{secret}");
+    assert!(line("s3://b", &keys[..1]).contains("half of its keys"));
+    assert!(line("s3://b", &at("http://far.example:9000")).contains("AWS_ALLOW_HTTP=true"));
+    assert!(line("s3://b", &at("far.example")).starts_with("AWS_ENDPOINT_URL"));
+    assert!(line("s3://b", &[("AWS_ENDPOINT_URL", "http://127.0.0.1:1")]).contains("no keys"));
+    let trusted = [keys[0], keys[1], ("AWS_ENDPOINT_URL", "http://far.example:9000"), ("AWS_ALLOW_HTTP", "true")];
+    assert!(open("s3://b", &trusted).is_ok());
+    let public = [("AWS_ENDPOINT_URL", "http://127.0.0.1:1"), ("AWS_SKIP_SIGNATURE", "true"), ("AWS_PROFILE", "me")];
+    assert!(open("s3://b", &public).is_ok());
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_server_that_is_away_gives_one_line_on_any_thread() {
+    let port = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+    let vars = [
+        ("AWS_ACCESS_KEY_ID", "k".to_owned()),
+        ("AWS_SECRET_ACCESS_KEY", "s".to_owned()),
+        ("AWS_ENDPOINT_URL", format!("http://127.0.0.1:{port}")),
+        ("AWS_TIMEOUT", "2 seconds".to_owned()),
+    ];
+    let variables = vars.into_iter().map(|(name, value)| (name.to_owned(), value));
+    let store = Store::open_with("s3://bucket/prefix", Surroundings { variables, retries: 0 }).unwrap();
+    let line = store.get_name("a").await.unwrap_err().to_string();
+    assert!(line.starts_with("cannot read names/a in the store s3://bucket/prefix: "), "{line}");
+    let blocking = store.blocking();
+    assert!(blocking.get_name("a").is_err());
+    let elsewhere = blocking.clone();
+    assert!(std::thread::spawn(move || elsewhere.get_name("a")).join().unwrap().is_err());
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn of_many_that_create_a_name_one_does() {
+    let folder = tempfile::tempdir().unwrap();
+    for store in [Store::open("memory://").unwrap(), Store::open(folder.path().to_str().unwrap()).unwrap()] {
+        for round in 0..10 {
+            let name = format!("leader/{round:06}.json");
+            let tries = (0..16).map(|writer: u8| store.create_name(&name, vec![writer].into()));
+            let won: Vec<bool> = join_all(tries).await.into_iter().map(Result::unwrap).collect();
+            let winner = won.iter().position(|won| *won).unwrap();
+            assert_eq!(won.iter().filter(|won| **won).count(), 1);
+            assert_eq!(store.newest("leader").await.unwrap().unwrap(), (round, vec![winner as u8].into()));
+        }
+        store.put_name("leader/newest.json", "no number".into()).await.unwrap();
+        store.put_name("leaders/99.json", "elsewhere".into()).await.unwrap();
+        assert_eq!(store.newest("leader").await.unwrap().unwrap().0, 9);
+        store.remove_name("leader/000009.json").await.unwrap();
+        store.remove_name("leader/000009.json").await.unwrap();
+        assert_eq!(store.newest("leader").await.unwrap().unwrap().0, 8);
+        assert_eq!(store.newest("nowhere").await.unwrap(), None);
+        assert_eq!(store.names("leader").await.unwrap().len(), 10);
+    }
+}
+
+#[tokio::test]
+async fn an_artefact_can_be_removed_and_put_again() {
+    let folder = tempfile::tempdir().unwrap();
+    for store in [Store::open("memory://").unwrap(), Store::open(folder.path().to_str().unwrap()).unwrap()] {
+        let id = store.put("some bytes".into()).await.unwrap();
+        store.remove(id).await.unwrap();
+        store.remove(id).await.unwrap();
+        assert!(!store.exists(id).await.unwrap());
+        assert_eq!(store.put("some bytes".into()).await.unwrap(), id);
+        assert_eq!(store.get(id).await.unwrap(), "some bytes");
+    }
+}
+
+/// A clock that goes a millisecond further whenever it is read.
+fn ticking() -> impl Fn() -> std::time::Duration {
+    let read = AtomicU64::new(0);
+    move || std::time::Duration::from_millis(read.fetch_add(1, Ordering::Relaxed))
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_doctor_finds_good_stores_fit_and_leaves_nothing() {
+    let folder = tempfile::tempdir().unwrap();
+    for store in [Store::open("memory://").unwrap(), Store::open(folder.path().to_str().unwrap()).unwrap()] {
+        let found = examine(&store, "test", &ticking()).await.unwrap();
+        assert!(found.is_fit() && found.races_held == crate::doctor::RACES, "{found:?}");
+        assert_eq!(found.create.p99, std::time::Duration::from_millis(1));
+        assert_eq!(found.read_bytes_per_second, 1000.0 * f64::from(16 << 20));
+        let left = store.objects().list(None).count().await;
+        assert_eq!((left, found.warnings.len()), (0, 0));
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_doctor_finds_stores_unfit_that_create_what_is_there_or_list_late() {
+    use faulty::{Fault, Faulty};
+    for (fault, words) in [
+        (Fault::CreateReplaces, "were told that they had: two coordinators"),
+        (Fault::CreateUnknown, "cannot be created only where there is none"),
+        (Fault::ListsNothing, "not listed"),
+    ] {
+        let objects = Arc::new(Faulty { inner: InMemory::new(), fault });
+        let found = examine(&Store::over(objects, "faulty"), "test", &ticking()).await.unwrap();
+        assert!(!found.is_fit() && found.faults.iter().any(|line| line.contains(words)), "{found:?}");
+    }
+}
+
+/// Servers as there are some.
+mod faulty {
+    use futures::stream::BoxStream;
+    use object_store::{
+        CopyOptions, GetOptions, GetResult, ListResult, MultipartUpload, ObjectMeta, PutMultipartOptions, PutOptions,
+        PutPayload, PutResult, Result,
+    };
+
+    use super::*;
+
+    #[derive(Debug, Clone, Copy, PartialEq)]
+    pub(super) enum Fault {
+        CreateReplaces,
+        CreateUnknown,
+        ListsNothing,
+    }
+
+    #[derive(Debug)]
+    pub(super) struct Faulty {
+        pub(super) inner: InMemory,
+        pub(super) fault: Fault,
+    }
+
+    impl std::fmt::Display for Faulty {
+        fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+            f.write_str("faulty")
+        }
+    }
+
+    #[async_trait::async_trait]
+    impl ObjectStore for Faulty {
+        async fn put_opts(&self, at: &Path, bytes: PutPayload, mut options: PutOptions) -> Result<PutResult> {
+            match (self.fault, &options.mode) {
+                (Fault::CreateReplaces, PutMode::Create) => options.mode = PutMode::Overwrite,
+                (Fault::CreateUnknown, PutMode::Create) => {
+                    let source = "501 Not Implemented".into();
+                    return Err(object_store::Error::Generic { store: "faulty", source });
+                }
+                _ => {}
+            }
+            self.inner.put_opts(at, bytes, options).await
+        }
+
+        async fn put_multipart_opts(
+            &self,
+            at: &Path,
+            options: PutMultipartOptions,
+        ) -> Result<Box<dyn MultipartUpload>> {
+            self.inner.put_multipart_opts(at, options).await
+        }
+
+        async fn get_opts(&self, at: &Path, options: GetOptions) -> Result<GetResult> {
+            self.inner.get_opts(at, options).await
+        }
+
+        fn delete_stream(&self, at: BoxStream<'static, Result<Path>>) -> BoxStream<'static, Result<Path>> {
+            self.inner.delete_stream(at)
+        }
+
+        fn list(&self, prefix: Option<&Path>) -> BoxStream<'static, Result<ObjectMeta>> {
+            if self.fault == Fault::ListsNothing { futures::stream::empty().boxed() } else { self.inner.list(prefix) }
+        }
+
+        async fn list_with_delimiter(&self, prefix: Option<&Path>) -> Result<ListResult> {
+            self.inner.list_with_delimiter(prefix).await
+        }
+
+        async fn copy_opts(&self, from: &Path, to: &Path, options: CopyOptions) -> Result<()> {
+            self.inner.copy_opts(from, to, options).await
+        }
+    }
 }

@@ -7,15 +7,14 @@ use std::time::Duration;
 use blocks::{Ground, Plan, PlanSettings, Task};
 use coordinator::{LocalError, Options, ServeError, run_local, serve};
 use glam::{DQuat, DVec2};
-use proto::coordinator_client::CoordinatorClient;
 use proto::lease_reply::Reply;
 use proto::watch_event::Event as News;
+use proto::{Access, Client};
 use scene::{ArtefactId, BlockId};
 use store::Store;
 use tokio::net::TcpListener;
 use tokio_util::sync::CancellationToken;
 use tonic::Code;
-use tonic::transport::{Channel, Endpoint};
 use worker::{Execute, ExecuteError, Flow, Report, TaskOrder};
 
 const BACKEND: &str = "cpu-none";
@@ -109,6 +108,12 @@ fn broken(message: &str, is_input: bool) -> ExecuteError {
     ExecuteError { message: message.into(), is_input }
 }
 
+/// A worker of this name.
+fn hand(coordinator_url: String, name: &str) -> worker::Options {
+    let (worker_id, backend) = (name.into(), BACKEND.into());
+    worker::Options { coordinator_url, access: Access::default(), worker_id, backend }
+}
+
 /// Runs the plan on workers of this fake; quick retries, a patient lease.
 async fn run(
     workers: usize,
@@ -120,7 +125,7 @@ async fn run(
     let mut news = Vec::new();
     let start = |coordinator_url, number, shutdown| {
         let worker_id = format!("local-{number}");
-        worker::run(worker::Options { coordinator_url, worker_id, backend: BACKEND.into() }, fake.clone(), shutdown)
+        worker::run(hand(coordinator_url, &worker_id), fake.clone(), shutdown)
     };
     let result = run_local(options, plan, workers, start, |event| news.push(event.clone()), stop).await;
     (result, news)
@@ -224,7 +229,7 @@ async fn what_is_not_a_plan_is_refused() {
 }
 
 /// A coordinator with one job, and a client; they end with the token.
-async fn host(lease_millis: u64) -> (CoordinatorClient<Channel>, String, u64, CancellationToken) {
+async fn host(lease_millis: u64) -> (Client, String, u64, CancellationToken) {
     let (store, plan) = stored_plan().await;
     let mut options = Options { wait_millis: 5, ..Options::new(store.clone()) };
     options.settings.lease_millis = lease_millis;
@@ -232,7 +237,7 @@ async fn host(lease_millis: u64) -> (CoordinatorClient<Channel>, String, u64, Ca
     let url = format!("http://{}", listener.local_addr().unwrap());
     let stop = CancellationToken::new();
     tokio::spawn(serve(listener, options, stop.clone().cancelled_owned()));
-    let mut client = proto::client(Endpoint::from_shared(url.clone()).unwrap().connect_lazy());
+    let mut client = proto::connect(&url, &Access::default()).unwrap();
     let request = proto::SubmitRequest { plan: plan.0.to_vec(), store_url: store.url().into() };
     let job = client.submit(request).await.unwrap().into_inner();
     assert_eq!(job.tasks, 7);
@@ -240,7 +245,7 @@ async fn host(lease_millis: u64) -> (CoordinatorClient<Channel>, String, u64, Ca
 }
 
 /// Asks until there is a grant, though not for ever.
-async fn lease(client: &mut CoordinatorClient<Channel>, worker: &str) -> proto::Attempt {
+async fn lease(client: &mut Client, worker: &str) -> proto::Attempt {
     for _ in 0..10_000 {
         let request = proto::LeaseRequest { worker: worker.into(), backend: BACKEND.into(), ..Default::default() };
         match client.lease(request).await.unwrap().into_inner().reply.unwrap() {
@@ -286,8 +291,7 @@ async fn a_leaving_worker_gives_its_task_back() {
             Err(broken("stopped", false))
         });
         let coordinator_url = url.clone();
-        let options = worker::Options { coordinator_url, worker_id: "leaving".into(), backend: BACKEND.into() };
-        worker::run(options, slow, leave).await.unwrap();
+        worker::run(hand(coordinator_url, "leaving"), slow, leave).await.unwrap();
     }
     // The leases were for an hour, and the next worker need not wait for their end.
     let next = lease(&mut client, "next").await;
@@ -306,8 +310,7 @@ async fn a_quiet_executor_keeps_its_lease() {
         }
         Ok(result_of(order))
     });
-    let options = worker::Options { coordinator_url: url, worker_id: "quiet".into(), backend: BACKEND.into() };
-    let run = tokio::spawn(worker::run(options, quiet.clone(), stop.clone()));
+    let run = tokio::spawn(worker::run(hand(url, "quiet"), quiet.clone(), stop.clone()));
     let mut news = client.watch(proto::WatchRequest { job }).await.unwrap().into_inner();
     while let Some(event) = news.message().await.unwrap() {
         if let Some(News::Finished(finished)) = event.event {
@@ -328,7 +331,7 @@ async fn a_job_is_paused_resumed_and_retried_and_its_journal_replays() {
     let url = format!("http://{}", listener.local_addr().unwrap());
     let stop = CancellationToken::new();
     let hosted = tokio::spawn(serve(listener, options, stop.clone().cancelled_owned()));
-    let mut client = proto::client(Endpoint::from_shared(url).unwrap().connect_lazy());
+    let mut client = proto::connect(&url, &Access::default()).unwrap();
     let request = proto::SubmitRequest { plan: plan.0.to_vec(), store_url: store.url().into() };
     let job = client.submit(request).await.unwrap().into_inner().job;
 

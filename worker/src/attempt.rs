@@ -5,29 +5,26 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use proto::coordinator_client::CoordinatorClient;
 use proto::{FailureKind, REPORTS_LIMIT};
 use tokio::sync::mpsc;
 use tokio::time::{Instant, MissedTickBehavior};
 use tokio_util::sync::CancellationToken;
-use tonic::transport::Channel;
 use tonic::{Code, Status};
 
-use crate::{Backoff, Execute, ExecuteError, Flow, Report, TaskOrder, is_passing};
+use crate::link::Link;
+use crate::{Execute, ExecuteError, Flow, Report, TaskOrder, is_passing};
 
 /// News go out this often, if there are any.
 const NEWS_PERIOD: Duration = Duration::from_millis(250);
 /// Signs of life per lease.
 const BEATS_PER_LEASE: u32 = 4;
 /// Tries to deliver the last word before the lease is left to expire: about half a minute.
-const LAST_WORD_TRIES: u32 = 10;
-
-type Client = CoordinatorClient<Channel>;
+const LAST_WORD_TRIES: u32 = 13;
 
 /// Carries out what was granted and says how it ended. Troubles on the wire are logged, not returned: the lease expires
 /// and the coordinator grants the task anew.
 pub(crate) async fn run(
-    client: &mut Client,
+    link: &mut Link,
     grant: proto::Grant,
     executor: Arc<dyn Execute>,
     shutdown: &CancellationToken,
@@ -37,6 +34,7 @@ pub(crate) async fn run(
         tracing::error!("a grant that makes no sense was dropped");
         return tokio::time::sleep(NEWS_PERIOD).await;
     };
+    link.saw(key.epoch);
     let stop = Arc::new(AtomicBool::new(false));
     let (sender, mut news) = mpsc::channel(REPORTS_LIMIT);
     let mut work = {
@@ -55,6 +53,8 @@ pub(crate) async fn run(
     let mut beat = tokio::time::interval(NEWS_PERIOD.min(longest_silence).max(Duration::from_millis(1)));
     beat.set_missed_tick_behavior(MissedTickBehavior::Delay);
     let mut last_call = Instant::now();
+    // How long to wait before it is looked for again who leads, where nobody answered.
+    let mut pause: Option<Duration> = None;
     let (mut void, mut leaving) = (false, false);
     let result = loop {
         tokio::select! {
@@ -65,9 +65,15 @@ pub(crate) async fn run(
                 stop.store(true, Ordering::Relaxed);
             }
             _ = beat.tick(), if !void => {
-                if !news.is_empty() || last_call.elapsed() >= longest_silence {
-                    void = !tell(client, key, &mut news).await;
+                let due = match pause {
+                    Some(pause) => last_call.elapsed() >= pause,
+                    None => !news.is_empty() || last_call.elapsed() >= longest_silence,
+                };
+                if due {
+                    let told = tell(link, key, &mut news).await;
                     last_call = Instant::now();
+                    pause = if let Told::Nobody(pause) = told { Some(pause) } else { None };
+                    void = told == Told::Void;
                     if void {
                         tracing::warn!(task = order.task, attempt = order.attempt, "the attempt is void, stopping");
                         stop.store(true, Ordering::Relaxed);
@@ -77,14 +83,14 @@ pub(crate) async fn run(
         }
     };
     if !void {
-        while !news.is_empty() && tell(client, key, &mut news).await {}
+        while !news.is_empty() && tell(link, key, &mut news).await == Told::Counts {}
     }
     if !void {
         let result = result.unwrap_or_else(|error| {
             let message = if error.is_panic() { panic_text(&*error.into_panic()) } else { error.to_string() };
             Err(ExecuteError { message, is_input: false })
         });
-        say_last_word(client, key, result, leaving).await;
+        say_last_word(link, key, result, leaving).await;
     }
 }
 
@@ -115,31 +121,47 @@ fn to_wire(report: Report) -> proto::Report {
     }
 }
 
-/// Sends the waiting news, or a mere sign of life. False if the attempt is void.
-async fn tell(client: &mut Client, key: proto::Attempt, news: &mut mpsc::Receiver<proto::Report>) -> bool {
+/// What came of a report.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Told {
+    /// The attempt holds its lease.
+    Counts,
+    /// It does not.
+    Void,
+    /// Nobody answered; the next try after this long.
+    Nobody(Duration),
+}
+
+/// Sends the waiting news, or a mere sign of life.
+async fn tell(link: &mut Link, key: proto::Attempt, news: &mut mpsc::Receiver<proto::Report>) -> Told {
     let reports = std::iter::from_fn(|| news.try_recv().ok()).take(REPORTS_LIMIT).collect();
-    match client.report(proto::ReportRequest { attempt: Some(key), reports }).await {
-        Ok(reply) => !reply.into_inner().cancelled,
+    let request = proto::ReportRequest { attempt: Some(key), reports };
+    let answer = async { link.client().await?.report(request).await }.await;
+    match answer {
+        Ok(reply) => {
+            link.found();
+            if reply.into_inner().cancelled { Told::Void } else { Told::Counts }
+        }
+        // A coordinator that does not know the job has forgotten it; any other trouble may pass.
+        Err(status) if status.code() == Code::NotFound => Told::Void,
         Err(status) => {
             tracing::warn!(task = key.task, attempt = key.number, "no answer to a report: {}", status.message());
-            // A coordinator that does not know the job has forgotten it; any other trouble may pass.
-            status.code() != Code::NotFound
+            Told::Nobody(link.lost())
         }
     }
 }
 
 async fn say_last_word(
-    client: &mut Client,
+    link: &mut Link,
     key: proto::Attempt,
     result: Result<scene::ArtefactId, ExecuteError>,
     leaving: bool,
 ) {
-    let mut backoff = Backoff::default();
     for _ in 0..LAST_WORD_TRIES {
         let answer = match &result {
             Ok(artefact) => {
-                let artefact = artefact.0.to_vec();
-                client.complete(proto::CompleteRequest { attempt: Some(key), artefact }).await
+                let request = proto::CompleteRequest { attempt: Some(key), artefact: artefact.0.to_vec() };
+                async { link.client().await?.complete(request).await }.await
             }
             Err(error) => {
                 let kind = match (leaving, error.is_input) {
@@ -148,13 +170,19 @@ async fn say_last_word(
                     (false, false) => FailureKind::Work,
                 };
                 let message = proto::one_line(&error.message);
-                client.fail(proto::FailRequest { attempt: Some(key), message, kind: kind.into() }).await
+                let request = proto::FailRequest { attempt: Some(key), message, kind: kind.into() };
+                async { link.client().await?.fail(request).await }.await
             }
         };
         match answer {
-            Ok(reply) if reply.get_ref().accepted => return,
-            Ok(_) => return log(key, "the coordinator refuses the result of a stale attempt"),
-            Err(status) if is_passing(&status) => tokio::time::sleep(backoff.next()).await,
+            Ok(reply) => {
+                link.found();
+                if !reply.get_ref().accepted {
+                    log(key, "the coordinator refuses the result of a stale attempt");
+                }
+                return;
+            }
+            Err(status) if is_passing(&status) => tokio::time::sleep(link.lost()).await,
             Err(status) => return log(key, status.message()),
         }
     }

@@ -183,6 +183,13 @@ impl Block<'_> {
                 let count = now.count();
                 stopped = !tell(step, loss, count, if evaluate { now.splats() } else { None }, last);
             }
+            // Whoever takes it up begins here, be it this worker.
+            if stopped
+                && let Some(memory) = self.memory
+                && let Some(state) = now.state()
+            {
+                memory.keep_checkpoint(&self.trainer.store, state);
+            }
             going(!stopped && !late)
         })
         .map_err(wrong)?;

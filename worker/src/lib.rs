@@ -15,6 +15,7 @@ pub mod cap;
 pub mod clock;
 pub mod estimate;
 pub mod execute;
+mod link;
 mod memory;
 pub mod merged;
 mod refine;
@@ -25,18 +26,18 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
 
+use proto::Access;
 use proto::lease_reply::Reply;
 use scene::{ArtefactId, BadInput};
 use tokio_util::sync::CancellationToken;
-use tonic::transport::Endpoint;
 use tonic::{Code, Status};
 
+use link::Link;
+pub use link::leader_of;
 pub use merged::Finished;
 
-/// Longest pause between two tries to reach a coordinator that is away.
-const BACKOFF_LIMIT: Duration = Duration::from_secs(5);
-/// A call without an answer for this long has failed.
-const CALL_TIMEOUT: Duration = Duration::from_secs(20);
+/// A coordinator that does not hear for this long that the worker leaves will notice by itself.
+const GOODBYE: Duration = Duration::from_secs(2);
 
 /// What a task needs to be carried out.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -110,8 +111,10 @@ pub trait Execute: Send + Sync + 'static {
 /// Who works for whom.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Options {
-    /// `http://host:port`.
+    /// `http://host:port`, `https://host:port`, or the URL of the store where whoever leads keeps its lease.
     pub coordinator_url: String,
+    /// What proves the worker to the coordinator, and the coordinator to it.
+    pub access: Access,
     /// Unique among the workers that run at the same time; printable ASCII without spaces.
     pub worker_id: String,
     /// The backend's full name; only jobs whose plan names the same are granted.
@@ -129,49 +132,89 @@ pub enum WorkerError {
     Refused(String),
 }
 
+/// Asks the coordinator what it is, for as long as it takes to get an answer; `None` if `shutdown` is cancelled first.
+///
+/// # Errors
+/// [`WorkerError`].
+pub async fn greet(options: &Options, shutdown: &CancellationToken) -> Result<Option<proto::AboutReply>, WorkerError> {
+    let mut link = Link::new(options)?;
+    while !shutdown.is_cancelled() {
+        let answer = tokio::select! {
+            biased;
+            () = shutdown.cancelled() => break,
+            answer = async { link.client().await?.about(proto::AboutRequest {}).await } => answer,
+        };
+        match answer {
+            Ok(about) => return Ok(Some(about.into_inner())),
+            Err(status) => wait(&mut link, options, status, shutdown).await?,
+        }
+    }
+    Ok(None)
+}
+
 /// Works until the coordinator has nothing left (`Ok`) or `shutdown` is cancelled (`Ok`; the task in hand is given
-/// back). Waits for a coordinator that is away for as long as it takes.
+/// back). Waits for a coordinator that is away for as long as it takes, and meanwhile goes on with the task in hand.
 ///
 /// # Errors
 /// [`WorkerError`].
 pub async fn run(options: Options, executor: Arc<dyn Execute>, shutdown: CancellationToken) -> Result<(), WorkerError> {
-    let url = &options.coordinator_url;
-    let endpoint = Endpoint::from_shared(url.clone()).map_err(|error| {
-        BadInput::new("--coordinator", format!("'{url}' is not a URL ({error})"), "give it as http://host:port")
-    })?;
-    let channel = endpoint.connect_timeout(BACKOFF_LIMIT).timeout(CALL_TIMEOUT).tcp_nodelay(true).connect_lazy();
-    let mut client = proto::client(channel);
-    let mut backoff = Backoff::default();
-    loop {
-        let (worker, backend) = (options.worker_id.clone(), options.backend.clone());
-        let request = proto::LeaseRequest { worker, backend, ..Default::default() };
+    let mut link = Link::new(&options)?;
+    while !shutdown.is_cancelled() {
+        let (worker, backend, epoch) = (options.worker_id.clone(), options.backend.clone(), link.epoch());
+        let request = proto::LeaseRequest { worker, backend, epoch, ..Default::default() };
         let answer = tokio::select! {
             biased;
-            () = shutdown.cancelled() => return Ok(()),
-            answer = client.lease(request) => answer,
+            () = shutdown.cancelled() => break,
+            answer = async { link.client().await?.lease(request).await } => answer,
         };
-        let pause = match answer.map(|reply| reply.into_inner().reply) {
+        match answer.map(|reply| reply.into_inner().reply) {
             Ok(Some(Reply::Grant(grant))) => {
-                backoff = Backoff::default();
-                attempt::run(&mut client, grant, executor.clone(), &shutdown).await;
-                continue;
+                link.found();
+                attempt::run(&mut link, grant, executor.clone(), &shutdown).await;
             }
             Ok(Some(Reply::WaitMillis(millis))) => {
-                backoff = Backoff::default();
-                Duration::from_millis(millis.into())
+                link.found();
+                pause(Duration::from_millis(millis.into()), &shutdown).await;
             }
             Ok(Some(Reply::Drained(_))) => return Ok(()),
             Ok(None) => return Err(WorkerError::Refused("it answers in a newer language".into())),
-            Err(status) if is_passing(&status) => {
-                tracing::warn!(coordinator = url, "waiting for the coordinator: {}", status.message());
-                backoff.next()
-            }
-            Err(status) => return Err(WorkerError::Refused(status.message().into())),
-        };
-        tokio::select! {
-            () = shutdown.cancelled() => return Ok(()),
-            () = tokio::time::sleep(pause) => {}
+            Err(status) => wait(&mut link, &options, status, &shutdown).await?,
         }
+    }
+    leave(&mut link, options.worker_id).await;
+    Ok(())
+}
+
+/// Waits before the same call is tried again.
+///
+/// # Errors
+/// The coordinator does not take the worker: no later call will fare better.
+async fn wait(
+    link: &mut Link,
+    options: &Options,
+    status: Status,
+    shutdown: &CancellationToken,
+) -> Result<(), WorkerError> {
+    if !is_passing(&status) {
+        return Err(WorkerError::Refused(proto::explain(&status)));
+    }
+    tracing::warn!(coordinator = options.coordinator_url, "waiting for the coordinator: {}", proto::explain(&status));
+    pause(link.lost(), shutdown).await;
+    Ok(())
+}
+
+async fn pause(long: Duration, shutdown: &CancellationToken) {
+    tokio::select! {
+        () = shutdown.cancelled() => {}
+        () = tokio::time::sleep(long) => {}
+    }
+}
+
+/// Says that the worker goes: a grant whose answer it did not wait for is free at once, too.
+async fn leave(link: &mut Link, worker: String) {
+    let said = async { link.client().await?.leave(proto::LeaveRequest { worker }).await };
+    if !matches!(tokio::time::timeout(GOODBYE, said).await, Ok(Ok(_))) {
+        tracing::warn!("the coordinator does not hear that this worker leaves");
     }
 }
 
@@ -186,18 +229,4 @@ fn is_passing(status: &Status) -> bool {
             | Code::Internal
             | Code::ResourceExhausted
     )
-}
-
-/// Pauses that double from 0.1 s to [`BACKOFF_LIMIT`].
-#[derive(Debug, Default)]
-struct Backoff {
-    tries: u32,
-}
-
-impl Backoff {
-    fn next(&mut self) -> Duration {
-        let pause = Duration::from_millis(100) * 2u32.pow(self.tries.min(10));
-        self.tries += 1;
-        pause.min(BACKOFF_LIMIT)
-    }
 }

@@ -18,8 +18,7 @@ pub(crate) struct Memory {
 
 impl Memory {
     pub(crate) fn of(order: &TaskOrder) -> Self {
-        let inputs: Vec<String> = order.inputs.iter().map(|(task, id)| format!("{task}={id}")).collect();
-        let key = ArtefactId::of(format!("{}/{}/{}", order.plan, order.task, inputs.join(",")).as_bytes());
+        let key = proto::memory_key(order.plan, order.task, &order.inputs);
         Self { result: format!("results/{key}"), checkpoint: format!("checkpoints/{key}") }
     }
 

@@ -2,14 +2,19 @@
 
 pub(crate) mod ablate;
 pub(crate) mod bench;
+pub(crate) mod coordinator;
 pub(crate) mod demo;
+pub(crate) mod doctor;
 pub(crate) mod eval;
 pub(crate) mod export;
 pub(crate) mod inspect;
+pub(crate) mod jobs;
 pub(crate) mod kernels;
 pub(crate) mod pareto;
 pub(crate) mod plan;
 pub(crate) mod prune;
 pub(crate) mod render;
+pub(crate) mod submit;
 pub(crate) mod synth;
 pub(crate) mod train;
+pub(crate) mod worker;

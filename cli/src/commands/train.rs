@@ -11,6 +11,7 @@ use blocks::{Plan, Severity};
 use coordinator::{LocalError, run_local};
 use dataset::ingest::{IngestOptions, Ingested, ingest};
 use dataset::open::Source;
+use proto::Access;
 use render::gpu::Gpu;
 use scene::{ArtefactId, BadInput, Capture};
 use serde::Serialize;
@@ -258,7 +259,7 @@ fn train_blocks(
     let runtime = runtime.map_err(|error| Failure::Work(format!("cannot start threads: {error}")))?;
     let start_worker = |coordinator_url, number: usize, shutdown| {
         let (worker_id, backend) = (format!("local-{number}"), backend.to_owned());
-        let options = worker::Options { coordinator_url, worker_id, backend };
+        let options = worker::Options { coordinator_url, access: Access::default(), worker_id, backend };
         worker::run(options, trainers[number].clone(), shutdown)
     };
     let result = runtime.block_on(async {

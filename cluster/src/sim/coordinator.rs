@@ -1,11 +1,12 @@
 //! A simulated coordinator: hears an event, steps its scheduler, makes what changed durable, and only then answers.
 
+use crate::durable::Changes;
 use crate::events::{Action, Event};
 use crate::invariants::{check, check_step};
 use crate::journal::{Line, digest, to_text};
 use crate::scheduler::Scheduler;
 use crate::sim::random::Random;
-use crate::sim::store::{Batch, Store};
+use crate::sim::store::Store;
 use crate::snapshot::RestoreError;
 use crate::words::{Settings, TaskState};
 
@@ -79,14 +80,14 @@ impl Node {
         }
         let wrong = |violation| format!("{violation} after {event:?}, which was answered by {actions:?}");
         check(scheduler).map_err(wrong)?;
-        check_step(&before, scheduler, &actions).map_err(wrong)?;
+        check_step(&before, scheduler, &event, &actions).map_err(wrong)?;
 
-        let batch = batch_of(scheduler, &event, &actions);
-        if !batch.headers.is_empty() || !batch.records.is_empty() {
+        let changes = Changes::of(scheduler, &event, &actions);
+        if !changes.is_empty() {
             if random.chance(faults.0) {
                 return Ok(Heard::Dead("store failed before"));
             }
-            if store.write(scheduler.epoch(), batch)?.is_err() {
+            if store.write(scheduler.epoch(), changes)?.is_err() {
                 return Ok(Heard::Dead("store fenced"));
             }
             if random.chance(faults.0) {
@@ -96,28 +97,6 @@ impl Node {
         }
         Ok(Heard::Said(actions))
     }
-}
-
-/// What must be durable before the actions are carried out: what they name, nothing else.
-fn batch_of(scheduler: &Scheduler, event: &Event, actions: &[Action]) -> Batch {
-    let mut batch = Batch::default();
-    for action in actions {
-        match action {
-            Action::Changed { job, task } => {
-                let record = scheduler.record(*job, *task).cloned();
-                batch.records.extend(record.map(|record| ((*job, *task), record)));
-            }
-            Action::Agreed { job } => {
-                batch.headers.insert(*job, scheduler.header(*job));
-                if let Event::Submitted { .. } = event {
-                    let records = scheduler.records(*job);
-                    batch.records.extend(records.map(|(task, record)| ((*job, task), record.clone())));
-                }
-            }
-            _ => {}
-        }
-    }
-    batch
 }
 
 /// Whether a coordinator that starts from the store now would know what this one knows.

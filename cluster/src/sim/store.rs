@@ -2,16 +2,9 @@
 
 use std::collections::BTreeMap;
 
+use crate::durable::Changes;
 use crate::snapshot::{JobHeader, JobSnapshot, Snapshot};
 use crate::words::{JobId, TaskIndex, TaskRecord, TaskState};
-
-/// What one step writes, all or nothing.
-#[derive(Debug, Default)]
-pub(crate) struct Batch {
-    /// `None`: forget the job.
-    pub(crate) headers: BTreeMap<JobId, Option<JobHeader>>,
-    pub(crate) records: BTreeMap<(JobId, TaskIndex), TaskRecord>,
-}
 
 /// A writer of an older epoch than the newest.
 #[derive(Debug, PartialEq, Eq)]
@@ -37,14 +30,14 @@ impl Store {
         (self.epoch, Snapshot { epoch, jobs: jobs.collect() })
     }
 
-    /// Writes a batch under an epoch.
+    /// Writes the changes of a step under an epoch.
     ///
     /// The outer error is a broken promise: a committed result that would change.
-    pub(crate) fn write(&mut self, epoch: u64, batch: Batch) -> Result<Result<(), Fenced>, String> {
+    pub(crate) fn write(&mut self, epoch: u64, changes: Changes) -> Result<Result<(), Fenced>, String> {
         if epoch < self.epoch {
             return Ok(Err(Fenced));
         }
-        for ((job, task), record) in &batch.records {
+        for ((job, task), record) in &changes.records {
             let old = self.records.get(&(*job, *task)).map(|old| &old.state);
             if let Some(TaskState::Done { .. }) = old
                 && old != Some(&record.state)
@@ -52,7 +45,7 @@ impl Store {
                 return Err(format!("the result of {}/{task} is committed twice: {old:?}, {:?}", job.0, record.state));
             }
         }
-        for (id, header) in batch.headers {
+        for (id, header) in changes.headers {
             match header {
                 Some(header) => {
                     self.headers.insert(id, header);
@@ -63,7 +56,7 @@ impl Store {
                 }
             }
         }
-        self.records.extend(batch.records);
+        self.records.extend(changes.records);
         Ok(Ok(()))
     }
 

@@ -316,7 +316,11 @@ fn rasterize_backward_tile<L: Lanes, const DEPTH: bool>(tile: &TileInput, band: 
     let (last, owned) = last_own(tile.pairs);
     alive &= owned;
     if alive == 0 {
-        return out.iter_mut().zip(tile.pairs).filter(|(_, pair)| pair.own).for_each(|(out, _)| *out = Moments::default());
+        return out
+            .iter_mut()
+            .zip(tile.pairs)
+            .filter(|(_, pair)| pair.own)
+            .for_each(|(out, _)| *out = Moments::default());
     }
     let mut d_colour = [[[0.0; 16]; BLOCKS]; 3];
     let mut d_depth: Plane = [[0.0; 16]; BLOCKS];

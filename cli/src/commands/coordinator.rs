@@ -1,0 +1,121 @@
+//! `plat coordinator`: hosts jobs for the workers of a cluster, until it is told to stop. Of several on one store one leads, the
+//! others stand by.
+
+use std::net::SocketAddr;
+use std::path::Path;
+
+use coordinator::{Durable, Options, Security, ServeError, serve};
+use scene::BadInput;
+use serde::Serialize;
+use store::Store;
+use store::file::append;
+use tokio::net::TcpListener;
+use tokio::sync::mpsc;
+use tokio_util::sync::CancellationToken;
+
+use crate::args::CoordinatorArgs;
+use crate::failure::{Failure, cannot};
+use crate::output::Output;
+use crate::remote::{key_pair, pem, runtime, token};
+use crate::signals::until_told;
+
+/// Lines of the journal that may wait for the disk.
+const JOURNAL_LAG: usize = 100_000;
+
+#[derive(Serialize)]
+struct Hosted {
+    command: &'static str,
+    listen: String,
+    /// As its lease says it to others.
+    address: String,
+    store: String,
+}
+
+pub(crate) fn run(args: &CoordinatorArgs, output: &Output) -> Result<(), Failure> {
+    let client_authority = args.tls_client_ca.as_deref().map(|path| pem("--tls-client-ca", path, "CERTIFICATE"));
+    let security = Security {
+        identity: key_pair(&args.tls_cert, &args.tls_key)?,
+        client_authority: client_authority.transpose()?,
+        token: token(&args.token_file)?,
+    };
+    let runtime = runtime()?;
+    let hosted = runtime.block_on(async {
+        let listener = TcpListener::bind(args.listen).await.map_err(|error| {
+            let advice = "choose another address, or stop what has it";
+            BadInput::new(format!("--listen {}", args.listen), format!("cannot be listened on ({error})"), advice)
+        })?;
+        let address = listener.local_addr().map_err(ServeError::Listen).map_err(of_serve)?;
+        security.check(address)?;
+        let store = Store::open(&absolute(&args.store)?)?;
+        let reached = reached_at(args, address, security.identity.is_some())?;
+        let durable = Some(Durable::new(&reached)?);
+        let mut options = Options { durable, security, ..Options::new(store.clone()) };
+        options.settings.lease_millis = (args.lease_seconds * 1e3) as u64;
+        let journal = match &args.journal {
+            None => None,
+            Some(path) => {
+                let (sender, lines) = mpsc::channel(JOURNAL_LAG);
+                options.journal = Some(sender);
+                Some(keep_journal(path, lines)?)
+            }
+        };
+        output.note(format!("listening on {address}, reached at {reached}, store {}", store.url()));
+        let stop = CancellationToken::new();
+        let told = tokio::spawn(until_told(stop.clone()));
+        let served = serve(listener, options, stop.cancelled_owned()).await.map_err(of_serve);
+        told.abort();
+        if let Some(journal) = journal {
+            // Ends with the last line, as whoever wrote is gone.
+            journal.await.map_err(|error| Failure::Work(error.to_string()))??;
+        }
+        let listen = address.to_string();
+        let hosted = Hosted { command: "coordinator", listen, address: reached, store: store.url().into() };
+        served.map(|()| hosted)
+    })?;
+    let text = format!("stopped listening on {}", hosted.listen);
+    output.result(&hosted, &text)
+}
+
+fn of_serve(error: ServeError) -> Failure {
+    match error {
+        ServeError::Input(error) => error.into(),
+        other => Failure::Work(other.to_string()),
+    }
+}
+
+/// The URL under which workers and other coordinators find this one.
+fn reached_at(args: &CoordinatorArgs, address: SocketAddr, encrypted: bool) -> Result<String, Failure> {
+    match &args.advertise {
+        Some(url) => Ok(url.clone()),
+        None if address.ip().is_unspecified() => {
+            let problem = "does not say under which name others reach this machine";
+            let advice = "give --advertise https://NAME:PORT, a name that the certificate is for";
+            Err(BadInput::new(format!("--listen {}", args.listen), problem, advice).into())
+        }
+        None => Ok(format!("{}://{address}", if encrypted { "https" } else { "http" })),
+    }
+}
+
+/// The store's URL as every process of the machine understands it.
+fn absolute(url: &str) -> Result<String, Failure> {
+    if url.contains("://") || url.is_empty() {
+        return Ok(url.into());
+    }
+    let path = std::path::absolute(url).map_err(cannot("found", Path::new(url)))?;
+    Ok(path.display().to_string())
+}
+
+/// Writes the scheduler's journal, line by line. A disk that refuses one is told, and the jobs go on without.
+fn keep_journal(
+    path: &Path,
+    mut lines: mpsc::Receiver<String>,
+) -> Result<tokio::task::JoinHandle<Result<(), Failure>>, Failure> {
+    let mut file = std::fs::File::create(path).map_err(cannot("written", path))?;
+    let path = path.to_path_buf();
+    Ok(tokio::task::spawn_blocking(move || {
+        while let Some(line) = lines.blocking_recv() {
+            append(&mut file, (line + "\n").as_bytes()).map_err(cannot("written", &path))?;
+        }
+        Ok(())
+    }))
+}

@@ -1,0 +1,112 @@
+//! `plat worker`: trains blocks for a coordinator, until it is told to stop. Then it leaves a checkpoint of the block in
+//! hand, gives the task back and goes; any worker goes on from there.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU32, Ordering};
+
+use scene::{ArtefactId, BadInput};
+use serde::Serialize;
+use tokio_util::sync::CancellationToken;
+use worker::execute::{BlockTrainer, Shared, TrainerOptions};
+use worker::{Execute, ExecuteError, Flow, Report, TaskOrder, WorkerError};
+
+use crate::args::WorkerArgs;
+use crate::commands::train::{CACHE_BYTES, compute_on};
+use crate::failure::Failure;
+use crate::output::Output;
+use crate::remote::{access, runtime, shared_store};
+use crate::signals::until_told;
+
+#[derive(Serialize)]
+struct Worked {
+    command: &'static str,
+    name: String,
+    backend: String,
+    threads: u32,
+    /// Tasks that it finished.
+    done: u32,
+    /// Tasks that it found finished, or begun with a checkpoint.
+    resumed: u32,
+}
+
+pub(crate) fn run(args: &WorkerArgs, output: &Output) -> Result<(), Failure> {
+    let access = access(&args.connection)?;
+    let name = name_of(args)?;
+    let backend = compute_on(args.backend)?;
+    let cores = std::thread::available_parallelism().map_or(1, |n| n.get() as u32);
+    let threads = args.threads.0.unwrap_or(cores).max(1);
+    let mut worked = Worked { command: "worker", name, backend: backend.name(), threads, done: 0, resumed: 0 };
+    let url = &args.connection.coordinator;
+    let runtime = runtime()?;
+    runtime.block_on(async {
+        let stop = CancellationToken::new();
+        let told = tokio::spawn(until_told(stop.clone()));
+        let worker = worker::Options {
+            coordinator_url: url.clone(),
+            access,
+            worker_id: worked.name.clone(),
+            backend: worked.backend.clone(),
+        };
+        if let Some(about) = worker::greet(&worker, &stop).await.map_err(of_worker)? {
+            let store = shared_store(&about.store_url).await?;
+            let options = TrainerOptions {
+                threads: threads as usize,
+                eval_every: 0,
+                cache_bytes: CACHE_BYTES,
+                resume: true,
+                checkpoint_seconds: args.checkpoint_every,
+            };
+            let shared = Arc::new(Shared::default());
+            let trainer = BlockTrainer::new(store.blocking(), options, shared.clone(), backend);
+            let counted = Arc::new(Counted { trainer: trainer.map_err(Failure::Work)?, done: AtomicU32::new(0) });
+            output.note(format!("{} works for {url}: {} on {threads} threads", worked.name, worked.backend));
+            worker::run(worker, counted.clone(), stop).await.map_err(of_worker)?;
+            worked.done = counted.done.load(Ordering::Relaxed);
+            worked.resumed = shared.resumed.load(Ordering::Relaxed);
+        }
+        told.abort();
+        Ok::<(), Failure>(())
+    })?;
+    let text = format!("{} left after {} tasks, {} of them resumed", worked.name, worked.done, worked.resumed);
+    output.result(&worked, &text)
+}
+
+/// Counts what a trainer finishes.
+struct Counted {
+    trainer: BlockTrainer,
+    done: AtomicU32,
+}
+
+impl Execute for Counted {
+    fn execute(
+        &self,
+        order: &TaskOrder,
+        report: &mut (dyn FnMut(Report) -> Flow + Send),
+    ) -> Result<ArtefactId, ExecuteError> {
+        let artefact = self.trainer.execute(order, report)?;
+        self.done.fetch_add(1, Ordering::Relaxed);
+        Ok(artefact)
+    }
+}
+
+/// The worker's name: the one asked for, else the machine's and the process's number.
+fn name_of(args: &WorkerArgs) -> Result<String, Failure> {
+    if let Some(name) = &args.name {
+        let refused = |status: tonic::Status| {
+            BadInput::new("--name", format!("'{name}': {}", status.message()), "choose another")
+        };
+        proto::check_name("worker", name).map_err(refused)?;
+        return Ok(name.clone());
+    }
+    let machine = std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();
+    let machine: String = machine.chars().filter(char::is_ascii_graphic).take(64).collect();
+    let machine = if machine.is_empty() { "worker" } else { &machine };
+    Ok(format!("{machine}-{}", std::process::id()))
+}
+
+fn of_worker(error: WorkerError) -> Failure {
+    match error {
+        WorkerError::Input(error) => error.into(),
+        WorkerError::Refused(_) => Failure::Input(error.to_string()),
+    }
+}

@@ -1,0 +1,231 @@
+//! The coordinator of a cluster, as the commands that ask it for something see it.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use coordinator::{LocalError, Results, of_status};
+use proto::watch_event::Event as News;
+use proto::{Access, Client, KeyPair, Outcome, Token};
+use scene::{BadInput, BlockId};
+use store::Store;
+use tokio::runtime::Runtime;
+use tonic::{Code, Response, Status};
+
+use crate::args::Connection;
+use crate::failure::Failure;
+use crate::output::Output;
+
+/// Files of certificates and tokens are small.
+const FILE_LIMIT: u64 = 1 << 20;
+/// The longest pause between two tries to reach a coordinator that was there before.
+const PAUSE_LIMIT: Duration = Duration::from_secs(5);
+
+/// A coordinator.
+pub(crate) struct Remote {
+    runtime: Runtime,
+    client: Client,
+    access: Access,
+    /// As it was given.
+    url: String,
+    /// What says who leads, where no coordinator was named.
+    leases: Option<Store>,
+}
+
+impl Remote {
+    pub(crate) fn open(connection: &Connection) -> Result<Self, Failure> {
+        let access = access(connection)?;
+        let runtime = runtime()?;
+        let url = connection.coordinator.clone();
+        let named = ["http://", "https://"].iter().any(|scheme| url.starts_with(scheme)) || !url.contains("://");
+        let leases = if named { None } else { Some(Store::open(&url)?) };
+        let client = runtime.block_on(find(&url, leases.as_ref(), &access))?;
+        Ok(Self { runtime, client, access, url, leases })
+    }
+
+    /// One call.
+    pub(crate) fn call<T>(
+        &mut self,
+        what: impl AsyncFnOnce(&mut Client) -> Result<Response<T>, Status>,
+    ) -> Result<T, Failure> {
+        let answer = self.runtime.block_on(what(&mut self.client));
+        answer.map(Response::into_inner).map_err(|status| self.failure(status))
+    }
+
+    /// The coordinator's store.
+    pub(crate) fn store(&self, about: &proto::AboutReply) -> Result<Store, Failure> {
+        self.runtime.block_on(shared_store(&about.store_url))
+    }
+
+    /// The blocks of a job's tasks, in the plan's order.
+    pub(crate) fn blocks(&mut self, job: u64) -> Result<Vec<BlockId>, Failure> {
+        let reply = self.call(async |client: &mut Client| client.blocks(proto::BlocksRequest { job }).await)?;
+        let columns = reply.level.into_iter().zip(reply.x).zip(reply.y);
+        let blocks = columns.map(|((level, x), y)| format!("{level}/{x}/{y}").parse::<BlockId>());
+        blocks.collect::<Result<_, _>>().map_err(|error| Failure::Work(format!("the coordinator's answer: {error}")))
+    }
+
+    /// Follows a job of so many tasks to its end and tells each piece of news. A coordinator that goes away is waited for: it
+    /// may come back, and says then how things stand. Ctrl-C ends it with `None`; the job goes on.
+    pub(crate) fn follow(
+        &mut self,
+        job: u64,
+        tasks: u32,
+        output: &Output,
+        mut on_news: impl FnMut(&Results, &News),
+    ) -> Result<Option<(Outcome, Results)>, Failure> {
+        let mut results = Results::new(tasks);
+        let mut pause = Duration::from_millis(100);
+        loop {
+            let client = &mut self.client;
+            let ended = self.runtime.block_on(async {
+                tokio::select! {
+                    _ = tokio::signal::ctrl_c() => Ok(None),
+                    outcome = watch(client, job, &mut results, &mut on_news, &mut pause) => outcome.map(Some),
+                }
+            });
+            match ended {
+                Ok(Some(outcome)) => return Ok(Some((outcome, results))),
+                Ok(None) => return Ok(None),
+                Err(Lost::Job(error)) => return Err(error.into()),
+                Err(Lost::Connection(status)) if is_passing(&status) => {
+                    output.note(format!("waiting for the coordinator {}: {}", self.url, proto::explain(&status)));
+                    self.runtime.block_on(tokio::time::sleep(pause));
+                    // Another one may lead by now.
+                    if let Ok(client) = self.runtime.block_on(find(&self.url, self.leases.as_ref(), &self.access)) {
+                        self.client = client;
+                    }
+                    pause = PAUSE_LIMIT.min(2 * pause);
+                }
+                Err(Lost::Connection(status)) => return Err(self.failure(status)),
+            }
+        }
+    }
+
+    /// What a refusal comes to: the input's fault, or the cluster's.
+    fn failure(&self, status: Status) -> Failure {
+        let passing = is_passing(&status);
+        match of_status(status) {
+            LocalError::Failed(line) if passing => {
+                Failure::Work(format!("the coordinator {} does not answer: {line}; is it running?", self.url))
+            }
+            other => other.into(),
+        }
+    }
+}
+
+/// A client of the coordinator that was named, or of the one that leads.
+async fn find(url: &str, leases: Option<&Store>, access: &Access) -> Result<Client, Failure> {
+    let Some(store) = leases else { return Ok(proto::connect(url, access)?) };
+    let lease = worker::leader_of(store).await.map_err(|status| Failure::Work(status.message().into()))?;
+    Ok(proto::connect(&lease.address, access)?)
+}
+
+/// Why watching ended before the job.
+enum Lost {
+    Connection(Status),
+    Job(LocalError),
+}
+
+/// Watches a job until it is over or the stream ends.
+async fn watch(
+    client: &mut Client,
+    job: u64,
+    results: &mut Results,
+    on_news: &mut impl FnMut(&Results, &News),
+    pause: &mut Duration,
+) -> Result<Outcome, Lost> {
+    let mut news = client.watch(proto::WatchRequest { job }).await.map_err(Lost::Connection)?.into_inner();
+    while let Some(event) = news.message().await.map_err(Lost::Connection)? {
+        // News of a kind that came into the wire later are no concern of this program's.
+        let Some(event) = event.event else { continue };
+        *pause = Duration::from_millis(100);
+        if let News::Changed(changed) = &event {
+            results.note(changed.clone()).map_err(Lost::Job)?;
+        }
+        on_news(results, &event);
+        if let News::Finished(finished) = event {
+            return Ok(finished.outcome());
+        }
+    }
+    Err(Lost::Connection(Status::unavailable("it stopped telling the news of the job")))
+}
+
+fn is_passing(status: &Status) -> bool {
+    matches!(
+        status.code(),
+        Code::Unavailable | Code::DeadlineExceeded | Code::Cancelled | Code::Unknown | Code::Internal
+    )
+}
+
+/// How a job that is over counts: `Ok` where all is done.
+pub(crate) fn judge(job: u64, outcome: Outcome, results: &Results) -> Result<(), Failure> {
+    match outcome {
+        Outcome::Done => Ok(()),
+        Outcome::Incomplete => Err(results.failure().into()),
+        Outcome::Cancelled => Err(Failure::Work(format!("job {job} was cancelled"))),
+    }
+}
+
+/// Threads for the wire.
+pub(crate) fn runtime() -> Result<Runtime, Failure> {
+    let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build();
+    runtime.map_err(|error| Failure::Work(format!("cannot start threads: {error}")))
+}
+
+/// The store of a coordinator, if it is the same from here.
+pub(crate) async fn shared_store(url: &str) -> Result<Store, Failure> {
+    let store = Store::open(url)?;
+    match store.newest(proto::leader::FOLDER).await? {
+        Some(_) => Ok(store),
+        None => {
+            let advice = "mount it here under the same path, or start the coordinator with a --store that all reach";
+            Err(BadInput::new(url, "is the coordinator's store, and another one on this machine", advice).into())
+        }
+    }
+}
+
+/// What the connection's files hold.
+pub(crate) fn access(connection: &Connection) -> Result<Access, Failure> {
+    let authority = connection.tls_ca.as_deref().map(|path| pem("--tls-ca", path, "CERTIFICATE")).transpose()?;
+    let identity = key_pair(&connection.tls_cert, &connection.tls_key)?;
+    Ok(Access { authority, identity, token: token(&connection.token_file)? })
+}
+
+/// A certificate and its key, where both are given.
+pub(crate) fn key_pair(certificate: &Option<PathBuf>, key: &Option<PathBuf>) -> Result<Option<KeyPair>, Failure> {
+    let (Some(certificate), Some(key)) = (certificate, key) else { return Ok(None) };
+    let (certificate, key) = (pem("--tls-cert", certificate, "CERTIFICATE")?, pem("--tls-key", key, "PRIVATE KEY")?);
+    Ok(Some(KeyPair { certificate, key }))
+}
+
+/// The token of a file.
+pub(crate) fn token(path: &Option<PathBuf>) -> Result<Option<Token>, Failure> {
+    let Some(path) = path else { return Ok(None) };
+    let text = String::from_utf8(small_file("--token-file", path)?).unwrap_or_default();
+    let token = Token::new(&text).map_err(|problem| {
+        BadInput::new(path.display().to_string(), problem, "write one there, say of `openssl rand -hex 32`")
+    });
+    Ok(Some(token?))
+}
+
+/// A file of PEM with such a part.
+pub(crate) fn pem(flag: &str, path: &Path, part: &str) -> Result<Vec<u8>, Failure> {
+    let bytes = small_file(flag, path)?;
+    let text = String::from_utf8_lossy(&bytes);
+    if text.lines().any(|line| line.starts_with("-----BEGIN ") && line.trim_end().ends_with(&format!("{part}-----"))) {
+        return Ok(bytes);
+    }
+    let problem = format!("holds no {}", part.to_lowercase());
+    Err(BadInput::new(path.display().to_string(), problem, format!("give {flag} a PEM file with one")).into())
+}
+
+fn small_file(flag: &str, path: &Path) -> Result<Vec<u8>, Failure> {
+    let bad = |problem: String| BadInput::new(path.display().to_string(), problem, format!("give {flag} a file"));
+    let unreadable = |error: std::io::Error| bad(format!("cannot be read ({error})"));
+    let length = fs::metadata(path).map_err(unreadable)?.len();
+    if length > FILE_LIMIT {
+        return Err(bad(format!("has {length} bytes, which none such needs")).into());
+    }
+    Ok(fs::read(path).map_err(unreadable)?)
+}

@@ -1,0 +1,197 @@
+//! A cluster of real processes on one machine, some of which die.
+#![cfg(unix)]
+
+mod common;
+
+use std::io::{BufRead, BufReader};
+use std::path::Path;
+use std::process::{Child, Command, Output, Stdio};
+use std::sync::mpsc;
+use std::time::Duration;
+
+use serde_json::Value;
+
+#[rustfmt::skip]
+const PLAN: [&str; 8] = ["--steps", "960", "--budget", "900", "--levels", "1", "--blocks", "tree"];
+
+/// A process that is killed with the test.
+struct Running(Option<Child>);
+
+impl Running {
+    fn begin(command: &mut Command) -> Self {
+        Self(Some(command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().expect("plat runs")))
+    }
+
+    fn child(&mut self) -> &mut Child {
+        self.0.as_mut().expect("it was not waited for yet")
+    }
+
+    fn signal(&mut self, name: &str) {
+        let id = self.child().id().to_string();
+        assert!(Command::new("kill").args([name, &id]).status().unwrap().success());
+    }
+
+    /// Its end, which must come.
+    fn end(mut self) -> Output {
+        self.0.take().expect("it was not waited for yet").wait_with_output().unwrap()
+    }
+}
+
+impl Drop for Running {
+    fn drop(&mut self) {
+        if let Some(child) = &mut self.0 {
+            let _ = child.kill();
+            let _ = child.wait();
+        }
+    }
+}
+
+/// A coordinator, and the URL at which it listens.
+fn coordinator(at: &Path) -> (Running, String) {
+    let words = ["coordinator", "--store", "shared", "--listen", "127.0.0.1:0", "--lease-seconds", "1"];
+    let mut running = Running::begin(&mut common::command(at, &words));
+    let stderr = running.child().stderr.take().unwrap();
+    let (said, listening) = mpsc::channel();
+    // Read to its end, so that it is never held up.
+    std::thread::spawn(move || {
+        for line in BufReader::new(stderr).lines().map_while(Result::ok) {
+            let url = line.split_whitespace().find(|word| word.starts_with("http://"));
+            url.map(|url| said.send(url.trim_end_matches(',').to_string()));
+        }
+    });
+    let url = listening.recv_timeout(Duration::from_secs(60)).expect("it says where it listens");
+    (running, url)
+}
+
+fn worker(at: &Path, url: &str, name: &str) -> Running {
+    let words = ["worker", "--coordinator", url, "--name", name, "--threads", "1", "--checkpoint-every", "0.05"];
+    Running::begin(&mut common::command(at, &[&words[..], &["--quiet", "--json"]].concat()))
+}
+
+/// Waits until the worker has a task in hand, or there is nothing left to have; whether it has.
+fn is_at_work(at: &Path, url: &str, name: &str) -> bool {
+    loop {
+        // The job may not be there yet.
+        let asked = common::plat(at, &["status", "1", "--coordinator", url, "--json", "--quiet"]);
+        let status: Value = serde_json::from_slice(&asked.stdout).unwrap_or_default();
+        let running = status["running"].as_array().cloned().unwrap_or_default();
+        if running.iter().any(|task| task["worker"] == name) {
+            return true;
+        }
+        if status["state"] == "done" {
+            return false;
+        }
+        std::thread::sleep(Duration::from_millis(20));
+    }
+}
+
+#[test]
+fn a_cluster_whose_workers_die_and_leave_makes_the_bytes_of_one_process() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    common::city(at, 20, 64, 48);
+    let (mut host, url) = coordinator(at);
+    let asked = |words: &[&str]| common::done(at, &[words, &["--coordinator", &url]].concat());
+    assert_eq!(asked(&["jobs"])["jobs"].as_array().unwrap().len(), 0);
+    let mut first = worker(at, &url, "first");
+    let mut second = worker(at, &url, "second");
+    let words = ["submit", "city", "--coordinator", &url, "--wait", "--out", "far", "--json"];
+    let submit = Running::begin(&mut common::command(at, &[&words[..], &PLAN].concat()));
+
+    // One is killed at its work; one is told to go and leaves its work to whoever comes.
+    assert!(is_at_work(at, &url, "first"));
+    first.signal("-KILL");
+    assert!(is_at_work(at, &url, "second"), "it is there alone");
+    second.signal("-TERM");
+    let left = second.end();
+    assert!(left.status.success(), "{}", String::from_utf8_lossy(&left.stderr));
+    let left: Value = serde_json::from_slice(&left.stdout).unwrap();
+    assert_eq!(left["name"], "second");
+    let status = asked(&["status", "1"]);
+    let holders: Vec<&Value> = status["running"].as_array().unwrap().iter().map(|task| &task["worker"]).collect();
+    assert!(status["state"] == "running" && !holders.contains(&&left["name"]), "{status}");
+    let mut third = worker(at, &url, "third");
+    let submit = submit.end();
+    assert!(submit.status.success(), "{}", String::from_utf8_lossy(&submit.stderr));
+    let said: Value = serde_json::from_str(String::from_utf8(submit.stdout).unwrap().lines().last().unwrap()).unwrap();
+    assert_eq!((&said["job"], said["tasks"].as_u64() > Some(2)), (&1.into(), true), "{said}");
+    third.signal("-TERM");
+    let third: Value = serde_json::from_slice(&third.end().stdout).unwrap();
+    assert!(third["resumed"].as_u64() >= Some(1), "somebody went on from a checkpoint: {third}");
+
+    let calm = common::done(at, &[&["train", "city", "--out", "calm", "--workers", "1"][..], &PLAN].concat());
+    let bytes = |path: &str| std::fs::read(at.join(path)).unwrap();
+    assert!(bytes("far/merged.ply") == bytes("calm/merged.ply"), "the cluster shows in the result");
+    assert_eq!((&said["plan"], &said["splats"]), (&calm["plan"], &calm["splats"]));
+    assert!(common::done(at, &["eval", "far", "city"])["psnr"].is_f64(), "it is a model as any other");
+
+    // What happened is written down, and nothing is left to do.
+    let log = asked(&["logs", "1"]);
+    let lines: Vec<&str> = log["lines"].as_array().unwrap().iter().map(|line| line["what"].as_str().unwrap()).collect();
+    assert!(lines[0].starts_with("submitted") && lines.last() == Some(&"over: Done"), "{lines:?}");
+    let trouble =
+        |line: &&str| line.starts_with("ended without a result, GivenBack") || *line == "waits for a worker again";
+    assert!(lines.iter().any(trouble), "{lines:?}");
+    assert_eq!(asked(&["jobs"])["jobs"][0]["state"], "done");
+    assert_eq!(asked(&["status", "1", "--watch"])["done"], said["tasks"]);
+    host.signal("-TERM");
+    assert!(host.end().status.success());
+}
+
+#[test]
+fn people_steer_jobs_and_wrong_requests_are_refused_with_a_line() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    common::city(at, 20, 64, 48);
+    let (host, url) = coordinator(at);
+    let to = |words: &[&str]| -> Vec<String> {
+        words.iter().chain(&["--coordinator", &url, "--quiet"]).map(ToString::to_string).collect()
+    };
+    let asked = |words: &[&str]| common::done(at, &to(words).iter().map(String::as_str).collect::<Vec<_>>());
+    let refused = |words: &[&str], wanted: &str| {
+        common::refused(at, &to(words).iter().map(String::as_str).collect::<Vec<_>>(), wanted);
+    };
+    refused(&["status", "1"], "no job 1");
+    let said = asked(&[&["submit", "city"][..], &PLAN].concat());
+    assert_eq!((&said["job"], said["tasks"].as_u64() > Some(2)), (&1.into(), true));
+    // Nobody works: all of it waits.
+    assert_eq!((&asked(&["status", "1"])["done"], &asked(&["pause", "1"])["state"]), (&0.into(), &"paused".into()));
+    assert_eq!(asked(&["resume", "1"])["state"], "running");
+    refused(&["retry", "1", "0/0/0"], "neither failed");
+    refused(&["retry", "1", "7/0/0"], "block 7/0/0");
+    refused(&["retry", "1", "first"], "level/x/y");
+    refused(&["submit", "city", "--out", "o"], "--wait");
+    refused(&["submit", "city", "--backend", "gpu"], "--backend");
+    refused(&["worker", "--name", "two words"], "--name");
+    assert_eq!(asked(&["cancel", "1"])["state"], "cancelled");
+    let watched = common::plat(at, &["status", "1", "--watch", "--coordinator", &url, "--json"]);
+    assert_eq!(watched.status.code(), Some(1), "it says how the job ended");
+    let words: Vec<String> = asked(&["logs", "1", "--follow"])["lines"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|line| line["what"].as_str().unwrap().to_string())
+        .collect();
+    assert_eq!(
+        words[1..],
+        ["asked: pause", "asked: resume", "asked: retry task 0", "asked: cancel", "over: Cancelled"]
+    );
+    // Its plan is all that it left; whoever knows the store finds who leads.
+    let store = format!("file://{}", at.join("shared").display());
+    let forgotten = common::done(at, &["forget", "1", "--coordinator", &store]);
+    assert_eq!((&forgotten["job"], &forgotten["deleted"]), (&1.into(), &1.into()));
+    refused(&["status", "1"], "no job 1");
+    drop(host);
+
+    // Nobody is there; no trust; no token; no store that is the coordinator's.
+    common::stopped(&mut common::command(at, &["jobs", "--coordinator", &url]), 1, "is it running?");
+    common::refused(at, &["jobs", "--coordinator", "https://127.0.0.1:1"], "--tls-ca");
+    common::refused(at, &["jobs"], "--coordinator");
+    std::fs::write(at.join("token"), "short\n").unwrap();
+    let listen = ["coordinator", "--store", "s", "--listen"];
+    common::refused(at, &[&listen[..], &["127.0.0.1:0", "--token-file", "token"]].concat(), "token");
+    common::refused(at, &[&listen[..], &["127.0.0.1:0", "--tls-cert", "token"]].concat(), "--tls-key");
+    let pair = ["--tls-cert", "token", "--tls-key", "token"];
+    common::refused(at, &[&listen[..], &["127.0.0.1:0"], &pair[..]].concat(), "certificate");
+    common::refused(at, &[&listen[..], &["0.0.0.0:0", "--quiet"]].concat(), "other machines");
+}

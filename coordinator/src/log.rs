@@ -1,0 +1,133 @@
+//! What happened lately, for people: a bounded list of lines, which nothing depends on.
+
+use std::collections::VecDeque;
+
+use cluster::{Action, AttemptId, JobId, Scheduler, TaskIndex, TaskState};
+use proto::LogLine;
+
+/// Lines of all jobs that are kept, the newest.
+const LINES_LIMIT: usize = 100_000;
+/// Bytes of a message that are kept.
+const MESSAGE_LIMIT: usize = 500;
+/// Lines of one answer.
+const PAGE: usize = 1000;
+
+/// The lines of all jobs.
+#[derive(Debug, Default)]
+pub(crate) struct Log {
+    lines: VecDeque<Line>,
+    next: u64,
+}
+
+#[derive(Debug)]
+struct Line {
+    number: u64,
+    now: u64,
+    job: JobId,
+    task: Option<TaskIndex>,
+    /// 0 where it is about none.
+    attempt: u32,
+    /// Of the worker, by its number.
+    worker: Option<u32>,
+    what: String,
+}
+
+impl Log {
+    /// Something that concerns a whole job.
+    pub(crate) fn job(&mut self, now: u64, job: JobId, what: impl Into<String>) {
+        self.add(Line { number: 0, now, job, task: None, attempt: 0, worker: None, what: what.into() });
+    }
+
+    /// Something that an attempt said.
+    pub(crate) fn attempt(&mut self, now: u64, of: AttemptId, what: impl Into<String>) {
+        let AttemptId { job, task, fence } = of;
+        let (task, attempt) = (Some(task), fence.number);
+        self.add(Line { number: 0, now, job, task, attempt, worker: None, what: what.into() });
+    }
+
+    /// What a step came to; the scheduler is as it is after it.
+    pub(crate) fn step(&mut self, now: u64, scheduler: &Scheduler, actions: &[Action]) {
+        for action in actions {
+            let line = |job, task, attempt, worker, what| Line { number: 0, now, job, task, attempt, worker, what };
+            match action {
+                Action::Grant { worker, attempt, .. } => {
+                    let AttemptId { job, task, fence } = *attempt;
+                    self.add(line(job, Some(task), fence.number, Some(worker.0), "granted".into()));
+                }
+                Action::Stop { worker, attempt } => {
+                    let AttemptId { job, task, fence } = *attempt;
+                    let what = "is told to stop: not needed any more".into();
+                    self.add(line(job, Some(task), fence.number, Some(worker.0), what));
+                }
+                Action::Changed { job, task } => {
+                    let Some(record) = scheduler.record(*job, *task) else { continue };
+                    let (attempt, what) = match &record.state {
+                        TaskState::Done { fence, artefact } => (fence.number, format!("done: {artefact}")),
+                        TaskState::Failed { fence, message } => (fence.number, format!("failed for good: {message}")),
+                        TaskState::Quarantined { fence, message } => (fence.number, format!("quarantined: {message}")),
+                        TaskState::Delayed { .. } => (record.attempts, "pauses before its next attempt".into()),
+                        TaskState::Ready { .. } if record.attempts > 0 => {
+                            (record.attempts, "waits for a worker again".into())
+                        }
+                        TaskState::Waiting { .. } | TaskState::Ready { .. } | TaskState::Leased { .. } => continue,
+                    };
+                    self.add(line(*job, Some(*task), attempt, None, what));
+                }
+                Action::JobFinished { job, outcome } => self.job(now, *job, format!("over: {outcome:?}")),
+                _ => {}
+            }
+        }
+    }
+
+    /// The next lines of a job with numbers above `after`.
+    pub(crate) fn page(&self, now: u64, job: JobId, after: u64, names: &[String]) -> Vec<LogLine> {
+        let first = self.lines.partition_point(|line| line.number <= after);
+        let lines = self.lines.range(first..).filter(|line| line.job == job).take(PAGE);
+        let worker = |line: &Line| line.worker.and_then(|worker| names.get(worker as usize).cloned());
+        let to_wire = |line: &Line| LogLine {
+            number: line.number,
+            millis_ago: now.saturating_sub(line.now),
+            task: line.task.map(|task| task.0),
+            attempt: line.attempt,
+            worker: worker(line).unwrap_or_default(),
+            what: line.what.clone(),
+        };
+        lines.map(to_wire).collect()
+    }
+
+    fn add(&mut self, mut line: Line) {
+        if line.what.len() > MESSAGE_LIMIT {
+            let end = (0..=MESSAGE_LIMIT).rev().find(|&end| line.what.is_char_boundary(end));
+            line.what.truncate(end.unwrap_or(0));
+        }
+        if self.lines.len() >= LINES_LIMIT {
+            self.lines.pop_front();
+        }
+        self.next += 1;
+        line.number = self.next;
+        self.lines.push_back(line);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_newest_lines_are_kept_and_read_page_by_page() {
+        let mut log = Log::default();
+        for i in 0..LINES_LIMIT as u64 + 10 {
+            log.job(i, JobId(i % 2), "é".repeat(400));
+        }
+        let (mut after, mut count) = (0, 0);
+        loop {
+            let page = log.page(LINES_LIMIT as u64 + 10, JobId(1), after, &[]);
+            let Some(last) = page.last() else { break };
+            assert!(
+                page.len() <= PAGE && page.iter().all(|line| line.number > after && line.what.len() <= MESSAGE_LIMIT)
+            );
+            (after, count) = (last.number, count + page.len());
+        }
+        assert_eq!((after, count), (LINES_LIMIT as u64 + 10, LINES_LIMIT / 2));
+    }
+}

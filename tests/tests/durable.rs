@@ -1,0 +1,399 @@
+//! Coordinators that are killed, followed and fenced, over real gRPC on the loopback and one shared store. A kill is a future
+//! that is dropped: nothing is flushed, nothing said.
+
+use std::collections::BTreeMap;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+
+use blocks::{Ground, Plan, PlanSettings, Task};
+use cluster::Settings;
+use coordinator::{Durable, Options, ServeError, serve};
+use glam::{DQuat, DVec2};
+use proto::leader::Leader;
+use proto::lease_reply::Reply;
+use proto::{Access, Client, Outcome, StatusReply};
+use scene::{ArtefactId, BlockId};
+use store::Store;
+use tokio::net::TcpListener;
+use tokio::task::JoinHandle;
+use tokio_util::sync::CancellationToken;
+use tonic::Code;
+use worker::{Execute, ExecuteError, Flow, Report, TaskOrder};
+
+const BACKEND: &str = "cpu-none";
+/// Between two looks at the lease.
+const QUICK: Duration = Duration::from_millis(10);
+/// Longer than any test.
+const LONG: Duration = Duration::from_secs(3600);
+
+/// A root and its four children, of which two have four children each.
+fn plan() -> Plan {
+    let names = ["0/0/0", "1/0/0", "1/1/0", "1/0/1", "1/1/1"].map(str::to_owned);
+    let grandchildren = [(0, 0), (1, 0), (0, 1), (1, 1), (2, 2), (3, 2), (2, 3), (3, 3)];
+    let names = names.into_iter().chain(grandchildren.map(|(x, y)| format!("2/{x}/{y}")));
+    let task = |block: String| {
+        let block: BlockId = block.parse().unwrap();
+        Task {
+            block,
+            parent: block.parent(),
+            context: Vec::new(),
+            views: Vec::new(),
+            test_views: Vec::new(),
+            points: 0,
+            budget: 1,
+            steps: 1,
+            rho_metres: 1.0,
+            drawn: 0,
+            context_drawn: 0,
+            memory_bytes: 0,
+        }
+    };
+    let mut tasks: Vec<Task> = names.map(task).collect();
+    tasks.sort_by_key(|task| (task.block.level, blocks::sweep_of(task.block), task.block.y, task.block.x));
+    Plan {
+        version: blocks::plan::VERSION,
+        capture: ArtefactId([1; 32]),
+        settings: PlanSettings::default(),
+        backend: BACKEND.into(),
+        ground: Ground {
+            ground_from_world: DQuat::IDENTITY,
+            min: DVec2::ZERO,
+            edge_metres: 100.0,
+            height_metres: 0.0,
+            near_metres: 1e300,
+        },
+        levels: 2,
+        rho_metres: vec![4.0, 2.0, 1.0],
+        tasks,
+    }
+}
+
+/// A coordinator of these tests.
+struct Host {
+    client: Client,
+    address: String,
+    stop: CancellationToken,
+    serving: JoinHandle<Result<(), ServeError>>,
+}
+
+impl Host {
+    async fn start(store: &Store, beat: Duration, patience: Duration) -> Self {
+        Self::start_with(store, beat, patience, None).await
+    }
+
+    async fn start_with(
+        store: &Store,
+        beat: Duration,
+        patience: Duration,
+        journal: Option<tokio::sync::mpsc::Sender<String>>,
+    ) -> Self {
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let address = format!("http://{}", listener.local_addr().unwrap());
+        let flush = Duration::from_millis(2);
+        let durable = Durable { flush, beat, patience, ..Durable::new(&address).unwrap() };
+        // No second attempts: here each task is to be worked on once.
+        let settings = Settings { duplicates: false, ..Settings::default() };
+        let options =
+            Options { settings, wait_millis: 5, durable: Some(durable), journal, ..Options::new(store.clone()) };
+        let stop = CancellationToken::new();
+        let serving = tokio::spawn(serve(listener, options, stop.clone().cancelled_owned()));
+        let client = proto::connect(&address, &Access::default()).unwrap();
+        Self { client, address, stop, serving }
+    }
+
+    /// As kill -9 does.
+    async fn kill(self) {
+        self.serving.abort();
+        assert!(self.serving.await.unwrap_err().is_cancelled());
+    }
+
+    /// Waits until it leads.
+    async fn leads(mut self) -> Self {
+        loop {
+            match self.client.status(proto::StatusRequest { job: u64::MAX }).await {
+                Err(status) if status.code() == Code::NotFound => return self,
+                _ => tokio::time::sleep(Duration::from_millis(5)).await,
+            }
+        }
+    }
+
+    async fn submit(&mut self, store: &Store) -> u64 {
+        let plan = store.put(plan().to_frame().into()).await.unwrap();
+        let request = proto::SubmitRequest { plan: plan.0.to_vec(), store_url: store.url().into() };
+        self.client.submit(request).await.unwrap().into_inner().job
+    }
+
+    async fn lease(&mut self, worker: &str) -> proto::Attempt {
+        loop {
+            let request = proto::LeaseRequest { worker: worker.into(), backend: BACKEND.into(), ..Default::default() };
+            match self.client.lease(request).await.unwrap().into_inner().reply.unwrap() {
+                Reply::Grant(grant) => return grant.attempt.unwrap(),
+                Reply::WaitMillis(millis) => tokio::time::sleep(Duration::from_millis(millis.into())).await,
+                Reply::Drained(_) => panic!("drained"),
+            }
+        }
+    }
+
+    async fn complete(&mut self, attempt: proto::Attempt, result: &[u8]) -> Result<bool, tonic::Status> {
+        let artefact = ArtefactId::of(result).0.to_vec();
+        let reply = self.client.complete(proto::CompleteRequest { attempt: Some(attempt), artefact }).await;
+        reply.map(|reply| reply.into_inner().accepted)
+    }
+
+    async fn status(&mut self, job: u64) -> StatusReply {
+        self.client.status(proto::StatusRequest { job }).await.unwrap().into_inner()
+    }
+}
+
+type Work =
+    dyn Fn(&TaskOrder, &mut (dyn FnMut(Report) -> Flow + Send)) -> Result<ArtefactId, ExecuteError> + Send + Sync;
+
+/// Does what the test says, and remembers what it was asked.
+struct Fake {
+    work: Box<Work>,
+    orders: Mutex<Vec<TaskOrder>>,
+}
+
+impl Execute for Fake {
+    fn execute(
+        &self,
+        order: &TaskOrder,
+        report: &mut (dyn FnMut(Report) -> Flow + Send),
+    ) -> Result<ArtefactId, ExecuteError> {
+        self.orders.lock().unwrap().push(order.clone());
+        (self.work)(order, report)
+    }
+}
+
+fn result_of(order: &TaskOrder) -> ArtefactId {
+    ArtefactId::of(format!("{} {} {:?}", order.plan, order.task, order.inputs).as_bytes())
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn what_was_answered_outlives_a_kill_and_the_epoch_rises() {
+    let store = Store::open("memory://").unwrap();
+    let mut first = Host::start(&store, LONG, LONG).await.leads().await;
+    let job = first.submit(&store).await;
+    let root = first.lease("w1").await;
+    assert!(first.complete(root, b"root").await.unwrap());
+    let [one, two] = [first.lease("w1").await, first.lease("w2").await];
+    assert_eq!((one.epoch, two.epoch), (1, 1));
+    first.kill().await;
+
+    let (journal, mut lines) = tokio::sync::mpsc::channel(10_000);
+    let mut second = Host::start_with(&store, QUICK, Duration::from_millis(50), Some(journal)).await.leads().await;
+    let status = second.status(job).await;
+    assert_eq!((status.done, status.leased, status.ready, status.waiting), (1, 2, 2, 8));
+    // Attempts under way go on, under the fence that they were granted with.
+    assert!(
+        !second
+            .client
+            .report(proto::ReportRequest { attempt: Some(one), reports: vec![] })
+            .await
+            .unwrap()
+            .into_inner()
+            .cancelled
+    );
+    assert!(second.complete(one, b"one").await.unwrap());
+    // What was committed stays so: the same again is agreed to, another result is not.
+    assert!(second.complete(root, b"root").await.unwrap());
+    // Workers mean themselves still: w2 asks anew, and what it held is lost.
+    let next = second.lease("w2").await;
+    assert_eq!(next.epoch, 2);
+    assert!(!second.complete(two, b"two").await.unwrap(), "a zombie's commit is refused");
+    // Numbers of attempts go on, and those of jobs.
+    let mut granted = vec![next];
+    while granted.iter().all(|attempt| attempt.task != two.task) {
+        granted.push(second.lease(&format!("new-{}", granted.len())).await);
+    }
+    assert_eq!(
+        granted.iter().find(|attempt| attempt.task == two.task).map(|attempt| attempt.number),
+        Some(two.number + 1)
+    );
+    assert_eq!(second.submit(&store).await, job + 1);
+    second.stop.cancel();
+    second.serving.await.unwrap().unwrap();
+
+    let mut text = Vec::new();
+    while let Some(line) = lines.recv().await {
+        text.push(line);
+    }
+    let replayed = cluster::journal::replay(text.iter().map(String::as_str), |_| {}).unwrap();
+    assert_eq!((replayed.last.epoch, replayed.last.jobs.len()), (2, 2));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_standby_says_who_leads_and_follows_a_leader_that_leaves() {
+    let store = Store::open("memory://").unwrap();
+    let mut first = Host::start(&store, QUICK, LONG).await.leads().await;
+    let job = first.submit(&store).await;
+    let mut standby = Host::start(&store, QUICK, LONG).await;
+    let refused = standby.client.status(proto::StatusRequest { job }).await.unwrap_err();
+    assert_eq!(refused.code(), Code::Unavailable);
+    assert!(refused.message().contains(&first.address), "{refused}");
+    first.stop.cancel();
+    first.serving.await.unwrap().unwrap();
+    // It was told: an hour's patience is not needed.
+    let mut standby = standby.leads().await;
+    assert_eq!(standby.status(job).await.ready, 1);
+    let (epoch, lease) = store.newest("leader").await.unwrap().unwrap();
+    let lease = Leader::from_bytes(epoch, &lease).unwrap();
+    assert_eq!((lease.epoch, &lease.address, lease.released), (2, &standby.address, false));
+    assert_eq!(store.names("leader").await.unwrap(), ["leader/000001.json", "leader/000002.json"]);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_leader_that_is_thought_dead_is_fenced() {
+    let store = Store::open("memory://").unwrap();
+    // Its heart beats once an hour: it lives, and nobody can see it.
+    let mut old = Host::start(&store, LONG, LONG).await.leads().await;
+    let job = old.submit(&store).await;
+    let held = old.lease("w1").await;
+    let mut new = Host::start(&store, QUICK, Duration::from_millis(60)).await.leads().await;
+    // The old one still thinks that it leads. What it says must be durable first, and that fails.
+    let refused = old.complete(held, b"to the old one").await.unwrap_err();
+    assert_eq!(refused.code(), Code::Unavailable, "{refused}");
+    assert_eq!(new.status(job).await.done, 0);
+    assert!(new.complete(held, b"to the new one").await.unwrap());
+    let granted = new.lease("w1").await;
+    assert_eq!((granted.epoch, new.status(job).await.done), (2, 1));
+    // From now on it stands by.
+    let line = loop {
+        let refused = old.client.status(proto::StatusRequest { job }).await.unwrap_err();
+        assert_eq!(refused.code(), Code::Unavailable);
+        if refused.message().contains("stands by") {
+            break refused.message().to_owned();
+        }
+    };
+    assert!(line.contains(&new.address), "{line}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn who_knows_of_a_higher_epoch_is_not_told_that_its_work_is_void() {
+    let store = Store::open("memory://").unwrap();
+    let mut host = Host::start(&store, LONG, LONG).await.leads().await;
+    let job = host.submit(&store).await;
+    let of_a_later_leader = proto::Attempt { job, task: 0, number: 1, epoch: 5 };
+    assert_eq!(host.complete(of_a_later_leader, b"x").await.unwrap_err().code(), Code::Unavailable);
+    let report = proto::ReportRequest { attempt: Some(of_a_later_leader), reports: vec![] };
+    assert_eq!(host.client.report(report).await.unwrap_err().code(), Code::Unavailable);
+    let ask = proto::LeaseRequest { worker: "w".into(), backend: BACKEND.into(), epoch: 5, ..Default::default() };
+    assert_eq!(host.client.lease(ask.clone()).await.unwrap_err().code(), Code::Unavailable);
+    let ask = proto::LeaseRequest { epoch: 1, ..ask };
+    assert!(matches!(host.client.lease(ask).await.unwrap().into_inner().reply, Some(Reply::Grant(_))));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn workers_find_each_new_leader_and_no_work_is_done_twice() {
+    let folder = tempfile::tempdir().unwrap();
+    let url = format!("file://{}", folder.path().display());
+    let store = Store::open(&url).unwrap();
+    let patience = Duration::from_millis(60);
+    let mut host = Host::start(&store, QUICK, patience).await.leads().await;
+    let job = host.submit(&store).await;
+
+    // The root takes until the first kill is over, the others a moment.
+    let killed = Arc::new(AtomicBool::new(false));
+    let wait = killed.clone();
+    let fake = Arc::new(Fake {
+        work: Box::new(move |order, report| {
+            while order.task == 0 && !wait.load(Ordering::Relaxed) {
+                assert_eq!(report(Report { steps: 2, step: 1, ..Report::default() }), Flow::Continue);
+                std::thread::sleep(Duration::from_millis(5));
+            }
+            std::thread::sleep(Duration::from_millis(60));
+            Ok(result_of(order))
+        }),
+        orders: Mutex::default(),
+    });
+    let home = CancellationToken::new();
+    let crew: Vec<_> = (0..3)
+        .map(|number| {
+            let options = worker::Options {
+                coordinator_url: url.clone(),
+                access: Access::default(),
+                worker_id: format!("w{number}"),
+                backend: BACKEND.into(),
+            };
+            tokio::spawn(worker::run(options, fake.clone(), home.clone()))
+        })
+        .collect();
+    while fake.orders.lock().unwrap().is_empty() {
+        tokio::time::sleep(Duration::from_millis(5)).await;
+    }
+    let mut kills = 0;
+    loop {
+        host.kill().await;
+        kills += 1;
+        host = Host::start(&store, QUICK, patience).await.leads().await;
+        killed.store(true, Ordering::Relaxed);
+        let before = host.status(job).await.done;
+        // Each leader sees some of the job done, then dies.
+        let status = loop {
+            let status = host.status(job).await;
+            if status.outcome.is_some() || status.done > before + 2 {
+                break status;
+            }
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        };
+        if status.outcome.is_some() {
+            assert_eq!((status.outcome(), status.done), (Outcome::Done, 13));
+            break;
+        }
+    }
+    assert!(kills >= 2, "{kills} kills");
+    home.cancel();
+    for worker in crew {
+        worker.await.unwrap().unwrap();
+    }
+    // Nothing was lost and nothing done twice: every task once, each from its parent's one result.
+    let orders = fake.orders.lock().unwrap().clone();
+    let by_task: BTreeMap<u32, &TaskOrder> = orders.iter().map(|order| (order.task, order)).collect();
+    assert_eq!((orders.len(), by_task.len()), (13, 13));
+    let plan = plan();
+    for (task, order) in &by_task {
+        let parent = plan.tasks[*task as usize].parent;
+        let parent =
+            parent.and_then(|block| plan.tasks.iter().position(|task| task.block == block)).map(|at| at as u32);
+        let given: BTreeMap<_, _> = parent.map(|parent| (parent, result_of(by_task[&parent]))).into_iter().collect();
+        assert_eq!(order.inputs, given, "task {task}");
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_job_that_is_over_is_forgotten_with_what_only_it_refers_to() {
+    use proto::control_request::What;
+    let store = Store::open("memory://").unwrap();
+    let mut host = Host::start(&store, LONG, LONG).await.leads().await;
+    let job = host.submit(&store).await;
+    let forget = |job| proto::ControlRequest { job, what: Some(What::Forget(proto::Forget {})) };
+    let result = store.put("root".into()).await.unwrap();
+    let root = host.lease("w1").await;
+    assert!(host.complete(root, b"root").await.unwrap());
+    let running = host.client.control(forget(job)).await.unwrap_err();
+    assert_eq!(running.code(), Code::FailedPrecondition, "{running}");
+    host.client.cancel(proto::CancelRequest { job }).await.unwrap();
+    let deleted = host.client.control(forget(job)).await.unwrap().into_inner().deleted;
+    assert_eq!((deleted, store.exists(result).await.unwrap()), (2, false));
+    let gone = |status: tonic::Status| assert_eq!(status.code(), Code::NotFound);
+    gone(host.client.status(proto::StatusRequest { job }).await.unwrap_err());
+    host.kill().await;
+    // Also for whoever comes after, and its number is not used again.
+    let mut next = Host::start(&store, QUICK, Duration::from_millis(50)).await.leads().await;
+    gone(next.client.status(proto::StatusRequest { job }).await.unwrap_err());
+    assert_eq!(next.submit(&store).await, job + 1);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_damaged_state_ends_the_coordinator_with_one_line() {
+    let folder = tempfile::tempdir().unwrap();
+    let store = Store::open(folder.path().to_str().unwrap()).unwrap();
+    Host::start(&store, LONG, LONG).await.leads().await.kill().await;
+    for entry in std::fs::read_dir(folder.path().join("state/manifest")).unwrap() {
+        std::fs::write(entry.unwrap().path(), "nonsense").unwrap();
+    }
+    let next = Host::start(&store, QUICK, Duration::from_millis(20)).await;
+    let line = next.serving.await.unwrap().unwrap_err().to_string();
+    assert!(line.starts_with("the durable state in ") && line.lines().count() == 1, "{line}");
+}
