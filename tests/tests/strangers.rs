@@ -125,7 +125,9 @@ async fn a_coordinator_may_ask_for_certificates() {
     let with = |identity| Access { authority: Some(authority.certificate.clone()), identity, token: token.clone() };
     call(&url, &with(Some(authority.pair()))).await.unwrap();
     for stranger in [None, Some(other.pair())] {
-        assert_eq!(call(&url, &with(stranger)).await.unwrap_err().code(), Code::Unavailable);
+        // TLS 1.3 refuses a certificate once its owner has begun to speak: how the broken connection shows is a matter of time.
+        let refused = call(&url, &with(stranger)).await.unwrap_err();
+        assert!(matches!(refused.code(), Code::Unavailable | Code::Unknown | Code::Cancelled), "{refused:?}");
     }
     stop.cancel();
 }
