@@ -90,7 +90,8 @@ impl Remote {
                 Err(Lost::Job(error)) => return Err(error.into()),
                 Err(Lost::Connection(status)) if is_passing(&status) => {
                     output.note(format!("waiting for the coordinator {}: {}", self.url, proto::explain(&status)));
-                    self.runtime.block_on(tokio::time::sleep(pause));
+                    // Made inside, where there is a clock to wake it.
+                    self.runtime.block_on(async { tokio::time::sleep(pause).await });
                     // Another one may lead by now.
                     if let Ok(client) = self.runtime.block_on(find(&self.url, self.leases.as_ref(), &self.access)) {
                         self.client = client;

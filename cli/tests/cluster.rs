@@ -46,21 +46,36 @@ impl Drop for Running {
     }
 }
 
-/// A coordinator, and the URL at which it listens.
+/// Lines that a process says, one of which is waited for. Read to the end, so that the process is never held up.
+struct Said(mpsc::Receiver<String>);
+
+impl Said {
+    fn by(running: &mut Running) -> Self {
+        let stderr = running.child().stderr.take().unwrap();
+        let (said, lines) = mpsc::channel();
+        std::thread::spawn(move || {
+            for line in BufReader::new(stderr).lines().map_while(Result::ok) {
+                let _ = said.send(line);
+            }
+        });
+        Self(lines)
+    }
+
+    fn line_with(&self, words: &str) -> String {
+        let next = || self.0.recv_timeout(Duration::from_secs(60)).unwrap_or_else(|_| panic!("it never said {words}"));
+        std::iter::repeat_with(next).find(|line| line.contains(words)).unwrap()
+    }
+}
+
+/// A coordinator that leads, and the URL at which it listens.
 fn coordinator(at: &Path) -> (Running, String) {
     let words = ["coordinator", "--store", "shared", "--listen", "127.0.0.1:0", "--lease-seconds", "1"];
     let mut running = Running::begin(&mut common::command(at, &words));
-    let stderr = running.child().stderr.take().unwrap();
-    let (said, listening) = mpsc::channel();
-    // Read to its end, so that it is never held up.
-    std::thread::spawn(move || {
-        for line in BufReader::new(stderr).lines().map_while(Result::ok) {
-            let url = line.split_whitespace().find(|word| word.starts_with("http://"));
-            url.map(|url| said.send(url.trim_end_matches(',').to_string()));
-        }
-    });
-    let url = listening.recv_timeout(Duration::from_secs(60)).expect("it says where it listens");
-    (running, url)
+    let said = Said::by(&mut running);
+    let line = said.line_with("http://");
+    said.line_with("leading");
+    let url = line.split_whitespace().find(|word| word.starts_with("http://")).unwrap();
+    (running, url.trim_end_matches(',').to_string())
 }
 
 fn worker(at: &Path, url: &str, name: &str) -> Running {
@@ -93,15 +108,16 @@ fn a_cluster_whose_workers_die_and_leave_makes_the_bytes_of_one_process() {
     let (mut host, url) = coordinator(at);
     let asked = |words: &[&str]| common::done(at, &[words, &["--coordinator", &url]].concat());
     assert_eq!(asked(&["jobs"])["jobs"].as_array().unwrap().len(), 0);
-    let mut first = worker(at, &url, "first");
-    let mut second = worker(at, &url, "second");
     let words = ["submit", "city", "--coordinator", &url, "--wait", "--out", "far", "--json"];
     let submit = Running::begin(&mut common::command(at, &[&words[..], &PLAN].concat()));
 
-    // One is killed at its work; one is told to go and leaves its work to whoever comes.
+    // One is killed at its work; one is told to go and leaves its work to whoever comes. Each is alone until then, so that
+    // the work is its own.
+    let mut first = worker(at, &url, "first");
     assert!(is_at_work(at, &url, "first"));
     first.signal("-KILL");
-    assert!(is_at_work(at, &url, "second"), "it is there alone");
+    let mut second = worker(at, &url, "second");
+    assert!(is_at_work(at, &url, "second"));
     second.signal("-TERM");
     let left = second.end();
     assert!(left.status.success(), "{}", String::from_utf8_lossy(&left.stderr));
@@ -110,14 +126,16 @@ fn a_cluster_whose_workers_die_and_leave_makes_the_bytes_of_one_process() {
     let status = asked(&["status", "1"]);
     let holders: Vec<&Value> = status["running"].as_array().unwrap().iter().map(|task| &task["worker"]).collect();
     assert!(status["state"] == "running" && !holders.contains(&&left["name"]), "{status}");
-    let mut third = worker(at, &url, "third");
+    let last = ["third", "fourth"].map(|name| worker(at, &url, name));
     let submit = submit.end();
     assert!(submit.status.success(), "{}", String::from_utf8_lossy(&submit.stderr));
     let said: Value = serde_json::from_str(String::from_utf8(submit.stdout).unwrap().lines().last().unwrap()).unwrap();
     assert_eq!((&said["job"], said["tasks"].as_u64() > Some(2)), (&1.into(), true), "{said}");
-    third.signal("-TERM");
-    let third: Value = serde_json::from_slice(&third.end().stdout).unwrap();
-    assert!(third["resumed"].as_u64() >= Some(1), "somebody went on from a checkpoint: {third}");
+    let ends = last.map(|mut worker| {
+        worker.signal("-TERM");
+        serde_json::from_slice::<Value>(&worker.end().stdout).unwrap()
+    });
+    assert!(ends.iter().any(|end| end["resumed"].as_u64() >= Some(1)), "one went on from a checkpoint: {ends:?}");
 
     let calm = common::done(at, &[&["train", "city", "--out", "calm", "--workers", "1"][..], &PLAN].concat());
     let bytes = |path: &str| std::fs::read(at.join(path)).unwrap();
@@ -136,6 +154,25 @@ fn a_cluster_whose_workers_die_and_leave_makes_the_bytes_of_one_process() {
     assert_eq!(asked(&["status", "1", "--watch"])["done"], said["tasks"]);
     host.signal("-TERM");
     assert!(host.end().status.success());
+}
+
+#[test]
+fn whoever_waits_for_a_job_waits_for_the_next_coordinator() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    common::city(at, 20, 64, 48);
+    let (mut host, _) = coordinator(at);
+    let store = format!("file://{}", at.join("shared").display());
+    let words = ["submit", "city", "--coordinator", &store, "--wait"];
+    let mut submit = Running::begin(&mut common::command(at, &[&words[..], &PLAN].concat()));
+    let said = Said::by(&mut submit);
+    said.line_with("job 1 of");
+    host.signal("-KILL");
+    said.line_with("waiting for the coordinator");
+    let (_next, url) = coordinator(at);
+    assert_eq!(common::done(at, &["cancel", "1", "--coordinator", &url])["state"], "cancelled");
+    said.line_with("job 1 was cancelled");
+    assert_eq!(submit.end().status.code(), Some(1));
 }
 
 #[test]
