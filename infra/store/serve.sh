@@ -1,0 +1,41 @@
+#!/bin/bash
+# Serves S3 on port 7480 until one of its three parts ends; then the container ends, and whoever started it starts it anew.
+#     STORE_KEY, STORE_SECRET   the one user's keys
+# The first start makes the disk. One that was cut short makes it again.
+set -euo pipefail
+: "${STORE_KEY:?an access key, three characters or more}" "${STORE_SECRET:?its secret, eight characters or more}"
+home=/var/lib/store
+export CEPH_ARGS="--no-mon-config"
+
+make_disk() {
+    rm -rf "${home:?}"/mon "$home"/osd "$home"/keyring
+    mkdir -p "$home/mon" "$home/osd"
+    local key=(ceph-authtool "$home/keyring" --gen-key)
+    ceph-authtool --create-keyring "$home/keyring" >&2
+    "${key[@]}" --name mon. --cap mon 'allow *' >&2
+    "${key[@]}" --name osd.0 --cap mon 'allow profile osd' --cap osd 'allow *' >&2
+    "${key[@]}" --name client.admin --cap mon 'allow *' --cap osd 'allow *' >&2
+    chmod 600 "$home/keyring"
+    local fsid
+    fsid=$(awk '$1 == "fsid" { print $3 }' /etc/ceph/ceph.conf)
+    monmaptool --create --clobber --fsid "$fsid" --addv a '[v2:127.0.0.1:3300,v1:127.0.0.1:6789]' /tmp/monmap >&2
+    # With the OSD in the first map nobody has to ask for its number, which would take Python.
+    osdmaptool --clobber --createsimple 1 /tmp/osdmap >&2
+    ceph-mon --mkfs --id a --fsid "$fsid" --monmap /tmp/monmap --osdmap /tmp/osdmap --keyring "$home/keyring"
+    ceph-osd --mkfs --id 0 --fsid "$fsid" --monmap /tmp/monmap --osd-uuid 00000000-0000-4000-8000-000000000001
+    touch "$home/made"
+}
+
+[[ -e $home/made ]] || make_disk
+trap 'kill $(jobs -p) 2>/dev/null; wait' TERM INT EXIT
+ceph-mon --foreground --id a &
+ceph-osd --foreground --id 0 &
+until timeout 20 radosgw-admin user info --uid plat >/dev/null 2>&1 \
+    || timeout 60 radosgw-admin user create --uid plat --display-name plat --access-key "$STORE_KEY" --secret "$STORE_SECRET" >/dev/null; do
+    # A part that could not start is not waited for.
+    [[ $(jobs -pr | wc -l) == 2 ]] || exit 1
+    sleep 1
+done
+radosgw --foreground --name client.admin &
+# A signal ends the wait, too, and the trap does the rest.
+wait -n
