@@ -184,7 +184,7 @@ def rehearse(cluster, case, seed, wanted):
         if (done := chance.randrange(status["tasks"] - 1)) > 0:
             wait_for(cluster, job, done)
         about["done_before"] = done
-        time.sleep(chance.uniform(0, 1))
+        time.sleep(chance.uniform(0, 0.5))
     CASES[case](cluster, job, chance, about)
     code = finish(job, about)
     if code != 0 and case == "corrupt":

@@ -15,10 +15,10 @@ trap 'rm -rf "$scratch"' EXIT
 if ! openssl x509 -in "$SECRETS/coordinator.pem" -noout -checkend $month >/dev/null 2>&1 || ! [ -s "$SHARED/ca.pem" ]; then
     names="IP:127.0.0.1,DNS:localhost"
     for name in "$@"; do names="$names,DNS:$name"; done
-    key="-newkey ec -pkeyopt ec_paramgen_curve:prime256v1 -nodes"
-    openssl req -x509 $key -keyout "$scratch/ca.key" -out "$scratch/ca.pem" -days 825 -subj "/CN=plat cluster authority" \
-        -addext "basicConstraints=critical,CA:TRUE" -addext "keyUsage=critical,keyCertSign" 2>/dev/null
-    openssl req -new $key -keyout "$scratch/coordinator.key" -out "$scratch/request" -subj "/CN=plat coordinator" 2>/dev/null
+    request() { openssl req -newkey ec -pkeyopt ec_paramgen_curve:prime256v1 -nodes "$@" 2>/dev/null; }
+    request -x509 -keyout "$scratch/ca.key" -out "$scratch/ca.pem" -days 825 -subj "/CN=plat cluster authority" \
+        -addext "basicConstraints=critical,CA:TRUE" -addext "keyUsage=critical,keyCertSign"
+    request -new -keyout "$scratch/coordinator.key" -out "$scratch/request" -subj "/CN=plat coordinator"
     printf 'subjectAltName=%s\nextendedKeyUsage=serverAuth\nbasicConstraints=critical,CA:FALSE\n' "$names" > "$scratch/extensions"
     openssl x509 -req -in "$scratch/request" -CA "$scratch/ca.pem" -CAkey "$scratch/ca.key" -CAcreateserial -days 825 \
         -extfile "$scratch/extensions" -out "$scratch/coordinator.pem" 2>/dev/null

@@ -25,12 +25,13 @@ while (($#)); do
 done
 [[ -n $home && $workers =~ ^[1-9][0-9]*$ ]] || usage
 plat=$(command -v "$plat") || { echo "$plat: is not to be found; give --plat the program" >&2; exit 2; }
-mkdir -p -m 700 "$home"
+mkdir -p "$home/secrets"
+chmod 700 "$home" "$home/secrets"
 home=$(cd "$home" && pwd)
 
-export PLAT_HOME="$home" PLAT_STORE="${store:-file://$home/store}" PLAT_PROGRAM="$(readlink -f "$plat")"
+plat=$(readlink -f "$plat")
+export PLAT_HOME="$home" PLAT_STORE="${store:-file://$home/store}" PLAT_PROGRAM="$plat"
 # The coordinator may come to any node, and again to another one.
-mkdir -p -m 700 "$home/secrets"
 sinfo --noheader --Node --format %N | sort -u | SECRETS="$home/secrets" SHARED="$home" xargs "$here/../cluster/certificates.sh"
 coordinator=$(sbatch --parsable --output "$home/coordinator-%j.log" "$here/coordinator.sbatch")
 # A worker waits for its coordinator, whenever that comes; it must not come before, as it would only hold its node.
