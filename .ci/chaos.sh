@@ -41,11 +41,16 @@ step "store's image"
 docker build --quiet --tag plat-store infra/store
 docker image ls --format '{{.Repository}}:{{.Tag}} {{.Size}}'
 step "what the images can do"
+# A real street where the data is; else a made one.
+capture=../shared/data/street_lund
+[[ -d $capture ]] || { capture="$scratch/city"; "$PLAT" synth --out "$capture" --area-km2 0.02 --views 24 --size 160x120 --quiet; }
+capture=$(realpath "$capture")
 docker run --rm --network none plat --version
-docker run --rm --network none --read-only plat-gpu train --backend gpu --help >/dev/null
-docker run --rm --network none --entrypoint vulkaninfo plat-gpu --summary 2>/dev/null || true
+few=(--blocks whole --steps 20 --downscale 4 --quiet)
+docker run --rm --network none --read-only --tmpfs /tmp:mode=1777 --tmpfs /out:mode=1777 --volume "$capture:/capture:ro" \
+    plat-gpu train /capture --out /out/model --backend gpu "${few[@]}"
 # Images of the profile `observability` come from a registry that CI cannot reach: what is checked is how they are put together.
 docker compose --profile observability config --quiet
 step "chaos"
-python3 infra/chaos/run.py "$@"
+python3 infra/chaos/run.py --capture "$capture" "$@"
 step "done"

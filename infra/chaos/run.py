@@ -2,7 +2,7 @@
 """Breaks a cluster in every way that clusters break while it works, and holds its model to the bytes that one undisturbed process makes
 of the same plan.
 
-    infra/chaos/run.py [--seeds 0..20] [--cases kill-worker,corrupt] [--capture FOLDER] [--out LINES.jsonl]
+    infra/chaos/run.py --capture FOLDER [--seeds 0..20] [--cases kill-worker,corrupt] [--out LINES.jsonl]
 
 The images must be there (.ci/chaos.sh makes them). When a case strikes, whom, and for how long follows from its seed. One line a case;
 exit code 1 if a model differs, or does not come to be.
@@ -19,10 +19,9 @@ import time
 from datetime import datetime
 from pathlib import Path
 
-from cluster import PROJECT, REPOSITORY, USER, Cluster, Trouble, cut, docker, kill, mend, run
+from cluster import PROJECT, USER, Cluster, Trouble, cut, docker, kill, mend
 
 PLAN = ["--blocks", "tree", "--levels", "1", "--steps", "1600", "--backend", "cpu"]
-STREET = REPOSITORY.parent / "shared/data/street_lund"
 LEASE_SECONDS = 2
 CHECKPOINT_SECONDS = 1
 # A job that takes longer than this hangs.
@@ -208,7 +207,7 @@ def arguments():
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--seeds", default="0..1", help="from..to, the last not among them")
     parser.add_argument("--cases", default=",".join(CASES), help="some of " + ", ".join(CASES))
-    parser.add_argument("--capture", type=Path, help="a folder; by default ../shared/data/street_lund, or a synthetic city")
+    parser.add_argument("--capture", type=Path, required=True, help="a folder of photos, as plat train takes it")
     parser.add_argument("--out", type=Path, help="append a line of JSON for each case")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--keep", action="store_true", help="leave the cluster as it is after the last case")
@@ -238,8 +237,7 @@ def main():
     with tempfile.TemporaryDirectory(prefix="plat-chaos-") as scratch:
         scratch = Path(scratch)
         scratch.chmod(0o755)
-        capture = chosen.capture or (STREET if STREET.is_dir() else scratch / "models/city")
-        cluster = Cluster(capture.resolve(), scratch, chosen.workers, LEASE_SECONDS, CHECKPOINT_SECONDS)
+        cluster = Cluster(chosen.capture.resolve(), scratch, chosen.workers, LEASE_SECONDS, CHECKPOINT_SECONDS)
         alone = lambda *words: finish(cluster.client("--entrypoint", "plat", "client", *words), about) == 0
         try:
             about = {"case": "start", "seed": "-"}
@@ -248,10 +246,6 @@ def main():
             cluster.start("s3://plat/start")
             note(about | {"seconds": round(time.monotonic() - began, 1)}, None)
             about = {"case": "one process", "seed": "-"}
-            if not capture.is_dir():
-                synth = ["--area-km2", "0.02", "--views", "24", "--size", "160x120"]
-                if not alone("synth", "--out", "/out/city", *synth):
-                    raise Trouble(about["said"])
             began = time.monotonic()
             if not alone("train", "/capture", "--out", "/out/alone", "--workers", "1", "--threads", "2", *PLAN):
                 raise Trouble(about["said"])
