@@ -47,7 +47,7 @@ capture=../shared/data/street_lund
 capture=$(realpath "$capture")
 docker run --rm --network none plat --version
 few=(--blocks whole --steps 20 --downscale 4 --quiet)
-docker run --rm --network none --read-only --tmpfs /tmp:mode=1777 --tmpfs /out:mode=1777 --volume "$capture:/capture:ro" \
+docker run --rm --network none --read-only --tmpfs /tmp:mode=1777 --volume /out --volume "$capture:/capture:ro" \
     plat-gpu train /capture --out /out/model --backend gpu "${few[@]}"
 # Images of the profile `observability` come from a registry that CI cannot reach: what is checked is how they are put together.
 docker compose --profile observability config --quiet

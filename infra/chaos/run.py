@@ -21,7 +21,7 @@ from pathlib import Path
 
 from cluster import PROJECT, USER, Cluster, Trouble, cut, docker, kill, mend
 
-PLAN = ["--blocks", "tree", "--levels", "1", "--steps", "1600", "--backend", "cpu"]
+PLAN = ["--blocks", "tree", "--levels", "1", "--steps", "900", "--downscale", "4", "--backend", "cpu"]
 LEASE_SECONDS = 2
 CHECKPOINT_SECONDS = 1
 # A job that takes longer than this hangs.
@@ -74,7 +74,7 @@ def pause_leader(cluster, job, chance, about):
 
 def fill_disk(cluster, job, chance, about):
     """The store's disk is full for a while."""
-    filled = f"dd if=/dev/zero of=/shared/filler bs=64K; sleep {away(chance):.1f}; rm /shared/filler"
+    filled = f"cat /dev/zero > /shared/filler; sleep {away(chance):.1f}; rm /shared/filler"
     image = cluster.env.get("PLAT_IMAGE", "plat:latest")
     volume = f"{PROJECT}_shared:/shared"
     docker("run", "--rm", "--network", "none", "--user", str(USER), "--volume", volume, "--entrypoint", "sh", image, "-c", filled)
