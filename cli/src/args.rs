@@ -20,7 +20,8 @@ pub(crate) use bench::{
     KernelsArgs, ParetoArgs,
 };
 pub(crate) use cluster::{
-    Connection, CoordinatorArgs, JobArgs, JobsArgs, LogsArgs, RetryArgs, StatusArgs, SubmitArgs, TaskName, WorkerArgs,
+    Connection, CoordinatorArgs, JobArgs, JobsArgs, LogFormat, LogsArgs, RetryArgs, StatusArgs, SubmitArgs, TaskName,
+    Told, WorkerArgs,
 };
 pub(crate) use sweep::{Named, Sweep};
 pub(crate) use synth::SynthArgs;

@@ -20,6 +20,7 @@ mod record;
 mod remote;
 mod seams;
 mod signals;
+mod told;
 mod variants;
 
 use std::process::ExitCode;
@@ -38,14 +39,11 @@ fn main() -> ExitCode {
         }
         Err(config::Stop::Usage(line)) => return fail(&Failure::Input(line)),
     };
-    // Who serves for days says what happens without being asked; whoever runs a command sees its notes.
-    let serves = matches!(cli.command, Command::Coordinator(_) | Command::Worker(_)) && !cli.quiet;
-    if std::env::var_os("RUST_LOG").is_some() || serves {
-        let filter = tracing_subscriber::EnvFilter::try_from_default_env();
-        let filter = filter.unwrap_or_else(|_| "warn,coordinator=info,worker=info".into());
-        tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
-    }
-    let output = Output::new(cli.json, cli.quiet);
+    let telemetry = match told::start(&cli) {
+        Ok(telemetry) => telemetry,
+        Err(error) => return fail(&error.into()),
+    };
+    let output = Output::new(cli.json, cli.quiet, told::format(&cli) == telemetry::Format::Json);
     let done = match &cli.command {
         Command::Demo(args) => commands::demo::run(args, &output),
         Command::Synth(args) => commands::synth::run(args, &output),
@@ -78,7 +76,15 @@ fn main() -> ExitCode {
         Command::Bench(BenchCommand::Adaptive(args)) => commands::bench::adaptive(args, &output),
         Command::Bench(BenchCommand::Demo(args)) => commands::bench::demo(args, &output),
     };
-    done.map_or_else(|failure| fail(&failure), |()| ExitCode::SUCCESS)
+    let code = done.map_or_else(
+        |failure| {
+            output.complain(&failure);
+            ExitCode::from(failure.exit_code())
+        },
+        |()| ExitCode::SUCCESS,
+    );
+    telemetry.finish();
+    code
 }
 
 fn fail(failure: &Failure) -> ExitCode {

@@ -17,12 +17,14 @@ use crate::failure::Failure;
 pub(crate) struct Output {
     json: bool,
     quiet: bool,
+    /// Notes go into the log, which is for tools.
+    logged: bool,
     terminal: bool,
 }
 
 impl Output {
-    pub(crate) fn new(json: bool, quiet: bool) -> Self {
-        Self { json, quiet, terminal: std::io::stderr().is_terminal() }
+    pub(crate) fn new(json: bool, quiet: bool, logged: bool) -> Self {
+        Self { json, quiet, logged, terminal: std::io::stderr().is_terminal() }
     }
 
     /// Whether the result is an object for a program.
@@ -32,8 +34,19 @@ impl Output {
 
     /// A line on the way, on stderr.
     pub(crate) fn note(&self, line: impl Display) {
-        if !self.quiet {
-            to_stderr(&format!("{line}\n"));
+        match (self.quiet, self.logged) {
+            (true, _) => {}
+            (false, true) => tracing::info!("{line}"),
+            (false, false) => to_stderr(&format!("{line}\n")),
+        }
+    }
+
+    /// The one line of an error; said in any case.
+    pub(crate) fn complain(&self, failure: &Failure) {
+        if self.logged && tracing::enabled!(tracing::Level::ERROR) {
+            tracing::error!("{failure}");
+        } else {
+            complain(&failure.to_string());
         }
     }
 

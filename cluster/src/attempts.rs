@@ -78,7 +78,10 @@ impl Scheduler {
                 charged,
             };
             match &mut record.state {
-                TaskState::Leased { leases } => leases.push(lease),
+                TaskState::Leased { leases } => {
+                    leases.push(lease);
+                    self.tally.duplicates += 1;
+                }
                 state => *state = TaskState::Leased { leases: vec![lease] },
             }
             (fence, record.rate_permille())
@@ -151,6 +154,7 @@ impl Scheduler {
             }
         };
         self.learn(attempt, &lease);
+        self.tally.completions += 1;
         self.move_on(id, task, actions, |record| record.state = TaskState::Done { fence, artefact });
         actions.retain(|action| !matches!(action, Action::Stop { attempt: stopped, .. } if *stopped == attempt));
         let Some(job) = self.jobs.get_mut(&id) else { return };
@@ -196,6 +200,7 @@ impl Scheduler {
             largest: self.lanes.get(&job.backend).and_then(Lane::largest_memory),
         };
         let (now, settings) = (self.now_millis, self.settings);
+        self.tally.ended(&trouble);
         // Attempts under way at once have the same rate and the same results: where one diverges the other will, too. It is
         // no second try, so it ends here; counted as one, a task would be quarantined without ever having had its lower rate.
         let speaks_for_all = matches!(&trouble, Trouble::Said(Failure { kind: FailureKind::Numeric, .. }));

@@ -112,7 +112,8 @@ fn check_job(scheduler: &Scheduler, job: &Job, indices: &mut Indices) -> Result<
                 }
             }
             TaskState::Done { .. } => counts.done += 1,
-            TaskState::Failed { .. } | TaskState::Quarantined { .. } => counts.failed += 1,
+            TaskState::Failed { .. } => counts.failed += 1,
+            TaskState::Quarantined { .. } => counts.quarantined += 1,
         }
         check_attempts(record).map_err(|what| Violation { number: 5, what: format!("{} {what}", name()) })?;
         let goes_on = !record.state.is_final() && retry::is_poison(record, settings);

@@ -33,13 +33,21 @@ pub(crate) struct Indices {
 
 /// How many tasks there are of each state.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub(crate) struct Counts {
-    pub(crate) waiting: u32,
-    pub(crate) ready: u32,
-    pub(crate) delayed: u32,
-    pub(crate) leased: u32,
-    pub(crate) done: u32,
-    pub(crate) failed: u32,
+pub struct Counts {
+    /// Whose dependencies are not done.
+    pub waiting: u32,
+    /// That may be granted.
+    pub ready: u32,
+    /// In a pause before the next attempt.
+    pub delayed: u32,
+    /// With an attempt under way.
+    pub leased: u32,
+    /// With a result.
+    pub done: u32,
+    /// Whose input is wrong.
+    pub failed: u32,
+    /// That reached a limit.
+    pub quarantined: u32,
 }
 
 #[derive(Debug, Clone)]
@@ -250,7 +258,8 @@ impl Job {
                 &mut self.counts.leased
             }
             TaskState::Done { .. } => &mut self.counts.done,
-            TaskState::Failed { .. } | TaskState::Quarantined { .. } => &mut self.counts.failed,
+            TaskState::Failed { .. } => &mut self.counts.failed,
+            TaskState::Quarantined { .. } => &mut self.counts.quarantined,
         };
         *count = if put { *count + 1 } else { *count - 1 };
         if matches!(record.state, TaskState::Ready { .. }) {

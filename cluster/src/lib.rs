@@ -23,6 +23,7 @@ mod retry;
 mod scheduler;
 pub mod sim;
 mod snapshot;
+mod tally;
 mod upkeep;
 mod words;
 
@@ -30,8 +31,10 @@ pub use dag::DagError;
 pub use durable::Changes;
 pub use events::{Action, Event, Failure, FailureKind, Outcome};
 pub use invariants::{Violation, check, check_step};
+pub use job::Counts;
 pub use scheduler::Scheduler;
 pub use snapshot::{JobHeader, JobSnapshot, RestoreError, Snapshot};
+pub use tally::Tally;
 pub use words::{
     AttemptId, CACHED_LIMIT, FULL_RATE, Fence, JobId, JobSpec, Lease, Offer, Settings, TaskIndex, TaskNode, TaskRecord,
     TaskState, WorkerId,

@@ -30,8 +30,9 @@ use std::collections::{BTreeMap, BTreeSet};
 use scene::ArtefactId;
 
 use crate::events::{Action, Event, Outcome};
-use crate::job::{Indices, Job};
+use crate::job::{Counts, Indices, Job};
 use crate::lanes::{Lane, Worker};
+use crate::tally::Tally;
 use crate::words::{AttemptId, JobId, Offer, Settings, TaskIndex, TaskRecord, WorkerId};
 
 /// The scheduler of all jobs.
@@ -52,6 +53,7 @@ pub struct Scheduler {
     pub(crate) unfinished: usize,
     /// Jobs that this step changed.
     pub(crate) touched: BTreeSet<JobId>,
+    pub(crate) tally: Tally,
 }
 
 impl Scheduler {
@@ -72,6 +74,7 @@ impl Scheduler {
             strands: BTreeSet::new(),
             unfinished: 0,
             touched: BTreeSet::new(),
+            tally: Tally::default(),
         }
     }
 
@@ -101,6 +104,7 @@ impl Scheduler {
             Event::Ticked => {}
         }
         self.settle(&mut actions);
+        self.tally.note(&actions);
         actions
     }
 
@@ -122,6 +126,27 @@ impl Scheduler {
     /// What a worker said of itself, if it is known.
     pub fn offer(&self, worker: WorkerId) -> Option<&Offer> {
         self.workers.get(&worker).map(|worker| &worker.offer)
+    }
+
+    /// How many workers there are of each backend that has any.
+    pub fn backends(&self) -> impl Iterator<Item = (&str, usize)> {
+        let lanes = self.lanes.iter().map(|(backend, lane)| (backend.as_str(), lane.memories.len()));
+        lanes.filter(|(_, workers)| *workers > 0)
+    }
+
+    /// What it did since it began.
+    pub fn tally(&self) -> Tally {
+        self.tally
+    }
+
+    /// How many tasks of a job are where; none if there is no such job.
+    pub fn counts(&self, job: JobId) -> Counts {
+        self.jobs.get(&job).map(|job| job.counts).unwrap_or_default()
+    }
+
+    /// Whether a person paused the job.
+    pub fn is_paused(&self, job: JobId) -> bool {
+        self.jobs.get(&job).is_some_and(|job| job.paused)
     }
 
     /// Number of tasks of a job; 0 if there is no such job.

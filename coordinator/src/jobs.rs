@@ -3,6 +3,7 @@
 //! and the news that must not go out before that is durable.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 use cluster::journal::{Line, digest, to_text};
 use cluster::{
@@ -14,14 +15,16 @@ use proto::control_request::What;
 use proto::lease_reply::Reply;
 use proto::watch_event::Event as News;
 use scene::ArtefactId;
+use telemetry::TraceParent;
 use tokio::sync::mpsc;
 use tonic::Status;
 
 use crate::Options;
 use crate::collect::Leftovers;
 use crate::log::Log;
+use crate::metrics::{Leads, Metrics};
 use crate::news::{Watched, Watchers, changed, finished, to_wire};
-use crate::state::{Batch, Restored};
+use crate::state::{Batch, Origin, Restored};
 
 /// Different names of workers.
 const WORKERS_LIMIT: usize = 100_000;
@@ -48,7 +51,7 @@ pub(crate) struct Jobs {
 
 /// What the scheduler does not care for.
 struct Job {
-    plan: ArtefactId,
+    origin: Origin,
     watchers: Watchers,
 }
 
@@ -79,12 +82,13 @@ impl Jobs {
     /// A state that no coordinator could have written.
     pub(crate) fn restore(options: Options, restored: Restored, epoch: u64) -> Result<Self, RestoreError> {
         let settings = Self::settings(&options);
-        let Restored { snapshot, plans, workers, next_job } = restored;
+        let Restored { snapshot, origins, workers, next_job } = restored;
         let began = options.journal.is_some().then(|| snapshot.clone());
         let mut jobs = Self::of(options, Scheduler::restore(snapshot, settings, epoch, 0)?);
         jobs.workers = workers.iter().cloned().zip((0..).map(WorkerId)).collect();
         jobs.names = workers;
-        jobs.jobs = plans.into_iter().map(|(id, plan)| (id, Job { plan, watchers: Watchers::default() })).collect();
+        let job = |(id, origin)| (id, Job { origin, watchers: Watchers::default() });
+        jobs.jobs = origins.into_iter().map(job).collect();
         jobs.next_job = next_job;
         jobs.write(|| Line::Began { settings, snapshot: began.unwrap_or_default(), epoch, now_millis: 0 });
         Ok(jobs)
@@ -108,6 +112,20 @@ impl Jobs {
 
     fn settings(options: &Options) -> Settings {
         Settings { ask_millis: options.wait_millis.into(), ..options.settings }
+    }
+
+    /// Under which epoch they are handed out.
+    pub(crate) fn epoch(&self) -> u64 {
+        self.scheduler.epoch()
+    }
+
+    pub(crate) fn metrics(&self) -> Arc<Metrics> {
+        self.options.metrics.clone()
+    }
+
+    /// Tells how they stand.
+    pub(crate) fn measure(&self, leads: &mut Leads<'_>) {
+        leads.measure(&self.scheduler);
     }
 
     /// How many there are.
@@ -145,7 +163,14 @@ impl Jobs {
         }
     }
 
-    pub(crate) fn submit(&mut self, now: u64, plan: ArtefactId, spec: JobSpec) -> Result<u64, Status> {
+    /// `traced` is the span that its tasks are part of.
+    pub(crate) fn submit(
+        &mut self,
+        now: u64,
+        plan: ArtefactId,
+        spec: JobSpec,
+        traced: Option<TraceParent>,
+    ) -> Result<u64, Status> {
         self.check_collecting()?;
         if self.jobs.len() >= self.options.settings.jobs_limit as usize {
             // The oldest that is over makes room.
@@ -156,7 +181,7 @@ impl Jobs {
             self.jobs.remove(&over);
         }
         let id = JobId(self.next_job);
-        self.jobs.insert(id, Job { plan, watchers: Watchers::default() });
+        self.jobs.insert(id, Job { origin: Origin { plan, traced }, watchers: Watchers::default() });
         let actions = self.step(now, Event::Submitted { job: id, spec });
         if let Err(status) = agreed(&actions, Status::invalid_argument) {
             self.jobs.remove(&id);
@@ -165,7 +190,6 @@ impl Jobs {
         self.next_job += 1;
         self.log.job(now, id, format!("submitted: plan {plan}, {} tasks", self.scheduler.len(id)));
         self.batch.next_job = Some(self.next_job);
-        tracing::info!(job = id.0, %plan, "submitted");
         Ok(id.0)
     }
 
@@ -215,9 +239,8 @@ impl Jobs {
     pub(crate) fn fail(&mut self, now: u64, of: proto::Attempt, failure: Failure) -> Result<bool, Status> {
         let attempt = self.attempt(of)?;
         let (kind, message) = (failure.kind, &failure.message);
-        tracing::warn!(job = of.job, task = of.task, attempt = of.number, ?kind, "attempt failed: {message}");
         if self.scheduler.holds(attempt) {
-            self.log.attempt(now, attempt, format!("ended without a result, {kind:?}: {message}"));
+            self.log.trouble(now, attempt, format!("ended without a result, {kind:?}: {message}"));
         }
         Ok(accepted(&self.step(now, Event::Failed { attempt, failure })))
     }
@@ -260,7 +283,7 @@ impl Jobs {
     /// is known here only once it is done.
     pub(crate) fn collect(&mut self, id: u64) -> Result<Leftovers, Status> {
         let of = JobId(id);
-        let plan = self.job(of)?.plan;
+        let plan = self.job(of)?.origin.plan;
         if let Some(other) = self.jobs.keys().find(|other| self.scheduler.finished(**other).is_none()) {
             return Err(Status::failed_precondition(format!("job {} runs; forget job {id} when none does", other.0)));
         }
@@ -271,7 +294,7 @@ impl Jobs {
             left.keys.insert(proto::memory_key(plan, task.0, &inputs));
         }
         for (other, job) in self.jobs.iter().filter(|(other, _)| **other != of) {
-            for id in self.results(*other).chain([job.plan]) {
+            for id in self.results(*other).chain([job.origin.plan]) {
                 left.artefacts.remove(&id);
             }
         }
@@ -326,7 +349,8 @@ impl Jobs {
         let id = JobId(id);
         let job = self.job(id)?;
         let outcome = self.scheduler.finished(id).map(|outcome| to_wire(outcome).into());
-        let mut reply = proto::StatusReply { job: id.0, plan: job.plan.0.to_vec(), outcome, ..Default::default() };
+        let mut reply =
+            proto::StatusReply { job: id.0, plan: job.origin.plan.0.to_vec(), outcome, ..Default::default() };
         if let Some(header) = self.scheduler.header(id) {
             (reply.paused, reply.priority, reply.weight) = (header.paused, header.priority.into(), header.weight);
         }
@@ -359,7 +383,7 @@ impl Jobs {
 
     /// The plan of a job.
     pub(crate) fn plan(&self, id: u64) -> Result<ArtefactId, Status> {
-        self.job(JobId(id)).map(|job| job.plan)
+        self.job(JobId(id)).map(|job| job.origin.plan)
     }
 
     /// What happened in a job after a line.
@@ -370,12 +394,11 @@ impl Jobs {
 
     /// How many of the workers that are there compute with what.
     pub(crate) fn backends(&self) -> Vec<proto::BackendCount> {
-        let mut counts: BTreeMap<&str, u32> = BTreeMap::new();
-        for offer in self.workers.values().filter_map(|worker| self.scheduler.offer(*worker)) {
-            *counts.entry(&offer.backend).or_default() += 1;
-        }
-        let count = |(backend, workers): (&str, u32)| proto::BackendCount { backend: backend.into(), workers };
-        counts.into_iter().map(count).collect()
+        let count = |(backend, workers): (&str, usize)| proto::BackendCount {
+            backend: backend.into(),
+            workers: workers as u32,
+        };
+        self.scheduler.backends().map(count).collect()
     }
 
     pub(crate) fn tick(&mut self, now: u64) {
@@ -393,7 +416,7 @@ impl Jobs {
             let held = held.and_then(|()| cluster::check_step(&before, &self.scheduler, &event, &actions));
             held.unwrap_or_else(|violation| panic!("{violation}"));
         }
-        self.log.step(now, &self.scheduler, &actions);
+        self.log.step(now, &self.scheduler, &actions, &self.names);
         for action in &actions {
             match action {
                 Action::Changed { job, task } => {
@@ -402,10 +425,7 @@ impl Jobs {
                         self.due.push(Due::News(*job, news));
                     }
                 }
-                Action::JobFinished { job, outcome } => {
-                    tracing::info!(job = job.0, ?outcome, "finished");
-                    self.due.push(Due::Over(*job, *outcome));
-                }
+                Action::JobFinished { job, outcome } => self.due.push(Due::Over(*job, *outcome)),
                 _ => {}
             }
         }
@@ -420,7 +440,7 @@ impl Jobs {
         let changes = Changes::of(&self.scheduler, event, actions);
         for id in changes.headers.keys() {
             if let Some(job) = self.jobs.get(id) {
-                self.batch.plans.insert(*id, job.plan);
+                self.batch.origins.insert(*id, job.origin.clone());
             }
         }
         self.batch.changes.absorb(changes);
@@ -441,11 +461,13 @@ impl Jobs {
         let input =
             |(task, artefact): (TaskIndex, ArtefactId)| proto::Input { task: task.0, artefact: artefact.0.to_vec() };
         let AttemptId { job, task, fence: Fence { epoch, number } } = attempt;
+        let Origin { plan, traced } = &self.job(job)?.origin;
         Ok(proto::Grant {
             attempt: Some(proto::Attempt { job: job.0, task: task.0, number, epoch }),
-            plan: self.job(job)?.plan.0.to_vec(),
+            plan: plan.0.to_vec(),
             lease_millis,
             inputs: self.scheduler.inputs(job, task).into_iter().map(input).collect(),
+            traceparent: traced.as_ref().map(|parent| parent.as_str().into()).unwrap_or_default(),
         })
     }
 

@@ -17,6 +17,7 @@ mod jobs;
 mod leader;
 mod local;
 mod log;
+mod metrics;
 mod news;
 mod owner;
 mod results;
@@ -25,6 +26,7 @@ mod service;
 mod state;
 
 use std::future::Future;
+use std::sync::Arc;
 use std::time::Duration;
 
 use cluster::Settings;
@@ -38,6 +40,7 @@ use tonic::transport::server::TcpIncoming;
 
 use jobs::Jobs;
 pub use local::run_local;
+pub use metrics::Metrics;
 use owner::{Inbox, own};
 pub use results::{LocalError, Results, of_status};
 pub use security::Security;
@@ -74,13 +77,24 @@ pub struct Options {
     pub journal: Option<mpsc::Sender<String>>,
     /// Encryption and proofs: needed beyond this machine.
     pub security: Security,
+    /// What it tells of itself.
+    pub metrics: Arc<Metrics>,
 }
 
 impl Options {
     /// The defaults: 30 s leases, 200 ms waits, workers stay, jobs in memory, no journal, for this machine alone.
     pub fn new(store: Store) -> Self {
-        let (settings, security) = (Settings::default(), Security::default());
-        Self { store, settings, wait_millis: 200, drain: false, epoch: 1, durable: None, journal: None, security }
+        Self {
+            store,
+            settings: Settings::default(),
+            wait_millis: 200,
+            drain: false,
+            epoch: 1,
+            durable: None,
+            journal: None,
+            security: Security::default(),
+            metrics: Arc::default(),
+        }
     }
 }
 

@@ -54,7 +54,7 @@ where
 
     let mut client = proto::connect(&url, &Access::default()).map_err(failed("the coordinator's address"))?;
     let request = proto::SubmitRequest { plan: plan.0.to_vec(), store_url };
-    let job = client.submit(request).await.map_err(of_status)?.into_inner();
+    let job = client.submit(telemetry::traced(request)).await.map_err(of_status)?.into_inner();
 
     // Watched before anyone works: a report that came earlier would be told to nobody.
     let mut news = client.watch(proto::WatchRequest { job: job.job }).await.map_err(of_status)?.into_inner();

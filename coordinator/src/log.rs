@@ -1,8 +1,8 @@
-//! What happened lately, for people: a bounded list of lines, which nothing depends on.
+//! What happened lately: a bounded list of lines for people, which nothing depends on, and an event for the program's own log each.
 
 use std::collections::VecDeque;
 
-use cluster::{Action, AttemptId, JobId, Scheduler, TaskIndex, TaskState};
+use cluster::{Action, AttemptId, JobId, Scheduler, TaskIndex, TaskState, WorkerId};
 use proto::LogLine;
 
 /// Lines of all jobs that are kept, the newest.
@@ -35,29 +35,30 @@ struct Line {
 impl Log {
     /// Something that concerns a whole job.
     pub(crate) fn job(&mut self, now: u64, job: JobId, what: impl Into<String>) {
-        self.add(Line { number: 0, now, job, task: None, attempt: 0, worker: None, what: what.into() });
+        let what = what.into();
+        tracing::info!(job = job.0, "{what}");
+        self.keep(Line { number: 0, now, job, task: None, attempt: 0, worker: None, what });
     }
 
-    /// Something that an attempt said.
-    pub(crate) fn attempt(&mut self, now: u64, of: AttemptId, what: impl Into<String>) {
+    /// What went wrong with an attempt.
+    pub(crate) fn trouble(&mut self, now: u64, of: AttemptId, what: impl Into<String>) {
         let AttemptId { job, task, fence } = of;
-        let (task, attempt) = (Some(task), fence.number);
-        self.add(Line { number: 0, now, job, task, attempt, worker: None, what: what.into() });
+        let (attempt, what) = (fence.number, what.into());
+        tracing::warn!(job = job.0, task = task.0, attempt, "{what}");
+        self.keep(Line { number: 0, now, job, task: Some(task), attempt, worker: None, what });
     }
 
-    /// What a step came to; the scheduler is as it is after it.
-    pub(crate) fn step(&mut self, now: u64, scheduler: &Scheduler, actions: &[Action]) {
+    /// What a step came to; the scheduler is as it is after it, and `names` are those of the workers.
+    pub(crate) fn step(&mut self, now: u64, scheduler: &Scheduler, actions: &[Action], names: &[String]) {
         for action in actions {
-            let line = |job, task, attempt, worker, what| Line { number: 0, now, job, task, attempt, worker, what };
             match action {
                 Action::Grant { worker, attempt, .. } => {
-                    let AttemptId { job, task, fence } = *attempt;
-                    self.add(line(job, Some(task), fence.number, Some(worker.0), "granted".into()));
+                    let name = names.get(worker.0 as usize);
+                    self.of_worker(now, *attempt, *worker, name, "granted".into());
                 }
                 Action::Stop { worker, attempt } => {
-                    let AttemptId { job, task, fence } = *attempt;
-                    let what = "is told to stop: not needed any more".into();
-                    self.add(line(job, Some(task), fence.number, Some(worker.0), what));
+                    let name = names.get(worker.0 as usize);
+                    self.of_worker(now, *attempt, *worker, name, "is told to stop: not needed any more".into());
                 }
                 Action::Changed { job, task } => {
                     let Some(record) = scheduler.record(*job, *task) else { continue };
@@ -71,7 +72,13 @@ impl Log {
                         }
                         TaskState::Waiting { .. } | TaskState::Ready { .. } | TaskState::Leased { .. } => continue,
                     };
-                    self.add(line(*job, Some(*task), attempt, None, what));
+                    match record.state {
+                        TaskState::Failed { .. } | TaskState::Quarantined { .. } => {
+                            tracing::error!(job = job.0, task = task.0, attempt, "{what}");
+                        }
+                        _ => tracing::info!(job = job.0, task = task.0, attempt, "{what}"),
+                    }
+                    self.keep(Line { number: 0, now, job: *job, task: Some(*task), attempt, worker: None, what });
                 }
                 Action::JobFinished { job, outcome } => self.job(now, *job, format!("over: {outcome:?}")),
                 _ => {}
@@ -95,7 +102,14 @@ impl Log {
         lines.map(to_wire).collect()
     }
 
-    fn add(&mut self, mut line: Line) {
+    fn of_worker(&mut self, now: u64, of: AttemptId, worker: WorkerId, name: Option<&String>, what: String) {
+        let AttemptId { job, task, fence } = of;
+        let attempt = fence.number;
+        tracing::info!(job = job.0, task = task.0, attempt, worker = name, "{what}");
+        self.keep(Line { number: 0, now, job, task: Some(task), attempt, worker: Some(worker.0), what });
+    }
+
+    fn keep(&mut self, mut line: Line) {
         if line.what.len() > MESSAGE_LIMIT {
             let end = (0..=MESSAGE_LIMIT).rev().find(|&end| line.what.is_char_boundary(end));
             line.what.truncate(end.unwrap_or(0));

@@ -17,10 +17,13 @@ use tokio_util::sync::CancellationToken;
 use tonic::Status;
 
 use crate::jobs::{Due, Jobs};
-use crate::state::{State, StateError};
+use crate::metrics::{Leads, Metrics};
+use crate::state::{Batch, State, StateError};
 
 /// How often time goes by for the scheduler when nothing else happens.
 const TICK: Duration = Duration::from_millis(100);
+/// How often the metrics are brought up to date.
+const LOOK: Duration = Duration::from_secs(1);
 
 /// A call to the owner: what to do with the jobs, at this many milliseconds since they were opened; or why there are none here.
 pub(crate) type Call = Box<dyn FnOnce(Result<(&mut Jobs, u64), Status>) + Send>;
@@ -50,15 +53,33 @@ pub(crate) async fn own(
     stop: &CancellationToken,
     deposed: &CancellationToken,
 ) -> Result<Stopped, StateError> {
+    let metrics = jobs.metrics();
+    let mut leads = metrics.leads(jobs.epoch());
+    let ended = own_until(&mut jobs, state, inbox, [stop, deposed], &mut leads).await;
+    jobs.measure(&mut leads);
+    ended
+}
+
+async fn own_until(
+    jobs: &mut Jobs,
+    state: Option<&State>,
+    inbox: &mut Inbox,
+    [stop, deposed]: [&CancellationToken; 2],
+    leads: &mut Leads<'_>,
+) -> Result<Stopped, StateError> {
     let began = Instant::now();
     let mut tick = interval(TICK);
     tick.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    let mut look = interval(LOOK);
+    look.set_missed_tick_behavior(MissedTickBehavior::Delay);
     let mut writing: Option<(Write<'_>, Vec<Due>)> = None;
     loop {
         if writing.is_none() {
             let (batch, due) = jobs.take_gathered();
             match state {
-                Some(state) if !batch.is_empty() => writing = Some((Box::pin(state.write(batch)), due)),
+                Some(state) if !batch.is_empty() => {
+                    writing = Some((Box::pin(timed(state, batch, leads.metrics())), due))
+                }
                 _ => jobs.deliver(due),
             }
         }
@@ -72,6 +93,10 @@ pub(crate) async fn own(
                 jobs.deliver(due.unwrap_or_default());
                 continue;
             }
+            _ = look.tick() => {
+                jobs.measure(leads);
+                continue;
+            }
             call = inbox.recv() => match call {
                 Some(call) => call,
                 None => break,
@@ -82,7 +107,7 @@ pub(crate) async fn own(
                 }
             }) as Call,
         };
-        call(Ok((&mut jobs, began.elapsed().as_millis() as u64)));
+        call(Ok((&mut *jobs, began.elapsed().as_millis() as u64)));
     }
     if let Some((write, due)) = writing {
         write.await?;
@@ -90,10 +115,18 @@ pub(crate) async fn own(
     }
     let (batch, due) = jobs.take_gathered();
     if let Some(state) = state.filter(|_| !batch.is_empty()) {
-        state.write(batch).await?;
+        timed(state, batch, leads.metrics()).await?;
     }
     jobs.deliver(due);
     Ok(Stopped::Asked)
+}
+
+/// Makes a batch durable, and tells what that took.
+async fn timed(state: &State, batch: Batch, metrics: &Metrics) -> Result<(), StateError> {
+    let began = Instant::now();
+    state.write(batch).await?;
+    metrics.wrote(began.elapsed());
+    Ok(())
 }
 
 async fn under_way(writing: &mut Option<(Write<'_>, Vec<Due>)>) -> Result<(), StateError> {

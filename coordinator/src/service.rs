@@ -15,10 +15,13 @@ use proto::{
 };
 use scene::{ArtefactId, BlockId, CodecError};
 use store::{Store, StoreError};
+use telemetry::TraceParent;
 use tokio::sync::{mpsc, oneshot};
 use tokio_stream::wrappers::ReceiverStream;
 use tokio_stream::{Stream, StreamExt};
 use tonic::{Request, Response, Status};
+use tracing::field::Empty;
+use tracing::{Instrument, Span};
 
 use crate::jobs::Jobs;
 use crate::owner::Call;
@@ -71,6 +74,20 @@ impl Service {
         let gone = || Status::unavailable("the coordinator is shutting down or leads no more");
         self.calls.send(call).await.map_err(|_| gone())?;
         answer.await.map_err(|_| gone())?
+    }
+
+    /// Makes a job of a plan, traced under this span.
+    async fn accept(&self, request: SubmitRequest, traced: Option<TraceParent>) -> Result<SubmitReply, Status> {
+        if request.store_url != self.store.url() {
+            let (theirs, ours) = (proto::one_line(&request.store_url), self.store.url());
+            let problem = format!("the plan lies in the store '{theirs}', this coordinator works on '{ours}'");
+            return Err(Status::failed_precondition(problem));
+        }
+        let plan = proto::artefact_id(&request.plan)?;
+        let spec = self.read_plan(plan, spec_of).await?;
+        let tasks = spec.tasks.len() as u32;
+        let job = self.ask(move |jobs, now| jobs.submit(now, plan, spec, traced)).await?;
+        Ok(SubmitReply { job, tasks })
     }
 
     /// Deletes what a job left, then forgets it. Goes on to its end if the caller hangs up.
@@ -143,6 +160,14 @@ fn store_status(error: StoreError) -> Status {
     }
 }
 
+/// A span under the caller's. Who is not traced gets none: it would be a trace of its own.
+fn span_of(parent: Option<TraceParent>, span: impl FnOnce() -> Span) -> Span {
+    let Some(parent) = parent else { return Span::none() };
+    let span = span();
+    parent.adopt(&span);
+    span
+}
+
 fn attempt_of(attempt: Option<proto::Attempt>) -> Result<proto::Attempt, Status> {
     attempt.ok_or_else(|| Status::invalid_argument("the call names no attempt"))
 }
@@ -156,17 +181,14 @@ impl Coordinator for Service {
     }
 
     async fn submit(&self, request: Request<SubmitRequest>) -> Answer<SubmitReply> {
-        let request = request.into_inner();
-        if request.store_url != self.store.url() {
-            let (theirs, ours) = (proto::one_line(&request.store_url), self.store.url());
-            let problem = format!("the plan lies in the store '{theirs}', this coordinator works on '{ours}'");
-            return Err(Status::failed_precondition(problem));
-        }
-        let plan = proto::artefact_id(&request.plan)?;
-        let spec = self.read_plan(plan, spec_of).await?;
-        let tasks = spec.tasks.len() as u32;
-        let job = self.ask(move |jobs, now| jobs.submit(now, plan, spec)).await?;
-        Ok(Response::new(SubmitReply { job, tasks }))
+        let span = tracing::info_span!("accept", otel.kind = "server", job = Empty, tasks = Empty);
+        let parent = TraceParent::of_header(request.metadata());
+        parent.iter().for_each(|parent| parent.adopt(&span));
+        // A coordinator that exports nothing hands on what it heard.
+        let traced = TraceParent::of(&span).or(parent);
+        let reply = self.accept(request.into_inner(), traced).instrument(span.clone()).await?;
+        span.record("job", reply.job).record("tasks", reply.tasks);
+        Ok(Response::new(reply))
     }
 
     async fn lease(&self, request: Request<LeaseRequest>) -> Answer<LeaseReply> {
@@ -196,13 +218,21 @@ impl Coordinator for Service {
     }
 
     async fn complete(&self, request: Request<CompleteRequest>) -> Answer<AttemptReply> {
+        let parent = TraceParent::of_header(request.metadata());
         let CompleteRequest { attempt, artefact } = request.into_inner();
         let (attempt, artefact) = (attempt_of(attempt)?, proto::artefact_id(&artefact)?);
-        let accepted = self.ask(move |jobs, now| jobs.complete(now, attempt, artefact)).await?;
+        let span = span_of(parent, || {
+            let proto::Attempt { job, task, number: attempt, .. } = attempt;
+            tracing::info_span!("commit", otel.kind = "server", job, task, attempt, %artefact, accepted = Empty)
+        });
+        let work = self.ask(move |jobs, now| jobs.complete(now, attempt, artefact));
+        let accepted = work.instrument(span.clone()).await?;
+        span.record("accepted", accepted);
         Ok(Response::new(AttemptReply { accepted }))
     }
 
     async fn fail(&self, request: Request<FailRequest>) -> Answer<AttemptReply> {
+        let parent = TraceParent::of_header(request.metadata());
         let request = request.into_inner();
         let kind = match request.kind() {
             proto::FailureKind::Work => FailureKind::Work,
@@ -212,7 +242,13 @@ impl Coordinator for Service {
             proto::FailureKind::OutOfMemory => FailureKind::OutOfMemory,
         };
         let (attempt, message) = (attempt_of(request.attempt)?, proto::one_line(&request.message));
-        let accepted = self.ask(move |jobs, now| jobs.fail(now, attempt, Failure { kind, message })).await?;
+        let span = span_of(parent, || {
+            let proto::Attempt { job, task, number: attempt, .. } = attempt;
+            tracing::info_span!("fail", otel.kind = "server", job, task, attempt, ?kind, accepted = Empty)
+        });
+        let work = self.ask(move |jobs, now| jobs.fail(now, attempt, Failure { kind, message }));
+        let accepted = work.instrument(span.clone()).await?;
+        span.record("accepted", accepted);
         Ok(Response::new(AttemptReply { accepted }))
     }
 

@@ -3,7 +3,7 @@
 //! ```text
 //! epoch            u64, of whoever opened it last
 //! next_job         u64, numbers of jobs are used once
-//! job/<16 hex>     header and plan of a job
+//! job/<16 hex>     header of a job, its plan and the span that it is traced under
 //! task/<16 hex>/<8 hex>   a task's record
 //! worker/<8 hex>   the name of a worker, so that its number means the same again
 //! ```
@@ -26,6 +26,7 @@ use slatedb::bytes::Bytes;
 use slatedb::config::{FlushOptions, FlushType, Settings};
 use slatedb::{CloseReason, Db, ErrorKind, WriteBatch};
 use store::Store;
+use telemetry::TraceParent;
 
 /// Where the database lies below the store's URL.
 const FOLDER: &str = "state";
@@ -34,7 +35,9 @@ const FOLDER: &str = "state";
 const WRITES_PER_MERGE: u32 = 128;
 
 const NUMBER: Kind = Kind(*b"numb", 1);
-const JOB: Kind = Kind(*b"job ", 1);
+const JOB: Kind = Kind(*b"job ", 2);
+/// Of before jobs were traced.
+const UNTRACED_JOB: Kind = Kind(*b"job ", 1);
 const TASK: Kind = Kind(*b"task", 1);
 const NAME: Kind = Kind(*b"name", 1);
 
@@ -70,8 +73,8 @@ pub enum StateError {
 #[derive(Debug, Default)]
 pub(crate) struct Batch {
     pub(crate) changes: Changes,
-    /// Plans of the jobs whose header is written.
-    pub(crate) plans: BTreeMap<JobId, ArtefactId>,
+    /// Where the jobs came from whose header is written.
+    pub(crate) origins: BTreeMap<JobId, Origin>,
     /// Workers that were not there before, by number.
     pub(crate) workers: BTreeMap<u32, String>,
     pub(crate) next_job: Option<u64>,
@@ -87,14 +90,28 @@ impl Batch {
 #[derive(Debug, Default)]
 pub(crate) struct Restored {
     pub(crate) snapshot: Snapshot,
-    pub(crate) plans: BTreeMap<JobId, ArtefactId>,
+    pub(crate) origins: BTreeMap<JobId, Origin>,
     /// Names of workers, by number.
     pub(crate) workers: Vec<String>,
     pub(crate) next_job: u64,
 }
 
+/// What a job came with, and keeps.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) struct Origin {
+    pub(crate) plan: ArtefactId,
+    /// The span that its tasks are part of.
+    pub(crate) traced: Option<TraceParent>,
+}
+
 #[derive(Serialize, Deserialize)]
 struct JobRow {
+    header: JobHeader,
+    origin: Origin,
+}
+
+#[derive(Serialize, Deserialize)]
+struct UntracedJobRow {
     header: JobHeader,
     plan: ArtefactId,
 }
@@ -145,9 +162,10 @@ impl State {
     pub(crate) async fn write(&self, batch: Batch) -> Result<(), StateError> {
         let mut rows = WriteBatch::new();
         for (job, header) in batch.changes.headers {
-            match (header, batch.plans.get(&job)) {
-                (Some(header), Some(plan)) => {
-                    rows.put(job_key(job), frame::encode(JOB, &JobRow { header, plan: *plan }, &[]))
+            match (header, batch.origins.get(&job)) {
+                (Some(header), Some(origin)) => {
+                    let origin = origin.clone();
+                    rows.put(job_key(job), frame::encode(JOB, &JobRow { header, origin }, &[]))
                 }
                 (Some(_), None) => return Err(self.damaged(&format!("job {} has no plan", job.0))),
                 (None, _) => {
@@ -203,7 +221,7 @@ impl State {
             restored.workers.push(name);
         }
         for (key, value) in self.read("job/").await? {
-            let JobRow { header, plan } = self.decode(JOB, &key, &value)?;
+            let JobRow { header, origin } = self.job_row(&key, &value)?;
             let id = header.id;
             if key != job_key(id) || id.0 >= restored.next_job {
                 return Err(self.damaged(&format!("'{key}' is of job {}", id.0)));
@@ -216,7 +234,7 @@ impl State {
                 }
                 tasks.push(record);
             }
-            restored.plans.insert(id, plan);
+            restored.origins.insert(id, origin);
             restored.snapshot.jobs.push(JobSnapshot { header, tasks });
         }
         Ok(restored)
@@ -234,6 +252,13 @@ impl State {
             found.push((key, row.value));
         }
         Ok(found)
+    }
+
+    fn job_row(&self, key: &str, value: &[u8]) -> Result<JobRow, StateError> {
+        match frame::decode(UNTRACED_JOB, value) {
+            Ok((UntracedJobRow { header, plan }, _)) => Ok(JobRow { header, origin: Origin { plan, traced: None } }),
+            Err(_) => self.decode(JOB, key, value),
+        }
     }
 
     fn decode<T: DeserializeOwned>(&self, kind: Kind, key: &str, value: &[u8]) -> Result<T, StateError> {
@@ -280,13 +305,19 @@ mod tests {
         State::take_over(store, FLUSH, 0).await.unwrap()
     }
 
+    /// Every second job is traced.
+    fn origin(job: JobId) -> Origin {
+        let parent = TraceParent::parse(&format!("00-{:032x}-{:016x}-01", job.0, job.0));
+        Origin { plan: ArtefactId([7; 32]), traced: parent.filter(|_| job.0.is_multiple_of(2)) }
+    }
+
     /// Steps a scheduler and makes durable what a coordinator would.
     async fn step(scheduler: &mut Scheduler, state: &State, event: Event) -> Vec<Action> {
         let actions = scheduler.step(1, event.clone());
         let changes = Changes::of(scheduler, &event, &actions);
-        let plans = changes.headers.keys().map(|job| (*job, ArtefactId([7; 32]))).collect();
+        let origins = changes.headers.keys().map(|job| (*job, origin(*job))).collect();
         let next_job = changes.headers.keys().map(|job| job.0 + 1).max();
-        let batch = Batch { changes, plans, next_job, ..Batch::default() };
+        let batch = Batch { changes, origins, next_job, ..Batch::default() };
         if !batch.is_empty() {
             state.write(batch).await.unwrap();
         }
@@ -334,7 +365,8 @@ mod tests {
         let (state, restored) = open(&store).await;
         assert_eq!((state.epoch(), restored.next_job), (2, 301));
         assert_eq!(restored.workers, ["w1"]);
-        assert_eq!(restored.plans.keys().copied().collect::<Vec<_>>(), [JobId(1), JobId(300)]);
+        assert_eq!(restored.origins, [1, 300].map(|job| (JobId(job), origin(JobId(job)))).into());
+        assert!(restored.origins[&JobId(300)].traced.is_some());
         // What a job had of its share may be stale, and what a task waits for follows from the others.
         let durable = |snapshot: &Snapshot| {
             let mut snapshot = snapshot.clone();
@@ -392,6 +424,22 @@ mod tests {
             }
         }
         assert_eq!(wrote, 1);
+    }
+
+    #[tokio::test(flavor = "multi_thread")]
+    async fn jobs_of_before_they_were_traced_are_read() {
+        let store = Store::open("memory://").unwrap();
+        let (state, _) = open(&store).await;
+        let mut scheduler = Scheduler::new(cluster::Settings::default(), 1);
+        step(&mut scheduler, &state, Event::Submitted { job: JobId(2), spec: spec(3) }).await;
+        let (header, plan) = (scheduler.header(JobId(2)).unwrap(), ArtefactId([9; 32]));
+        let mut rows = WriteBatch::new();
+        rows.put(job_key(JobId(2)), frame::encode(UNTRACED_JOB, &UntracedJobRow { header, plan }, &[]));
+        state.put(rows).await.unwrap();
+        drop(state);
+        let (_, restored) = open(&store).await;
+        assert_eq!(restored.origins, BTreeMap::from([(JobId(2), Origin { plan, traced: None })]));
+        assert_eq!(restored.snapshot.jobs[0].header, scheduler.header(JobId(2)).unwrap());
     }
 
     #[tokio::test(flavor = "multi_thread")]

@@ -4,6 +4,7 @@
 //! ```text
 //! plat-wire: 2                       of every call
 //! authorization: Bearer <token>      where the coordinator asks for one
+//! traceparent: 00-<trace>-<span>-01  where whoever calls is traced; proves nothing, and is not asked for
 //! ```
 
 use std::error::Error;

@@ -224,6 +224,56 @@ async fn what_was_answered_outlives_a_kill_and_the_epoch_rises() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn a_job_stays_in_its_trace_whoever_leads() {
+    const PARENT: &str = "00-0af7651916cd43dd8448eb211c80319c-b7ad6b7169203331-01";
+    let store = Store::open("memory://").unwrap();
+    let mut host = Host::start(&store, LONG, LONG).await.leads().await;
+    let plan = store.put(plan().to_frame().into()).await.unwrap().0.to_vec();
+    for said in [Some(PARENT), Some("00-nonsense"), None] {
+        let request = proto::SubmitRequest { plan: plan.clone(), store_url: store.url().into() };
+        let mut request = tonic::Request::new(request);
+        if let Some(said) = said {
+            request.metadata_mut().insert("traceparent", said.parse().unwrap());
+        }
+        host.client.submit(request).await.unwrap();
+    }
+    for epoch in 1..3 {
+        let mut granted = BTreeMap::new();
+        for worker in 0..3 {
+            let (worker, backend) = (format!("{epoch}-{worker}"), BACKEND.into());
+            let request = proto::LeaseRequest { worker, backend, ..Default::default() };
+            let Some(Reply::Grant(grant)) = host.client.lease(request).await.unwrap().into_inner().reply else {
+                panic!("the root of a job is left")
+            };
+            let attempt = grant.attempt.unwrap();
+            assert_eq!(attempt.epoch, epoch);
+            granted.insert(attempt.job, grant.traceparent);
+            // The next leader has a root of each job to give, too.
+            let given_back = proto::FailRequest {
+                attempt: Some(attempt),
+                message: String::new(),
+                kind: proto::FailureKind::GivenBack.into(),
+            };
+            host.client
+                .control(proto::ControlRequest {
+                    job: attempt.job,
+                    what: Some(proto::control_request::What::Pause(proto::Pause {})),
+                })
+                .await
+                .unwrap();
+            assert!(host.client.fail(given_back).await.unwrap().into_inner().accepted);
+        }
+        assert_eq!(granted, [(1, PARENT), (2, ""), (3, "")].map(|(job, parent)| (job, parent.to_owned())).into());
+        for job in 1..4 {
+            let what = Some(proto::control_request::What::Resume(proto::Resume {}));
+            host.client.control(proto::ControlRequest { job, what }).await.unwrap();
+        }
+        host.kill().await;
+        host = Host::start(&store, QUICK, Duration::from_millis(50)).await.leads().await;
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn a_standby_says_who_leads_and_follows_a_leader_that_leaves() {
     let store = Store::open("memory://").unwrap();
     let mut first = Host::start(&store, QUICK, LONG).await.leads().await;

@@ -6,10 +6,13 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use proto::{FailureKind, REPORTS_LIMIT};
+use telemetry::{TraceParent, traced};
 use tokio::sync::mpsc;
 use tokio::time::{Instant, MissedTickBehavior};
 use tokio_util::sync::CancellationToken;
-use tonic::{Code, Status};
+use tonic::Code;
+use tracing::field::Empty;
+use tracing::{Instrument, Span};
 
 use crate::link::Link;
 use crate::{Execute, ExecuteError, Flow, Report, TaskOrder, is_passing};
@@ -25,27 +28,45 @@ const LAST_WORD_TRIES: u32 = 13;
 /// and the coordinator grants the task anew.
 pub(crate) async fn run(
     link: &mut Link,
+    worker: &str,
     grant: proto::Grant,
     executor: Arc<dyn Execute>,
     shutdown: &CancellationToken,
 ) {
     let lease = Duration::from_millis(grant.lease_millis.into());
+    let parent = TraceParent::parse(&grant.traceparent);
     let Some((key, order)) = order_of(grant) else {
         tracing::error!("a grant that makes no sense was dropped");
         return tokio::time::sleep(NEWS_PERIOD).await;
     };
     link.saw(key.epoch);
+    let proto::Attempt { job, task, number: attempt, .. } = key;
+    // Of the highest level, so that whatever is logged within says of which attempt it is.
+    let span = tracing::error_span!("task", job, task, attempt, worker, artefact = Empty, otel.status_code = Empty);
+    parent.iter().for_each(|parent| parent.adopt(&span));
+    carry_out(link, key, order, lease, executor, shutdown).instrument(span).await;
+}
+
+async fn carry_out(
+    link: &mut Link,
+    key: proto::Attempt,
+    order: TaskOrder,
+    lease: Duration,
+    executor: Arc<dyn Execute>,
+    shutdown: &CancellationToken,
+) {
+    tracing::info!("begins");
     let stop = Arc::new(AtomicBool::new(false));
     let (sender, mut news) = mpsc::channel(REPORTS_LIMIT);
     let mut work = {
-        let (order, stop) = (order.clone(), stop.clone());
+        let (stop, span) = (stop.clone(), Span::current());
         tokio::task::spawn_blocking(move || {
             let mut report = |report: Report| {
                 // A full channel means that the coordinator is away: the line is lost, the compute goes on.
                 let _ = sender.try_send(to_wire(report));
                 if stop.load(Ordering::Relaxed) { Flow::Stop } else { Flow::Continue }
             };
-            executor.execute(&order, &mut report)
+            span.in_scope(|| executor.execute(&order, &mut report))
         })
     };
 
@@ -75,7 +96,7 @@ pub(crate) async fn run(
                     pause = if let Told::Nobody(pause) = told { Some(pause) } else { None };
                     void = told == Told::Void;
                     if void {
-                        tracing::warn!(task = order.task, attempt = order.attempt, "the attempt is void, stopping");
+                        tracing::warn!("the attempt is void, stopping");
                         stop.store(true, Ordering::Relaxed);
                     }
                 }
@@ -90,6 +111,16 @@ pub(crate) async fn run(
             let message = if error.is_panic() { panic_text(&*error.into_panic()) } else { error.to_string() };
             Err(ExecuteError { message, is_input: false })
         });
+        match &result {
+            Ok(artefact) => {
+                Span::current().record("artefact", tracing::field::display(artefact));
+                tracing::info!(%artefact, "done");
+            }
+            Err(error) => {
+                Span::current().record("otel.status_code", "ERROR");
+                tracing::warn!("ends without a result: {error}");
+            }
+        }
         say_last_word(link, key, result, leaving).await;
     }
 }
@@ -145,7 +176,7 @@ async fn tell(link: &mut Link, key: proto::Attempt, news: &mut mpsc::Receiver<pr
         // A coordinator that does not know the job has forgotten it; any other trouble may pass.
         Err(status) if status.code() == Code::NotFound => Told::Void,
         Err(status) => {
-            tracing::warn!(task = key.task, attempt = key.number, "no answer to a report: {}", status.message());
+            tracing::warn!("no answer to a report: {}", status.message());
             Told::Nobody(link.lost())
         }
     }
@@ -161,7 +192,7 @@ async fn say_last_word(
         let answer = match &result {
             Ok(artefact) => {
                 let request = proto::CompleteRequest { attempt: Some(key), artefact: artefact.0.to_vec() };
-                async { link.client().await?.complete(request).await }.await
+                async { link.client().await?.complete(traced(request)).await }.await
             }
             Err(error) => {
                 let kind = match (leaving, error.is_input) {
@@ -171,26 +202,22 @@ async fn say_last_word(
                 };
                 let message = proto::one_line(&error.message);
                 let request = proto::FailRequest { attempt: Some(key), message, kind: kind.into() };
-                async { link.client().await?.fail(request).await }.await
+                async { link.client().await?.fail(traced(request)).await }.await
             }
         };
         match answer {
             Ok(reply) => {
                 link.found();
                 if !reply.get_ref().accepted {
-                    log(key, "the coordinator refuses the result of a stale attempt");
+                    tracing::warn!("the coordinator refuses the result of a stale attempt");
                 }
                 return;
             }
             Err(status) if is_passing(&status) => tokio::time::sleep(link.lost()).await,
-            Err(status) => return log(key, status.message()),
+            Err(status) => return tracing::warn!("{}", status.message()),
         }
     }
-    log(key, Status::unavailable("the coordinator could not be told how it ended").message());
-}
-
-fn log(key: proto::Attempt, what: &str) {
-    tracing::warn!(job = key.job, task = key.task, attempt = key.number, "{what}");
+    tracing::warn!("the coordinator could not be told how it ended");
 }
 
 fn panic_text(panic: &(dyn Any + Send)) -> String {

@@ -59,7 +59,7 @@ impl Block<'_> {
         report: &mut (dyn FnMut(Report) -> Flow + Send),
     ) -> Result<Trained, ExecuteError> {
         let Self { plan, task, .. } = *self;
-        let Shared { finished, cap, .. } = &*self.trainer.shared;
+        let Shared { finished, cap, metrics, .. } = &*self.trainer.shared;
         let eval_every = self.trainer.options.eval_every;
         let recipe = recipe_of(&plan.settings, task);
         let wrong = |error| match error {
@@ -143,6 +143,8 @@ impl Block<'_> {
         // Reports a step, measured where splats are given; whether to go on.
         let mut tell = |step: u32, loss: f64, count: usize, splats: Option<&Splats>, last: bool| -> bool {
             let (cpu_seconds, wall_seconds) = (stopwatch.cpu_seconds(), stopwatch.wall_seconds());
+            metrics.splats.set(count as i64);
+            metrics.cache_bytes.set(self.reader.stats().cached_bytes as i64);
             let measured = splats.and_then(|splats| stopwatch.paused(|| measure(splats)));
             let flow = report(Report {
                 step: step.into(),
@@ -166,13 +168,14 @@ impl Block<'_> {
         let clock = Stopwatch::start();
         let mut next_checkpoint = self.trainer.options.checkpoint_seconds;
         let (mut splats, exposures) = train::train_on(job, from, &mut |mut now| {
+            metrics.steps.inc();
             let (seconds, last) = (clock.wall_seconds(), now.step == now.steps);
             // The last one is what pruning begins with.
             if let Some(memory) = self.memory
                 && (seconds >= next_checkpoint || (last && seconds > 0.5 * next_checkpoint))
                 && let Some(state) = now.state()
             {
-                memory.keep_checkpoint(&self.trainer.store, state);
+                self.keep_checkpoint(memory, state);
                 next_checkpoint = seconds + self.trainer.options.checkpoint_seconds;
             }
             late = !last && over();
@@ -188,7 +191,7 @@ impl Block<'_> {
                 && let Some(memory) = self.memory
                 && let Some(state) = now.state()
             {
-                memory.keep_checkpoint(&self.trainer.store, state);
+                self.keep_checkpoint(memory, state);
             }
             going(!stopped && !late)
         })
@@ -198,6 +201,7 @@ impl Block<'_> {
         if let Some(pruning) = pruning.filter(|_| !stopped && !late) {
             let job = train::Job { exposures: exposures.as_ref().or(self.exposures_given), ..job_of(splats, whole) };
             let (pruned, outcome) = prune::within_tolerance(job, &pruning, &mut |mut now| {
+                metrics.steps.inc();
                 late = over();
                 // Once more at the end, with what pruning chose.
                 let (step, healing) = (trained + now.step.min(now.steps - 1), &mut now.healing);
@@ -233,6 +237,12 @@ impl Block<'_> {
             finished.insert(self.order.plan, plan, task.block, &splats);
         }
         Ok(Trained { splats, exposures, residual })
+    }
+
+    fn keep_checkpoint(&self, memory: &Memory, state: &train::State) {
+        if memory.keep_checkpoint(&self.trainer.store, state) {
+            self.trainer.shared.metrics.checkpoints.inc();
+        }
     }
 
     /// How far the splats of a root with children are off in what they were trained on.

@@ -22,6 +22,7 @@ use crate::cap::Cap;
 use crate::clock::Stopwatch;
 use crate::memory::Memory;
 use crate::merged::{Finished, Judge, is_look};
+use crate::metrics::Metrics;
 use crate::{Execute, ExecuteError, Flow, Report, TaskOrder};
 
 /// What a worker may use, and what it is asked to measure.
@@ -50,6 +51,8 @@ pub struct Shared {
     pub resumed: AtomicU32,
     /// Blocks that were trained no finer than their parent.
     pub settled: AtomicU32,
+    /// What the work comes to, as it goes on.
+    pub metrics: Metrics,
 }
 
 /// Trains blocks.
@@ -92,6 +95,7 @@ impl Execute for BlockTrainer {
         report: &mut (dyn FnMut(Report) -> Flow + Send),
     ) -> Result<ArtefactId, ExecuteError> {
         let mut stopwatch = Stopwatch::start();
+        let fetching = tracing::info_span!("fetch").entered();
         let plan = self.store.get(order.plan).map_err(failed)?;
         let plan = Plan::from_frame(&plan).map_err(failed)?;
         if plan.backend != self.backend.name() {
@@ -132,6 +136,7 @@ impl Execute for BlockTrainer {
             Some(id) => Some(Exposures::from_frame(&self.store.get(id).map_err(failed)?).map_err(failed)?),
             None => None,
         };
+        drop(fetching);
         let (exposures_given, residual_given) = (exposures.as_ref(), given.residual);
         let block = Block {
             trainer: self,
@@ -144,8 +149,14 @@ impl Execute for BlockTrainer {
             exposures_given,
             residual_given,
         };
-        let Trained { splats, exposures, residual } =
-            self.pool.install(|| block.train(results, &mut stopwatch, report))?;
+        let training = tracing::info_span!("train", block = %task.block);
+        let trained = self.pool.install(|| training.in_scope(|| block.train(results, &mut stopwatch, report)));
+        drop(training);
+        // The next block has splats and a cache of its own.
+        self.shared.metrics.splats.set(0);
+        self.shared.metrics.cache_bytes.set(0);
+        let Trained { splats, exposures, residual } = trained?;
+        let _keeping = tracing::info_span!("keep").entered();
         let exposures = match exposures {
             Some(trained) => Some(self.store.put(trained.to_frame()).map_err(failed)?),
             None => given.exposures,

@@ -18,6 +18,7 @@ pub mod execute;
 mod link;
 mod memory;
 pub mod merged;
+pub mod metrics;
 mod refine;
 mod start;
 pub mod whole;
@@ -170,7 +171,7 @@ pub async fn run(options: Options, executor: Arc<dyn Execute>, shutdown: Cancell
         match answer.map(|reply| reply.into_inner().reply) {
             Ok(Some(Reply::Grant(grant))) => {
                 link.found();
-                attempt::run(&mut link, grant, executor.clone(), &shutdown).await;
+                attempt::run(&mut link, &options.worker_id, grant, executor.clone(), &shutdown).await;
             }
             Ok(Some(Reply::WaitMillis(millis))) => {
                 link.found();

@@ -40,13 +40,15 @@ impl Memory {
         State::from_frame(&store.get_name(&self.checkpoint).ok()??).ok()
     }
 
-    pub(crate) fn keep_checkpoint(&self, store: &BlockingStore, state: &State) {
-        kept(store.put_name(&self.checkpoint, state.to_frame()));
+    /// Whether it is there now.
+    pub(crate) fn keep_checkpoint(&self, store: &BlockingStore, state: &State) -> bool {
+        tracing::info_span!("checkpoint").in_scope(|| kept(store.put_name(&self.checkpoint, state.to_frame())))
     }
 }
 
-fn kept(outcome: Result<(), store::StoreError>) {
-    if let Err(error) = outcome {
+fn kept(outcome: Result<(), store::StoreError>) -> bool {
+    if let Err(error) = &outcome {
         tracing::warn!("what was reached is not kept: {error}");
     }
+    outcome.is_ok()
 }

@@ -1,11 +1,11 @@
 //! The commands of a cluster: who hosts it, who works for it, and who asks it for something.
 
 use std::fmt;
-use std::net::SocketAddr;
+use std::net::{Ipv4Addr, SocketAddr};
 use std::path::PathBuf;
 use std::str::FromStr;
 
-use clap::Args;
+use clap::{Args, ValueEnum};
 use scene::BlockId;
 
 use super::{Auto, Backend, PlanOptions, seconds};
@@ -28,6 +28,33 @@ pub(crate) struct Connection {
     /// File with the coordinator's token
     #[arg(long, value_name = "FILE")]
     pub(crate) token_file: Option<PathBuf>,
+}
+
+/// What a program tells of itself that runs for days.
+#[derive(Debug, Clone, Copy, Args)]
+pub(crate) struct Told {
+    /// Answer Prometheus at GET /metrics of this address, or of this port of this machine alone. Whoever reaches it may read; it
+    /// says numbers, and what workers compute with
+    #[arg(long, value_name = "ADDR|PORT", value_parser = metrics_address)]
+    pub(crate) metrics: Option<SocketAddr>,
+    /// Lines of the log, on stderr; RUST_LOG chooses which
+    #[arg(long, value_enum, value_name = "FORMAT", default_value = "text")]
+    pub(crate) log_format: LogFormat,
+}
+
+/// What a line of the log looks like.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum LogFormat {
+    /// For people
+    Text,
+    /// An object a line
+    Json,
+}
+
+fn metrics_address(text: &str) -> Result<SocketAddr, String> {
+    let local = text.parse().ok().map(|port: u16| SocketAddr::from((Ipv4Addr::LOCALHOST, port)));
+    let address = local.or_else(|| text.parse().ok());
+    address.ok_or_else(|| "give a port, such as 9464, or an address with one, such as 0.0.0.0:9464".into())
 }
 
 #[derive(Debug, Clone, Args)]
@@ -59,6 +86,8 @@ pub(crate) struct CoordinatorArgs {
     /// Write down what the scheduler hears, as its simulator replays it
     #[arg(long, value_name = "FILE")]
     pub(crate) journal: Option<PathBuf>,
+    #[command(flatten)]
+    pub(crate) told: Told,
 }
 
 fn lease(text: &str) -> Result<f64, String> {
@@ -82,6 +111,8 @@ pub(crate) struct WorkerArgs {
     /// Seconds between two checkpoints of a block, from which any worker goes on
     #[arg(long, value_name = "SECONDS", default_value_t = 60.0, value_parser = seconds)]
     pub(crate) checkpoint_every: f64,
+    #[command(flatten)]
+    pub(crate) told: Told,
 }
 
 #[derive(Debug, Clone, Args)]

@@ -18,6 +18,7 @@ use crate::failure::{Failure, cannot};
 use crate::output::Output;
 use crate::remote::{key_pair, pem, runtime, token};
 use crate::signals::until_told;
+use crate::told::Metrics;
 
 /// Lines of the journal that may wait for the disk.
 const JOURNAL_LAG: usize = 100_000;
@@ -46,6 +47,7 @@ pub(crate) fn run(args: &CoordinatorArgs, output: &Output) -> Result<(), Failure
         })?;
         let address = listener.local_addr().map_err(ServeError::Listen).map_err(of_serve)?;
         security.check(address)?;
+        let metrics = Metrics::listen(&args.told).await?;
         let store = Store::open(&absolute(&args.store)?)?;
         let reached = reached_at(args, address, security.identity.is_some())?;
         let durable = Some(Durable::new(&reached)?);
@@ -60,6 +62,7 @@ pub(crate) fn run(args: &CoordinatorArgs, output: &Output) -> Result<(), Failure
             }
         };
         output.note(format!("listening on {address}, reached at {reached}, store {}", store.url()));
+        let _told = metrics.tell(output, |registry| options.metrics.register(registry));
         let stop = CancellationToken::new();
         let told = tokio::spawn(until_told(stop.clone()));
         let served = serve(listener, options, stop.cancelled_owned()).await.map_err(of_serve);

@@ -37,7 +37,7 @@ struct Inspected {
 }
 
 pub(crate) fn run(args: &InspectArgs, output: &Output) -> Result<(), Failure> {
-    let source = cameras::open(&args.capture, &Output::new(false, true))?;
+    let source = cameras::open(&args.capture, &Output::new(false, true, false))?;
     let planned = plan_of(&source.capture, &args.plan);
     let planned = planned.and_then(|(capture, plan)| {
         check_plan(&plan, &capture, output)?;

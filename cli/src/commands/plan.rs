@@ -45,7 +45,7 @@ pub(crate) fn run(args: &PlanArgs, output: &Output) -> Result<(), Failure> {
         findings: findings.iter().map(Finding::to_string).collect(),
     };
     output.result(&planned, &format!("{}\n{}", describe(&plan), planned.findings.join("\n")))?;
-    check_plan(&plan, &capture, &Output::new(false, true))
+    check_plan(&plan, &capture, &Output::new(false, true, false))
 }
 
 /// Plans an opened capture for the CPU; returns it as it was planned for.

@@ -6,6 +6,8 @@ use dataset::ingest::Ingested;
 use proto::Client;
 use scene::{ArtefactId, BadInput};
 use serde::Serialize;
+use telemetry::traced;
+use tracing::field::Empty;
 
 use crate::args::{Backend, SubmitArgs};
 use crate::cameras;
@@ -35,6 +37,7 @@ struct Submitted {
 
 pub(crate) fn run(args: &SubmitArgs, output: &Output) -> Result<(), Failure> {
     let clock = Stopwatch::start();
+    let span = tracing::info_span!("submit", job = Empty, tasks = Empty, otel.kind = "client").entered();
     let source = cameras::open(&args.capture, output)?;
     // What the plan or the coordinator refuses is said before any photo is read.
     let (planned_for, plan) = plan_of(&source.capture, &args.plan)?;
@@ -51,7 +54,8 @@ pub(crate) fn run(args: &SubmitArgs, output: &Output) -> Result<(), Failure> {
     let plan = Plan { capture: id, ..plan };
     let plan_id = store.blocking().put(plan.to_frame())?;
     let request = proto::SubmitRequest { plan: plan_id.0.to_vec(), store_url: store.url().into() };
-    let job = remote.call(async |client: &mut Client| client.submit(request).await)?;
+    let job = remote.call(async |client: &mut Client| client.submit(traced(request)).await)?;
+    span.record("job", job.job).record("tasks", job.tasks);
     let mut submitted = Submitted {
         command: "submit",
         job: job.job,

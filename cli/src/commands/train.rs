@@ -229,6 +229,7 @@ pub(crate) fn ingest_photos(
     downscale: u32,
     output: &Output,
 ) -> Result<Ingested, Failure> {
+    let _traced = tracing::info_span!("ingest").entered();
     let threads = std::thread::available_parallelism().map_or(1, usize::from);
     let progress = output.progress("photos", source.photos.len() as u64);
     Ok(ingest(source, store, &IngestOptions { downscale, threads }, &|done, _| progress.at(done as u64, ""))?)
@@ -262,6 +263,7 @@ fn train_blocks(
         let options = worker::Options { coordinator_url, access: Access::default(), worker_id, backend };
         worker::run(options, trainers[number].clone(), shutdown)
     };
+    let _traced = tracing::info_span!("job").entered();
     let result = runtime.block_on(async {
         let stop = CancellationToken::new();
         let interrupted = tokio::spawn(interruption(stop.clone(), *output));

@@ -2,13 +2,14 @@
 //! hand, gives the task back and goes; any worker goes on from there.
 
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU32, Ordering};
+use std::sync::atomic::Ordering;
 
-use scene::{ArtefactId, BadInput};
+use scene::BadInput;
 use serde::Serialize;
 use tokio_util::sync::CancellationToken;
+use worker::WorkerError;
 use worker::execute::{BlockTrainer, Shared, TrainerOptions};
-use worker::{Execute, ExecuteError, Flow, Report, TaskOrder, WorkerError};
+use worker::metrics::Measured;
 
 use crate::args::WorkerArgs;
 use crate::commands::train::{CACHE_BYTES, compute_on};
@@ -16,6 +17,7 @@ use crate::failure::Failure;
 use crate::output::Output;
 use crate::remote::{access, runtime, shared_store};
 use crate::signals::until_told;
+use crate::told::Metrics;
 
 #[derive(Serialize)]
 struct Worked {
@@ -24,7 +26,7 @@ struct Worked {
     backend: String,
     threads: u32,
     /// Tasks that it finished.
-    done: u32,
+    done: u64,
     /// Tasks that it found finished, or begun with a checkpoint.
     resumed: u32,
 }
@@ -41,6 +43,10 @@ pub(crate) fn run(args: &WorkerArgs, output: &Output) -> Result<(), Failure> {
     runtime.block_on(async {
         let stop = CancellationToken::new();
         let told = tokio::spawn(until_told(stop.clone()));
+        let shared = Arc::new(Shared::default());
+        // Told before there is a coordinator: that none is there is worth knowing.
+        let metrics = Metrics::listen(&args.told).await?;
+        let _told = metrics.tell(output, |registry| shared.metrics.register(registry));
         let worker = worker::Options {
             coordinator_url: url.clone(),
             access,
@@ -48,7 +54,7 @@ pub(crate) fn run(args: &WorkerArgs, output: &Output) -> Result<(), Failure> {
             backend: worked.backend.clone(),
         };
         if let Some(about) = worker::greet(&worker, &stop).await.map_err(of_worker)? {
-            let store = shared_store(&about.store_url).await?;
+            let store = shared_store(&about.store_url).await?.metered();
             let options = TrainerOptions {
                 threads: threads as usize,
                 eval_every: 0,
@@ -56,12 +62,12 @@ pub(crate) fn run(args: &WorkerArgs, output: &Output) -> Result<(), Failure> {
                 resume: true,
                 checkpoint_seconds: args.checkpoint_every,
             };
-            let shared = Arc::new(Shared::default());
+            shared.metrics.moves_from_and_to(store.clone());
             let trainer = BlockTrainer::new(store.blocking(), options, shared.clone(), backend);
-            let counted = Arc::new(Counted { trainer: trainer.map_err(Failure::Work)?, done: AtomicU32::new(0) });
+            let measured = Measured::new(trainer.map_err(Failure::Work)?, shared.metrics.clone());
             output.note(format!("{} works for {url}: {} on {threads} threads", worked.name, worked.backend));
-            worker::run(worker, counted.clone(), stop).await.map_err(of_worker)?;
-            worked.done = counted.done.load(Ordering::Relaxed);
+            worker::run(worker, Arc::new(measured), stop).await.map_err(of_worker)?;
+            worked.done = shared.metrics.done();
             worked.resumed = shared.resumed.load(Ordering::Relaxed);
         }
         told.abort();
@@ -69,24 +75,6 @@ pub(crate) fn run(args: &WorkerArgs, output: &Output) -> Result<(), Failure> {
     })?;
     let text = format!("{} left after {} tasks, {} of them resumed", worked.name, worked.done, worked.resumed);
     output.result(&worked, &text)
-}
-
-/// Counts what a trainer finishes.
-struct Counted {
-    trainer: BlockTrainer,
-    done: AtomicU32,
-}
-
-impl Execute for Counted {
-    fn execute(
-        &self,
-        order: &TaskOrder,
-        report: &mut (dyn FnMut(Report) -> Flow + Send),
-    ) -> Result<ArtefactId, ExecuteError> {
-        let artefact = self.trainer.execute(order, report)?;
-        self.done.fetch_add(1, Ordering::Relaxed);
-        Ok(artefact)
-    }
 }
 
 /// The worker's name: the one asked for, else the machine's and the process's number.

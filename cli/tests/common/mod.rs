@@ -1,6 +1,9 @@
 //! plat as scripts run it, and what must come of that.
 #![allow(dead_code, reason = "each test program uses some of it")]
 
+#[cfg(unix)]
+pub(crate) mod cluster;
+
 use std::path::Path;
 use std::process::{Command, Output};
 
