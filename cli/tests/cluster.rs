@@ -157,6 +157,43 @@ fn a_cluster_whose_workers_die_and_leave_makes_the_bytes_of_one_process() {
 }
 
 #[test]
+fn a_damaged_result_is_made_again() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    common::city(at, 20, 64, 48);
+    let (_host, url) = coordinator(at);
+    let words = ["submit", "city", "--coordinator", &url, "--wait", "--out", "far"];
+    let submit = Running::begin(&mut common::command(at, &[&words[..], &PLAN].concat()));
+    // The root's result is there, and those who need it are not finished.
+    let mut first = worker(at, &url, "first");
+    let results = at.join("shared/names/results");
+    let root = loop {
+        let found = std::fs::read_dir(&results).ok().and_then(|mut found| Some(found.next()?.unwrap().path()));
+        match found.filter(|path| std::fs::metadata(path).unwrap().len() == 32) {
+            Some(record) => break std::fs::read(record).unwrap(),
+            None => std::thread::sleep(Duration::from_millis(5)),
+        }
+    };
+    first.signal("-TERM");
+    assert!(first.end().status.success());
+    let name: String = root.iter().map(|byte| format!("{byte:02x}")).collect();
+    let artefact = at.join("shared/artefacts").join(&name[..2]).join(&name);
+    let sound = std::fs::read(&artefact).unwrap();
+    let mut damaged = sound.clone();
+    damaged[sound.len() / 2] ^= 1;
+    std::fs::write(&artefact, damaged).unwrap();
+    let mut second = worker(at, &url, "second");
+    let submit = submit.end();
+    assert!(submit.status.success(), "{}", String::from_utf8_lossy(&submit.stderr));
+    assert!(std::fs::read(&artefact).unwrap() == sound, "it is not what it was");
+    second.signal("-TERM");
+    assert!(second.end().status.success());
+    common::done(at, &[&["train", "city", "--out", "calm", "--workers", "1"][..], &PLAN].concat());
+    let bytes = |path: &str| std::fs::read(at.join(path)).unwrap();
+    assert!(bytes("far/merged.ply") == bytes("calm/merged.ply"), "the damage shows in the result");
+}
+
+#[test]
 fn whoever_waits_for_a_job_waits_for_the_next_coordinator() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();

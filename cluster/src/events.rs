@@ -17,7 +17,7 @@ pub enum FailureKind {
     Infrastructure,
     /// It took more memory than the worker has: again where there is more.
     OutOfMemory,
-    /// It diverged: once again, from the checkpoint, with a lower rate.
+    /// It diverged: once again, with a lower rate.
     Numeric,
     /// Nobody's: the worker is leaving and gives the task back.
     GivenBack,

@@ -466,6 +466,7 @@ impl Jobs {
             attempt: Some(proto::Attempt { job: job.0, task: task.0, number, epoch }),
             plan: plan.0.to_vec(),
             lease_millis,
+            rate_permille: self.scheduler.record(job, task).map_or(0, |record| record.rate_permille().into()),
             inputs: self.scheduler.inputs(job, task).into_iter().map(input).collect(),
             traceparent: traced.as_ref().map(|parent| parent.as_str().into()).unwrap_or_default(),
         })

@@ -240,6 +240,7 @@ impl Coordinator for Service {
             proto::FailureKind::GivenBack => FailureKind::GivenBack,
             proto::FailureKind::Infrastructure => FailureKind::Infrastructure,
             proto::FailureKind::OutOfMemory => FailureKind::OutOfMemory,
+            proto::FailureKind::Numeric => FailureKind::Numeric,
         };
         let (attempt, message) = (attempt_of(request.attempt)?, proto::one_line(&request.message));
         let span = span_of(parent, || {

@@ -44,6 +44,14 @@ impl BlockingStore {
         self.wait(|store| async move { store.get(id).await })
     }
 
+    /// See [`Store::get_or_discard`].
+    ///
+    /// # Errors
+    /// As there.
+    pub fn get_or_discard(&self, id: ArtefactId) -> Result<Option<Bytes>, StoreError> {
+        self.wait(|store| async move { store.get_or_discard(id).await })
+    }
+
     /// See [`Store::get_ranges`].
     ///
     /// # Errors

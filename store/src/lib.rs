@@ -139,6 +139,24 @@ impl Store {
         if found == id { Ok(bytes) } else { Err(StoreError::Corrupt { id, store: self.url.to_string() }) }
     }
 
+    /// The bytes of an artefact that can be made again, `None` where it is not there. One that is damaged, twice read, is deleted, so
+    /// that it can be put again: [`Store::put`] leaves alone what has the right length.
+    ///
+    /// # Errors
+    /// Not readable, or not to be deleted.
+    pub async fn get_or_discard(&self, id: ArtefactId) -> Result<Option<Bytes>, StoreError> {
+        let mut found = self.get(id).await;
+        if matches!(found, Err(StoreError::Corrupt { .. })) {
+            found = self.get(id).await;
+        }
+        match found {
+            Ok(bytes) => Ok(Some(bytes)),
+            Err(StoreError::Missing { .. }) => Ok(None),
+            Err(StoreError::Corrupt { .. }) => self.remove(id).await.map(|()| None),
+            Err(error) => Err(error),
+        }
+    }
+
     /// Ranges (none empty) of the bytes of an artefact, in the order asked for. A range says nothing of the hash of the whole: what
     /// is read by ranges carries its own checksums.
     ///

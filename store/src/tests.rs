@@ -36,6 +36,23 @@ fn what_is_put_is_got_whole_and_in_ranges() {
 }
 
 #[test]
+fn what_is_damaged_can_be_put_again() {
+    let folder = tempfile::tempdir().unwrap();
+    let store = Store::open(folder.path().to_str().unwrap()).unwrap().blocking();
+    let id = store.put("the survey map").unwrap();
+    assert_eq!(store.get_or_discard(id).unwrap().unwrap(), "the survey map");
+    std::fs::write(artefact_file(folder.path(), id), "the survey cap").unwrap();
+    // Of the right length, it is left alone.
+    assert_eq!(store.put("the survey map").unwrap(), id);
+    assert!(matches!(store.get(id), Err(StoreError::Corrupt { .. })));
+    assert_eq!(store.get_or_discard(id).unwrap(), None);
+    assert_eq!(store.get_or_discard(id).unwrap(), None);
+    assert!(!store.exists(id).unwrap());
+    store.put("the survey map").unwrap();
+    assert_eq!(store.get(id).unwrap(), "the survey map");
+}
+
+#[test]
 fn traffic_is_counted_apart() {
     let all = Store::open("memory://").unwrap();
     let (one, other) = (all.metered(), all.metered());

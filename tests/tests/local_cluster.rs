@@ -15,7 +15,7 @@ use store::Store;
 use tokio::net::TcpListener;
 use tokio_util::sync::CancellationToken;
 use tonic::Code;
-use worker::{Execute, ExecuteError, Flow, Report, TaskOrder};
+use worker::{Execute, ExecuteError, FailureKind, Flow, Report, TaskOrder};
 
 const BACKEND: &str = "cpu-none";
 
@@ -104,8 +104,8 @@ fn result_of(order: &TaskOrder) -> ArtefactId {
     ArtefactId::of(format!("{} {} {:?}", order.plan, order.task, order.inputs).as_bytes())
 }
 
-fn broken(message: &str, is_input: bool) -> ExecuteError {
-    ExecuteError { message: message.into(), is_input }
+fn broken(message: &str, kind: FailureKind) -> ExecuteError {
+    ExecuteError { message: message.into(), kind }
 }
 
 /// A worker of this name.
@@ -150,7 +150,14 @@ async fn two_workers_train_the_tree_in_the_order_of_its_dependencies() {
         let place = |block: &BlockId| plan.tasks.iter().position(|task| task.block == *block).unwrap() as u32;
         let needed = task.parent.iter().chain(&task.context).map(place);
         let inputs: BTreeMap<u32, ArtefactId> = needed.map(|place| (place, expected[place as usize])).collect();
-        expected.push(result_of(&TaskOrder { job: 1, plan: plan_id, task: index, attempt: 1, inputs }));
+        expected.push(result_of(&TaskOrder {
+            job: 1,
+            plan: plan_id,
+            task: index,
+            attempt: 1,
+            inputs,
+            rate_permille: worker::FULL_RATE,
+        }));
     }
     assert_eq!(results, expected);
     let mut tasks: Vec<u32> = fake.orders.lock().unwrap().iter().map(|order| order.task).collect();
@@ -175,7 +182,7 @@ async fn two_workers_train_the_tree_in_the_order_of_its_dependencies() {
 async fn a_panicking_task_is_retried_then_quarantined_and_the_rest_goes_on() {
     let fake = fake(|order, _| match (order.task, order.attempt) {
         (3, attempt) => panic!("block 3 broke, attempt {attempt}"),
-        (4, 1) => Err(broken("the disk was full", false)),
+        (4, 1) => Err(broken("out of luck", FailureKind::Work)),
         _ => Ok(result_of(order)),
     });
     let (result, _) = run(2, &fake, CancellationToken::new()).await;
@@ -186,8 +193,24 @@ async fn a_panicking_task_is_retried_then_quarantined_and_the_rest_goes_on() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn what_diverged_is_trained_once_more_at_half_the_rate() {
+    let fake = fake(|order, _| match (order.task, order.rate_permille) {
+        (3, 1000) | (4, _) => Err(broken("no numbers", FailureKind::Numeric)),
+        _ => Ok(result_of(order)),
+    });
+    let (result, _) = run(1, &fake, CancellationToken::new()).await;
+    let line = "task 4 failed in attempt 2: no numbers; 1 that depend on such were not started";
+    assert_eq!(result, Err(LocalError::Failed(line.into())));
+    let rates = |task| -> Vec<u32> {
+        let orders = fake.orders.lock().unwrap();
+        orders.iter().filter(|order| order.task == task).map(|order| order.rate_permille).collect()
+    };
+    assert_eq!([0, 3, 4].map(rates), [vec![1000], vec![1000, 500], vec![1000, 500]]);
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn wrong_input_fails_the_job_at_once() {
-    let fake = fake(|_, _| Err(broken("photo 7 is no photo", true)));
+    let fake = fake(|_, _| Err(broken("photo 7 is no photo", FailureKind::Input)));
     let (result, _) = run(1, &fake, CancellationToken::new()).await;
     let line = "task 0 failed in attempt 1: photo 7 is no photo; 6 that depend on such were not started";
     assert_eq!(result, Err(LocalError::Input(line.into())));
@@ -203,7 +226,7 @@ async fn a_cancelled_job_stops_the_work_in_hand() {
         while report(Report::default()) == Flow::Continue {
             std::thread::sleep(Duration::from_millis(1));
         }
-        Err(broken("stopped", false))
+        Err(broken("stopped", FailureKind::Work))
     });
     let (result, _) = run(1, &fake, stop).await;
     assert_eq!(result, Err(LocalError::Cancelled));
@@ -288,7 +311,7 @@ async fn a_leaving_worker_gives_its_task_back() {
             while report(Report::default()) == Flow::Continue {
                 std::thread::sleep(Duration::from_millis(1));
             }
-            Err(broken("stopped", false))
+            Err(broken("stopped", FailureKind::Work))
         });
         let coordinator_url = url.clone();
         worker::run(hand(coordinator_url, "leaving"), slow, leave).await.unwrap();

@@ -105,6 +105,21 @@ impl Recipe {
         }
     }
 
+    /// The same in steps of this share of the size.
+    #[must_use]
+    pub fn at_rate(self, share: f32) -> Self {
+        let scaled = |rate: [f32; 2]| rate.map(|rate| share * rate);
+        Self {
+            mean: scaled(self.mean),
+            log_scale: scaled(self.log_scale),
+            quat: scaled(self.quat),
+            opacity: scaled(self.opacity),
+            sh_dc: scaled(self.sh_dc),
+            exposure: scaled(self.exposure),
+            ..self
+        }
+    }
+
     /// The same by the clock alone, whatever training says: the baseline that following the need is measured against.
     /// Blocks that start from points begin at coarse mips, others do not.
     #[must_use]

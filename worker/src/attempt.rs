@@ -15,7 +15,7 @@ use tracing::field::Empty;
 use tracing::{Instrument, Span};
 
 use crate::link::Link;
-use crate::{Execute, ExecuteError, Flow, Report, TaskOrder, is_passing};
+use crate::{Execute, ExecuteError, FULL_RATE, Flow, Report, TaskOrder, is_passing};
 
 /// News go out this often, if there are any.
 const NEWS_PERIOD: Duration = Duration::from_millis(250);
@@ -109,7 +109,7 @@ async fn carry_out(
     if !void {
         let result = result.unwrap_or_else(|error| {
             let message = if error.is_panic() { panic_text(&*error.into_panic()) } else { error.to_string() };
-            Err(ExecuteError { message, is_input: false })
+            Err(ExecuteError::of(FailureKind::Work, message))
         });
         match &result {
             Ok(artefact) => {
@@ -134,6 +134,7 @@ fn order_of(grant: proto::Grant) -> Option<(proto::Attempt, TaskOrder)> {
         task: key.task,
         attempt: key.number,
         inputs: grant.inputs.iter().map(input).collect::<Option<_>>()?,
+        rate_permille: if grant.rate_permille == 0 { FULL_RATE } else { grant.rate_permille.min(FULL_RATE) },
     };
     Some((key, order))
 }
@@ -195,11 +196,7 @@ async fn say_last_word(
                 async { link.client().await?.complete(traced(request)).await }.await
             }
             Err(error) => {
-                let kind = match (leaving, error.is_input) {
-                    (true, _) => FailureKind::GivenBack,
-                    (false, true) => FailureKind::Input,
-                    (false, false) => FailureKind::Work,
-                };
+                let kind = if leaving { FailureKind::GivenBack } else { error.kind };
                 let message = proto::one_line(&error.message);
                 let request = proto::FailRequest { attempt: Some(key), message, kind: kind.into() };
                 async { link.client().await?.fail(traced(request)).await }.await

@@ -18,7 +18,7 @@ use crate::execute::{BlockTrainer, Shared, failed};
 use crate::memory::Memory;
 use crate::merged::{Judge, is_look};
 use crate::refine::{self, Start};
-use crate::{ExecuteError, Flow, Report, TaskOrder};
+use crate::{ExecuteError, FULL_RATE, FailureKind, Flow, Report, TaskOrder};
 
 /// Steps between two reports: on a GPU each makes the device wait.
 fn report_every(backend: &Backend) -> u32 {
@@ -61,13 +61,17 @@ impl Block<'_> {
         let Self { plan, task, .. } = *self;
         let Shared { finished, cap, metrics, .. } = &*self.trainer.shared;
         let eval_every = self.trainer.options.eval_every;
-        let recipe = recipe_of(&plan.settings, task);
+        let recipe = recipe_of(&plan.settings, task).at_rate(self.order.rate_permille as f32 / FULL_RATE as f32);
         let wrong = |error| match error {
             TrainError::NoViews | TrainError::Exposures | TrainError::Empty(_) => {
-                ExecuteError { message: format!("block {}: {error}", task.block), is_input: true }
+                ExecuteError::of(FailureKind::Input, format!("block {}: {error}", task.block))
             }
-            TrainError::Device(_) | TrainError::OutOfMemory(_) => failed(format!("block {}: {error}", task.block)),
-            TrainError::Source(_) => failed(error),
+            TrainError::Device(_) => failed(format!("block {}: {error}", task.block)),
+            TrainError::OutOfMemory(_) => {
+                ExecuteError::of(FailureKind::OutOfMemory, format!("block {}: {error}", task.block))
+            }
+            // The photos' windows carry checksums: what cannot be read is away or damaged.
+            TrainError::Source(_) => ExecuteError::of(FailureKind::Infrastructure, error),
         };
         let counts = |p: Vec3| self.owns(task, p.as_dvec3());
         let budget = self.budget(&results);
@@ -132,7 +136,7 @@ impl Block<'_> {
             _ => (u64::from(task.steps) * u64::from(trained)).div_ceil(u64::from(planned)) as u32,
         };
         let steps = trained + pruning.map_or(0, |pruning| pruning.steps(whole));
-        let (mut cancelled, mut late) = (false, false);
+        let (mut cancelled, mut late, mut diverged) = (false, false, false);
         let every = report_every(&self.trainer.backend);
         // Is a step to be reported, and the merged model measured for it?
         let due = |step: u32, last: bool| -> Option<bool> {
@@ -183,6 +187,10 @@ impl Block<'_> {
             if let Some(evaluate) = due(step, last) {
                 // Where there is no telling, training ends with why.
                 loss = now.loss().unwrap_or(f64::NAN);
+                diverged = now.skipped().is_some_and(|skipped| has_diverged(skipped, step));
+                if diverged {
+                    return train::Flow::Stop;
+                }
                 let count = now.count();
                 stopped = !tell(step, loss, count, if evaluate { now.splats() } else { None }, last);
             }
@@ -196,6 +204,10 @@ impl Block<'_> {
             going(!stopped && !late)
         })
         .map_err(wrong)?;
+        if diverged {
+            let message = format!("block {}: training diverges: too many losses are no numbers", task.block);
+            return Err(ExecuteError::of(FailureKind::Numeric, message));
+        }
         // Where training's last step is not the last to tell.
         let mut end = (settled && pruning.is_none()).then_some(task.steps);
         if let Some(pruning) = pruning.filter(|_| !stopped && !late) {
@@ -351,6 +363,12 @@ impl Block<'_> {
                 && !ground.is_far(place)
                 && owner.is_none_or(|b| b.level < self.task.block.level))
     }
+}
+
+/// Is a loss that is no number the rule rather than the exception? One such step is left out, and harms nothing.
+fn has_diverged(skipped: u32, step: u32) -> bool {
+    const FEW: u32 = 10;
+    skipped > FEW && skipped > step / 20
 }
 
 /// The recipe of a block's level: a child starts from splats that fit already, one mip coarser.

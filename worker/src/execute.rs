@@ -11,6 +11,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
 
 use blocks::{Plan, Task};
+use dataset::ingest::IngestError;
 use dataset::windows::WindowReader;
 use scene::frame::{self, About};
 use scene::{ArtefactId, BlockId, Exposures, Splats};
@@ -23,7 +24,7 @@ use crate::clock::Stopwatch;
 use crate::memory::Memory;
 use crate::merged::{Finished, Judge, is_look};
 use crate::metrics::Metrics;
-use crate::{Execute, ExecuteError, Flow, Report, TaskOrder};
+use crate::{Execute, ExecuteError, FailureKind, Flow, Report, TaskOrder};
 
 /// What a worker may use, and what it is asked to measure.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -96,16 +97,16 @@ impl Execute for BlockTrainer {
     ) -> Result<ArtefactId, ExecuteError> {
         let mut stopwatch = Stopwatch::start();
         let fetching = tracing::info_span!("fetch").entered();
-        let plan = self.store.get(order.plan).map_err(failed)?;
+        let plan = self.store.get(order.plan)?;
         let plan = Plan::from_frame(&plan).map_err(failed)?;
         if plan.backend != self.backend.name() {
             let (planned, own) = (&plan.backend, self.backend.name());
             return Err(failed(format!("the plan is for the backend {planned}, this worker computes on {own}")));
         }
         let task = plan.tasks.get(order.task as usize).ok_or_else(|| failed("the plan has no such task"))?;
-        let capture = Arc::new(dataset::ingest::load_capture(&self.store, plan.capture).map_err(failed)?);
+        let capture = Arc::new(dataset::ingest::load_capture(&self.store, plan.capture).map_err(unread)?);
         let reader = WindowReader::new(capture.clone(), self.store.clone(), self.options.cache_bytes);
-        let (results, given) = self.results(&plan, task, order)?;
+        let (results, given) = self.results(&plan, task, order, report)?;
         let memory = self.options.resume.then(|| Memory::of(order)).filter(|_| self.shared.cap.is_none());
         if let Some((artefact, splats)) = memory.as_ref().and_then(|memory| memory.result(&self.store)) {
             self.shared.resumed.fetch_add(1, Ordering::Relaxed);
@@ -133,7 +134,7 @@ impl Execute for BlockTrainer {
         }
         let memory = memory.as_ref();
         let exposures = match given.exposures {
-            Some(id) => Some(Exposures::from_frame(&self.store.get(id).map_err(failed)?).map_err(failed)?),
+            Some(id) => Some(Exposures::from_frame(&self.store.get(id)?).map_err(failed)?),
             None => None,
         };
         drop(fetching);
@@ -158,11 +159,11 @@ impl Execute for BlockTrainer {
         let Trained { splats, exposures, residual } = trained?;
         let _keeping = tracing::info_span!("keep").entered();
         let exposures = match exposures {
-            Some(trained) => Some(self.store.put(trained.to_frame()).map_err(failed)?),
+            Some(trained) => Some(self.store.put(trained.to_frame())?),
             None => given.exposures,
         };
         let about = About { exposures, residual: residual.or(given.residual) };
-        let artefact = self.store.put(frame::encode_result(&splats, about)).map_err(failed)?;
+        let artefact = self.store.put(frame::encode_result(&splats, about))?;
         self.shared.cap.iter().for_each(|cap| cap.finish(order.task));
         if let Some(memory) = memory {
             memory.keep_result(&self.store, artefact);
@@ -173,13 +174,23 @@ impl Execute for BlockTrainer {
 
 impl BlockTrainer {
     /// The splats of the blocks that the task needs, and what else its parent hands down.
-    fn results(&self, plan: &Plan, task: &Task, order: &TaskOrder) -> Result<Inputs, ExecuteError> {
+    fn results(
+        &self,
+        plan: &Plan,
+        task: &Task,
+        order: &TaskOrder,
+        report: &mut (dyn FnMut(Report) -> Flow + Send),
+    ) -> Result<Inputs, ExecuteError> {
         let (mut results, mut given) = (BTreeMap::new(), About::default());
         for block in task.context_cut().blocks() {
             let index = plan.tasks.iter().position(|t| t.block == block);
-            let id = index.and_then(|i| order.inputs.get(&(i as u32)));
-            let id = id.ok_or_else(|| failed(format!("the result of block {block} was not handed over")))?;
-            let bytes = self.store.get(*id).map_err(failed)?;
+            let known = index.and_then(|i| order.inputs.get_key_value(&(i as u32)));
+            let (&index, &id) =
+                known.ok_or_else(|| failed(format!("the result of block {block} was not handed over")))?;
+            let bytes = match self.store.get_or_discard(id)? {
+                Some(bytes) => bytes,
+                None => self.make_again(plan, order, index, id, report)?,
+            };
             let (splats, about) = frame::decode_result(&bytes).map_err(failed)?;
             results.insert(block, splats);
             given = if Some(block) == task.parent { about } else { given };
@@ -192,5 +203,12 @@ impl BlockTrainer {
 type Inputs = (BTreeMap<BlockId, Splats>, About);
 
 pub(crate) fn failed(error: impl ToString) -> ExecuteError {
-    ExecuteError { message: error.to_string(), is_input: false }
+    ExecuteError::of(FailureKind::Work, error)
+}
+
+fn unread(error: IngestError) -> ExecuteError {
+    match error {
+        IngestError::Store(error) => error.into(),
+        IngestError::BadInput(error) => failed(error),
+    }
 }

@@ -15,6 +15,7 @@ pub mod cap;
 pub mod clock;
 pub mod estimate;
 pub mod execute;
+mod heal;
 mod link;
 mod memory;
 pub mod merged;
@@ -28,8 +29,10 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use proto::Access;
+pub use proto::FailureKind;
 use proto::lease_reply::Reply;
 use scene::{ArtefactId, BadInput};
+use store::StoreError;
 use tokio_util::sync::CancellationToken;
 use tonic::{Code, Status};
 
@@ -39,6 +42,9 @@ pub use merged::Finished;
 
 /// A coordinator that does not hear for this long that the worker leaves will notice by itself.
 const GOODBYE: Duration = Duration::from_secs(2);
+
+/// [`TaskOrder::rate_permille`] of a task that never diverged.
+pub const FULL_RATE: u32 = 1000;
 
 /// What a task needs to be carried out.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -53,6 +59,8 @@ pub struct TaskOrder {
     pub attempt: u32,
     /// The results of the tasks it depends on (parent and context), by their place in the plan.
     pub inputs: BTreeMap<u32, ArtefactId>,
+    /// The learning rate's factor in thousandths: less than [`FULL_RATE`] where an earlier attempt diverged.
+    pub rate_permille: u32,
 }
 
 /// How far a task is: one line of metrics.
@@ -91,8 +99,21 @@ pub enum Flow {
 pub struct ExecuteError {
     /// One line for a person.
     pub message: String,
-    /// Whether the input is at fault, so that no other attempt would fare better.
-    pub is_input: bool,
+    /// Whose fault it is, which decides what the coordinator does next; never `GivenBack`, which is no failure.
+    pub kind: FailureKind,
+}
+
+impl ExecuteError {
+    pub(crate) fn of(kind: FailureKind, message: impl ToString) -> Self {
+        Self { message: message.to_string(), kind }
+    }
+}
+
+impl From<StoreError> for ExecuteError {
+    /// A store that fails may be itself again later, or its disk have room; what it lacks or holds damaged, a person may put there.
+    fn from(error: StoreError) -> Self {
+        Self::of(FailureKind::Infrastructure, error)
+    }
 }
 
 /// Carries out tasks. Blocking, on a thread of its own; a panic is a failed attempt.

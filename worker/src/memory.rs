@@ -7,7 +7,7 @@ use scene::{ArtefactId, Splats, frame};
 use store::BlockingStore;
 use train::State;
 
-use crate::TaskOrder;
+use crate::{FULL_RATE, TaskOrder};
 
 /// Names of what is remembered of a task.
 #[derive(Debug)]
@@ -19,12 +19,14 @@ pub(crate) struct Memory {
 impl Memory {
     pub(crate) fn of(order: &TaskOrder) -> Self {
         let key = proto::memory_key(order.plan, order.task, &order.inputs);
-        Self { result: format!("results/{key}"), checkpoint: format!("checkpoints/{key}") }
+        // At a lower rate training begins anew: from a checkpoint, the result would hang on when that was made.
+        let slower = if order.rate_permille < FULL_RATE { "-slower" } else { "" };
+        Self { result: format!("results/{key}"), checkpoint: format!("checkpoints/{key}{slower}") }
     }
 
     pub(crate) fn result(&self, store: &BlockingStore) -> Option<(ArtefactId, Splats)> {
         let id = ArtefactId(store.get_name(&self.result).ok()??.as_ref().try_into().ok()?);
-        let splats = frame::decode_splats(&store.get(id).ok()?).ok()?;
+        let splats = frame::decode_splats(&store.get_or_discard(id).ok()??).ok()?;
         Some((id, splats))
     }
 

@@ -15,10 +15,10 @@ use scene::ArtefactId;
 use store::Store;
 
 use crate::clock::cpu_seconds;
-use crate::{Execute, ExecuteError, Flow, Report, TaskOrder};
+use crate::{Execute, ExecuteError, FailureKind, Flow, Report, TaskOrder};
 
 /// Why a task had no result.
-const FAILURES: [&str; 3] = ["input", "work", "panic"];
+const FAILURES: [&str; 6] = ["input", "work", "infrastructure", "out_of_memory", "numeric", "panic"];
 
 /// A worker's metrics. Clones share them.
 #[derive(Debug, Clone)]
@@ -132,7 +132,7 @@ impl<E: Execute> Execute for Measured<E> {
         match &ended {
             Ok(Ok(_)) => self.metrics.tasks_done.inc(),
             Ok(Err(_)) if stopped => self.metrics.tasks_stopped.inc(),
-            Ok(Err(error)) => self.failed(if error.is_input { "input" } else { "work" }),
+            Ok(Err(error)) => self.failed(word_of(error.kind)),
             Err(_) => self.failed("panic"),
         };
         ended.unwrap_or_else(|panic: Box<dyn Any + Send>| resume_unwind(panic))
@@ -142,6 +142,17 @@ impl<E: Execute> Execute for Measured<E> {
 impl<E> Measured<E> {
     fn failed(&self, kind: &'static str) -> u64 {
         self.metrics.tasks_failed.get_or_create(&[("kind", kind)]).inc()
+    }
+}
+
+/// One of [`FAILURES`].
+fn word_of(kind: FailureKind) -> &'static str {
+    match kind {
+        FailureKind::Input => "input",
+        FailureKind::Work | FailureKind::GivenBack => "work",
+        FailureKind::Infrastructure => "infrastructure",
+        FailureKind::OutOfMemory => "out_of_memory",
+        FailureKind::Numeric => "numeric",
     }
 }
 
@@ -165,7 +176,7 @@ mod tests {
                 1 => panic!("broken"),
                 task => {
                     assert_eq!(flow == Flow::Stop, task == 4);
-                    Err(ExecuteError { message: String::new(), is_input: task == 2 })
+                    Err(ExecuteError::of(if task == 2 { FailureKind::Input } else { FailureKind::Work }, ""))
                 }
             }
         }
@@ -176,7 +187,8 @@ mod tests {
         let metrics = Metrics::default();
         let measured = Measured::new(Fake, metrics.clone());
         for task in 0..5 {
-            let order = TaskOrder { job: 1, plan: ArtefactId([1; 32]), task, attempt: 1, inputs: BTreeMap::new() };
+            let (plan, inputs) = (ArtefactId([1; 32]), BTreeMap::new());
+            let order = TaskOrder { job: 1, plan, task, attempt: 1, inputs, rate_permille: crate::FULL_RATE };
             let mut report = |_| if task == 4 { Flow::Stop } else { Flow::Continue };
             let ended = catch_unwind(AssertUnwindSafe(|| measured.execute(&order, &mut report)));
             assert_eq!((ended.is_err(), matches!(ended, Ok(Ok(_)))), (task == 1, task == 0));

@@ -15,7 +15,7 @@ use crate::block::{Block, recipe_of};
 use crate::clock::Stopwatch;
 use crate::execute::{BlockTrainer, Shared, TrainerOptions, failed};
 use crate::merged::Judge;
-use crate::{ExecuteError, TaskOrder};
+use crate::{ExecuteError, FULL_RATE, FailureKind, TaskOrder};
 
 /// A training of one block.
 pub struct Whole<'a> {
@@ -75,7 +75,14 @@ impl Whole<'_> {
         let judge = Judge::new(plan, capture, &self.store);
         let mut judge = judge.ok_or_else(|| input("holds out no view, so nothing can be measured"))?;
         let reader = WindowReader::new(capture.clone(), self.store.clone(), self.cache_bytes);
-        let order = TaskOrder { job: 0, plan: ArtefactId([0; 32]), task: 0, attempt: 1, inputs: BTreeMap::new() };
+        let order = TaskOrder {
+            job: 0,
+            plan: ArtefactId([0; 32]),
+            task: 0,
+            attempt: 1,
+            inputs: BTreeMap::new(),
+            rate_permille: FULL_RATE,
+        };
         let block = Block {
             trainer,
             order: &order,
@@ -138,7 +145,7 @@ fn is_due(step: u32, steps: u32, looks: u32) -> bool {
 }
 
 fn input(what: &str) -> ExecuteError {
-    ExecuteError { message: format!("the plan {what}"), is_input: true }
+    ExecuteError::of(FailureKind::Input, format!("the plan {what}"))
 }
 
 #[cfg(test)]

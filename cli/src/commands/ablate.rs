@@ -92,9 +92,9 @@ pub(crate) fn run(args: &AblateArgs, output: &Output) -> Result<(), Failure> {
             looks: args.looks,
         };
         for variant in variants {
-            let looks = whole.train(variant.recipe).map_err(|error| match error.is_input {
-                true => Failure::Input(error.message),
-                false => Failure::Work(error.message),
+            let looks = whole.train(variant.recipe).map_err(|error| match error.kind {
+                worker::FailureKind::Input => Failure::Input(error.message),
+                _ => Failure::Work(error.message),
             })?;
             let [.., last] = looks[..] else { return Err(Failure::Work("nothing was measured".into())) };
             output.note(format!(
