@@ -22,7 +22,7 @@ use serde_json::Value;
 use tonic::{Request, Response, Status};
 
 #[rustfmt::skip]
-const PLAN: [&str; 8] = ["--steps", "480", "--budget", "900", "--levels", "1", "--blocks", "tree"];
+const PLAN: [&str; 8] = ["--steps", "960", "--budget", "900", "--levels", "1", "--blocks", "tree"];
 const TOKEN: &str = "d34db33f-secret-of-the-cluster";
 
 /// What a span is: its service, and itself.
@@ -268,7 +268,7 @@ fn a_collector_that_is_away_costs_one_line() {
     submit(1);
     submit(2);
     // Both jobs' spans were refused by then, each in a batch of its own.
-    host.line(|line| line.contains("traces are lost"));
+    host.line_with("traces are lost");
     host.signal("-TERM");
     let host = host.end();
     assert!(host.status.success(), "{}", host.stderr);

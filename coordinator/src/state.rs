@@ -132,7 +132,10 @@ impl State {
         let settings = Settings { flush_interval: Some(flush), ..Settings::default() };
         // All of it fits into memory, where the scheduler has it anyway: what is read once need not be cached.
         let builder = Db::builder(FOLDER, store.objects()).with_settings(settings).with_db_cache_disabled();
-        let db = builder.build().await.map_err(failed(&store_url, "opened"))?;
+        let db = builder.build().await.map_err(|error| match is_outrun(&error) {
+            true => StateError::Fenced,
+            false => failed(&store_url, "opened")(error),
+        })?;
         let mut state = Self { db, store_url, epoch: 0, writes: AtomicU32::new(0) };
         match state.begin(seen).await {
             Ok(restored) => Ok((state, restored)),
@@ -281,6 +284,11 @@ fn job_key(job: JobId) -> String {
 
 fn task_key(job: JobId, task: u32) -> String {
     format!("task/{:016x}/{task:08x}", job.0)
+}
+
+/// Did somebody else open it at the same moment, and was faster? The database has no kind of its own for that.
+fn is_outrun(error: &slatedb::Error) -> bool {
+    error.kind() == ErrorKind::Data && error.to_string().contains("version already exists")
 }
 
 fn failed(store: &str, action: &'static str) -> impl Fn(slatedb::Error) -> StateError {

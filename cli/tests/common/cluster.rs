@@ -57,6 +57,11 @@ impl Running {
         }
     }
 
+    /// The next line on stderr in which these words stand.
+    pub(crate) fn line_with(&self, words: &str) -> String {
+        self.line(|line| line.contains(words))
+    }
+
     pub(crate) fn signal(&self, name: &str) {
         assert!(Command::new("kill").args([name, &self.child.id().to_string()]).status().unwrap().success());
     }
