@@ -95,9 +95,11 @@ fn a_damaged_result_is_made_again() {
     let first = worker(at, &url, "first");
     let results = at.join("shared/names/results");
     let root = loop {
-        let found = std::fs::read_dir(&results).ok().and_then(|mut found| Some(found.next()?.unwrap().path()));
-        match found.filter(|path| std::fs::metadata(path).unwrap().len() == 32) {
-            Some(record) => break std::fs::read(record).unwrap(),
+        let found = std::fs::read_dir(&results).into_iter().flatten().filter_map(|entry| entry.ok());
+        // A record on its way in has another name, and may be gone by now.
+        let mut records = found.filter_map(|entry| std::fs::read(entry.path()).ok()).filter(|bytes| bytes.len() == 32);
+        match records.next() {
+            Some(root) => break root,
             None => std::thread::sleep(Duration::from_millis(5)),
         }
     };

@@ -247,6 +247,9 @@ pub(crate) fn check_plan(plan: &Plan, capture: &Capture, output: &Output) -> Res
     Err(Failure::Input(format!("the plan cannot run: {first}{more}; plat plan shows all, other --levels may help")))
 }
 
+/// Times that a task of a local job is tried with a store that fails: over three seconds.
+const LOCAL_TROUBLES: u32 = 3;
+
 /// Runs the plan on workers in this process; Ctrl-C cancels the job.
 fn train_blocks(
     trainers: Vec<Arc<BlockTrainer>>,
@@ -267,7 +270,9 @@ fn train_blocks(
     let result = runtime.block_on(async {
         let stop = CancellationToken::new();
         let interrupted = tokio::spawn(interruption(stop.clone(), *output));
-        let hosting = coordinator::Options::new(store.clone());
+        let mut hosting = coordinator::Options::new(store.clone());
+        // Whoever sits before it had better hear of a full disk than wait for room: what is done stays done.
+        hosting.settings.troubles_limit = LOCAL_TROUBLES;
         let news = |news: &_| journal.note(news);
         let result = run_local(hosting, plan, trainers.len(), start_worker, news, stop).await;
         interrupted.abort();
