@@ -22,6 +22,8 @@ pub enum PartLine {
     Tree(Tree),
     /// Training in another way.
     Ablation(Ablation),
+    /// A job on a cluster.
+    Scale(Scale),
 }
 
 /// How long the renderer's passes take: medians.
@@ -128,6 +130,39 @@ pub struct Ablation {
     pub wall_seconds: f64,
     /// Held-out PSNR along the way; the first point is the model that training starts from.
     pub curve: Vec<CurvePoint>,
+    /// The command that made the line.
+    pub command: String,
+}
+
+/// A job on a cluster of processes of one machine, whose store was empty.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Scale {
+    /// The program's git commit.
+    pub commit: String,
+    /// See [`crate::machine`].
+    pub machine: String,
+    /// The capture's name.
+    pub scene: String,
+    /// Backend and its instruction set.
+    pub backend: String,
+    /// The plan's name.
+    pub plan: String,
+    /// `file` or `s3`.
+    pub store: String,
+    /// Workers.
+    pub workers: u32,
+    /// Threads of each.
+    pub threads: u32,
+    /// Tasks.
+    pub tasks: u64,
+    /// From when the job was accepted, its photos in the store, until it was done.
+    pub job_seconds: f64,
+    /// User and system time of all workers from their start to their end.
+    pub cpu_seconds: f64,
+    /// What all workers read from the store.
+    pub bytes_read: u64,
+    /// What all workers wrote to it.
+    pub bytes_written: u64,
     /// The command that made the line.
     pub command: String,
 }
@@ -282,6 +317,7 @@ impl PartLine {
                 });
                 of_levels.chain(of_faces).flatten().all(f64::is_finite)
             }
+            Self::Scale(line) => line.job_seconds.is_finite() && line.cpu_seconds.is_finite(),
             Self::Ablation(line) => {
                 let reached = line.reached.iter().flat_map(|reached| [Some(reached.psnr), reached.cpu_seconds]);
                 let curve = line.curve.iter().flat_map(|point| [point.cpu_seconds, point.psnr]);

@@ -17,7 +17,7 @@ use train::importance::Order;
 
 pub(crate) use bench::{
     AblateArgs, AdaptiveArgs, BenchCommand, BenchDemoArgs, BenchPruneArgs, BenchTreeArgs, ChartArgs, IngestArgs,
-    KernelsArgs, ParetoArgs,
+    KernelsArgs, ParetoArgs, ScaleArgs,
 };
 pub(crate) use cluster::{
     Connection, CoordinatorArgs, JobArgs, JobsArgs, LogFormat, LogsArgs, RetryArgs, StatusArgs, SubmitArgs, TaskName,

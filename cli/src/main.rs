@@ -73,6 +73,7 @@ fn main() -> ExitCode {
         Command::Bench(BenchCommand::Ingest(args)) => commands::bench::ingest(args, &output),
         Command::Bench(BenchCommand::Prune(args)) => commands::prune::bench(args, &output),
         Command::Bench(BenchCommand::Tree(args)) => commands::bench::tree(args, &output),
+        Command::Bench(BenchCommand::Scale(args)) => commands::scale::scale(args, &output),
         Command::Bench(BenchCommand::Adaptive(args)) => commands::bench::adaptive(args, &output),
         Command::Bench(BenchCommand::Demo(args)) => commands::bench::demo(args, &output),
     };

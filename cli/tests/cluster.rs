@@ -141,6 +141,27 @@ fn whoever_waits_for_a_job_waits_for_the_next_coordinator() {
 }
 
 #[test]
+fn clusters_of_several_sizes_are_compared() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    common::city(at, 20, 64, 48);
+    let words = ["bench", "scale", "city", "--workers", "1,2", "--rounds", "1", "--results", "results", "--json", "--"];
+    let output = common::plat(at, &[&words[..], &PLAN].concat());
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let lines = std::fs::read_to_string(at.join("results/scale.jsonl")).unwrap();
+    let lines: Vec<Value> = lines.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    let workers: Vec<u64> = lines.iter().map(|line| line["workers"].as_u64().unwrap()).collect();
+    assert_eq!(workers, [1, 2]);
+    for line in &lines {
+        assert!(line["plan"] == lines[0]["plan"] && line["tasks"].as_u64() > Some(2), "{line}");
+        // Nothing was left over from the cluster before: photos and context were read, results written.
+        assert!(line["bytes_read"].as_u64() > Some(10_000) && line["bytes_written"].as_u64() > Some(10_000), "{line}");
+        assert!(line["job_seconds"].as_f64() > Some(0.1) && line["cpu_seconds"].as_f64() > Some(0.1), "{line}");
+    }
+    common::refused(at, &["bench", "scale", "city", "--workers", "0"], "--workers");
+}
+
+#[test]
 fn people_steer_jobs_and_wrong_requests_are_refused_with_a_line() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();

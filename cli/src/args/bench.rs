@@ -25,6 +25,8 @@ pub(crate) enum BenchCommand {
     Prune(BenchPruneArgs),
     /// Measure a tree level by level and at the faces between its blocks, and append the figures to the results
     Tree(BenchTreeArgs),
+    /// Run a job on clusters of several sizes, processes of this machine, in turns, and append what each took to the results
+    Scale(ScaleArgs),
     /// Build the demo, and append what it took and how good it is to the results
     Demo(BenchDemoArgs),
     /// Train a city whose one half is a bare plain, as a tree of one depth and as one that follows the need; keep both
@@ -157,6 +159,30 @@ pub(crate) struct AdaptiveArgs {
     /// Folder of the result lines; these go to plat.jsonl there
     #[arg(long, value_name = "DIR", default_value = "bench/results")]
     pub(crate) results: PathBuf,
+}
+
+#[derive(Debug, Clone, Args)]
+pub(crate) struct ScaleArgs {
+    /// Folder of the capture: COLMAP or transforms.json
+    pub(crate) capture: PathBuf,
+    /// Numbers of workers, each of one thread
+    #[arg(long, value_name = "N,N", value_delimiter = ',', default_value = "1,2", value_parser = clap::value_parser!(u32).range(1..=64))]
+    pub(crate) workers: Vec<u32>,
+    /// How often each
+    #[arg(long, value_name = "N", default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..=100))]
+    pub(crate) rounds: u32,
+    /// Also on this store, s3://bucket/prefix, beside one in a folder
+    #[arg(long, value_name = "URL")]
+    pub(crate) store: Option<String>,
+    /// What the lines call the capture; by default the name of its folder
+    #[arg(long)]
+    pub(crate) scene: Option<String>,
+    /// Folder of the result lines; these go to scale.jsonl there
+    #[arg(long, value_name = "DIR", default_value = "bench/results")]
+    pub(crate) results: PathBuf,
+    /// After --: what plat submit is to be told of the plan
+    #[arg(last = true, value_name = "OPTION")]
+    pub(crate) plan: Vec<String>,
 }
 
 #[derive(Debug, Clone, Args)]

@@ -14,6 +14,7 @@ pub(crate) mod pareto;
 pub(crate) mod plan;
 pub(crate) mod prune;
 pub(crate) mod render;
+pub(crate) mod scale;
 pub(crate) mod submit;
 pub(crate) mod synth;
 pub(crate) mod train;

@@ -31,6 +31,8 @@ struct Submitted {
     /// Of the merged model, where it was waited for and written.
     splats: Option<u64>,
     bytes: Option<u64>,
+    /// Of the job, from when it was accepted to its end, where it was waited for.
+    job_seconds: Option<f64>,
     /// Since the command began, where it was waited for.
     wall_seconds: Option<f64>,
 }
@@ -56,6 +58,7 @@ pub(crate) fn run(args: &SubmitArgs, output: &Output) -> Result<(), Failure> {
     let request = proto::SubmitRequest { plan: plan_id.0.to_vec(), store_url: store.url().into() };
     let job = remote.call(async |client: &mut Client| client.submit(traced(request)).await)?;
     span.record("job", job.job).record("tasks", job.tasks);
+    let accepted = Stopwatch::start();
     let mut submitted = Submitted {
         command: "submit",
         job: job.job,
@@ -65,6 +68,7 @@ pub(crate) fn run(args: &SubmitArgs, output: &Output) -> Result<(), Failure> {
         tasks: job.tasks,
         splats: None,
         bytes: None,
+        job_seconds: None,
         wall_seconds: None,
     };
     let mut text = format!("job {} of {} tasks; plat status {} says how it stands", job.job, job.tasks, job.job);
@@ -77,6 +81,7 @@ pub(crate) fn run(args: &SubmitArgs, output: &Output) -> Result<(), Failure> {
             let advice = format!("plat status {0} --watch goes on watching, plat cancel {0} ends it", job.job);
             return Err(Failure::Work(format!("stopped waiting as asked; job {} goes on: {advice}", job.job)));
         };
+        submitted.job_seconds = Some(accepted.wall_seconds());
         judge(job.job, outcome, &results)?;
         text = format!("job {} is done: {} tasks", job.job, job.tasks);
         if let Some(out) = &args.out {

@@ -29,6 +29,12 @@ struct Worked {
     done: u64,
     /// Tasks that it found finished, or begun with a checkpoint.
     resumed: u32,
+    /// User and system time of this process.
+    cpu_seconds: f64,
+    /// What it read from the store.
+    bytes_read: u64,
+    /// What it wrote to the store.
+    bytes_written: u64,
 }
 
 pub(crate) fn run(args: &WorkerArgs, output: &Output) -> Result<(), Failure> {
@@ -37,7 +43,17 @@ pub(crate) fn run(args: &WorkerArgs, output: &Output) -> Result<(), Failure> {
     let backend = compute_on(args.backend)?;
     let cores = std::thread::available_parallelism().map_or(1, |n| n.get() as u32);
     let threads = args.threads.0.unwrap_or(cores).max(1);
-    let mut worked = Worked { command: "worker", name, backend: backend.name(), threads, done: 0, resumed: 0 };
+    let mut worked = Worked {
+        command: "worker",
+        name,
+        backend: backend.name(),
+        threads,
+        done: 0,
+        resumed: 0,
+        cpu_seconds: 0.0,
+        bytes_read: 0,
+        bytes_written: 0,
+    };
     let url = &args.connection.coordinator;
     let runtime = runtime()?;
     runtime.block_on(async {
@@ -68,6 +84,9 @@ pub(crate) fn run(args: &WorkerArgs, output: &Output) -> Result<(), Failure> {
             output.note(format!("{} works for {url}: {} on {threads} threads", worked.name, worked.backend));
             worker::run(worker, Arc::new(measured), stop).await.map_err(of_worker)?;
             worked.done = shared.metrics.done();
+            worked.cpu_seconds = worker::clock::cpu_seconds();
+            let traffic = store.traffic();
+            (worked.bytes_read, worked.bytes_written) = (traffic.read, traffic.written);
             worked.resumed = shared.resumed.load(Ordering::Relaxed);
         }
         told.abort();
