@@ -17,7 +17,7 @@ fn a_plain_stays_coarse_beside_houses() {
     rehearse::write(&at.join("city"), &city, &|_, _, _| ()).unwrap();
     let train = |out: &str, words: &[&str]| {
         let job =
-            ["train", "city", "--steps", "1500", "--budget", "5000", "--levels", "2", "--tolerance-db", "0", "--out"];
+            ["train", "city", "--steps", "2000", "--budget", "5000", "--levels", "2", "--tolerance-db", "0", "--out"];
         json_of(&mut common::command(at, &[&job, &[out][..], words].concat()))
     };
     let adaptive = train("adaptive", &["--threads", "2"]);
