@@ -66,7 +66,7 @@ within() {
 is_idle() { [[ $(sinfo --noheader --format %t) == idle ]]; }
 within 30 is_idle
 
-"$PLAT" synth --out "$scratch/city" --area-km2 0.02 --views 24 --size 160x120 --quiet >/dev/null
+"$PLAT" synth --out "$scratch/city" --area-km2 0.05 --views 24 --size 160x120 --quiet >/dev/null
 plan=(--blocks tree --levels 1 --steps 1600 --backend cpu)
 "$PLAT" train "$scratch/city" --out "$scratch/calm" --workers 1 "${plan[@]}" --quiet >/dev/null
 
