@@ -163,6 +163,10 @@ pub struct Scale {
     pub bytes_read: u64,
     /// What all workers wrote to it.
     pub bytes_written: u64,
+    /// What of the reading was for windows of photos.
+    pub window_bytes_read: u64,
+    /// The part of it that the windows' own pixels take of their tiles.
+    pub window_bytes_used: u64,
     /// The command that made the line.
     pub command: String,
 }

@@ -25,10 +25,6 @@ const SEEN_AGAIN: f64 = 0.05;
 const INNER_COUNTS: f64 = 2.0;
 /// A block that keeps this share of its own need, because too few of its children have a task, is worked on as a leaf.
 const KEEPS_MUCH: f64 = 0.25;
-/// A step of a tree takes this much of what is counted, against a step on the whole scene: small windows have more rim, and every
-/// block begins anew (1.10 to 1.22 on the bench's five scenes, by a price that took frozen splats for a block's own; by today's it
-/// comes out at 0.74 to 1.23, 1.01 on average).
-pub(crate) const TREE_STEP: f64 = 1.18;
 /// Steps of a task at least.
 const MIN_STEPS: u32 = 50;
 /// Levels below the leaves of the cells in which ground is counted as seen: 16 a side (see [`Needs`]).
@@ -176,8 +172,6 @@ fn set_steps(tasks: &mut [Task], whole: &Task, standings: &[Standing], capture: 
     let work = f64::from(settings.steps) * cost_of_visits(whole) / whole.views.len().max(1) as f64;
     // Where splats and pixels are few a visit costs next to nothing, but needs no end of them.
     let most = INNER_COUNTS * f64::from(settings.steps) / whole.views.len().max(1) as f64;
-    let parents = parents(tasks);
-    let work = if parents.is_empty() { work } else { work / TREE_STEP };
     let shown = first_shown(tasks, standings, capture);
     let all: f64 = shown.values().sum();
     for (height, shown) in shown {

@@ -114,10 +114,10 @@ pub fn context_of(ground: &Ground, block: BlockId, existing: &BTreeSet<BlockId>)
     found.into_iter().collect()
 }
 
-/// The sweep of its level in which a block is trained: no two blocks of one sweep touch, so a level takes four sweeps and
-/// the blocks of each can be trained at once.
+/// The sweep of its level in which a block is trained, like the fields of a chessboard: no two blocks of one sweep share a face,
+/// so a level takes two sweeps and the blocks of each can be trained at once.
 pub fn sweep_of(block: BlockId) -> u8 {
-    ((block.x & 1) | (block.y & 1) << 1) as u8
+    ((block.x ^ block.y) & 1) as u8
 }
 
 /// The order of training, and of a plan's tasks: by level, sweep, row, column.
@@ -125,11 +125,11 @@ pub fn training_order(block: BlockId) -> (u8, u8, u32, u32) {
     (block.level, sweep_of(block), block.y, block.x)
 }
 
-/// The neighbours of `block` on its own level that are trained in an earlier sweep. They are final when the block starts:
+/// The neighbours of `block` on its own level, beyond its faces, that are trained in an earlier sweep. They are final when the block starts:
 /// drawn, frozen, as the merged model will have them, so that the block fits what it will stand beside.
 pub fn finished_neighbours(block: BlockId, of_level: &BTreeSet<BlockId>) -> impl Iterator<Item = BlockId> {
-    let touches = move |b: &BlockId| b.x.abs_diff(block.x) <= 1 && b.y.abs_diff(block.y) <= 1;
-    of_level.iter().copied().filter(move |b| b.level == block.level && touches(b) && sweep_of(*b) < sweep_of(block))
+    let beside = move |b: &BlockId| b.x.abs_diff(block.x) + b.y.abs_diff(block.y) == 1;
+    of_level.iter().copied().filter(move |b| b.level == block.level && beside(b) && sweep_of(*b) < sweep_of(block))
 }
 
 #[cfg(test)]

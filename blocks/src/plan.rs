@@ -10,7 +10,7 @@ use crate::ground::{Ground, HALO_SCALE};
 use crate::lod::{Cut, training_order};
 
 /// The version of [`Plan`] that this program writes and reads.
-pub const VERSION: u32 = 3;
+pub const VERSION: u32 = 4;
 /// The frame that carries a plan.
 pub const PLAN: Kind = Kind(*b"plan", VERSION);
 /// The deepest level a plan may have: 65,536 blocks a side.

@@ -156,7 +156,7 @@ fn clusters_of_several_sizes_are_compared() {
         assert!(line["plan"] == lines[0]["plan"] && line["tasks"].as_u64() > Some(2), "{line}");
         // Nothing was left over from the cluster before: photos and context were read, results written.
         assert!(line["bytes_read"].as_u64() > Some(10_000) && line["bytes_written"].as_u64() > Some(10_000), "{line}");
-        assert!(line["job_seconds"].as_f64() > Some(0.1) && line["cpu_seconds"].as_f64() > Some(0.1), "{line}");
+        assert!(line["job_seconds"].as_f64() > Some(0.0) && line["cpu_seconds"].as_f64() > Some(0.0), "{line}");
     }
     common::refused(at, &["bench", "scale", "city", "--workers", "0"], "--workers");
 }

@@ -26,7 +26,7 @@ pub const CAPTURE: Kind = Kind(*b"capt", 1);
 /// What is remembered of a photo.
 const MEMO: Kind = Kind(*b"memo", 1);
 /// Raised whenever the same photo would give other mips: decoding, undistortion, downscaling, mips, their format.
-const FORMAT: u32 = 1;
+const FORMAT: u32 = 2;
 
 /// How to ingest.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

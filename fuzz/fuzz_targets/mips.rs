@@ -17,7 +17,7 @@ fuzz_target!(|bytes: &[u8]| {
         let mut bytes = bytes.to_vec();
         let Some(index) = bytes.get_mut(..layout.index_len()) else { return };
         let words = [SIZE.0, SIZE.1, 3 + u32::from(masked)].map(u32::to_le_bytes);
-        index[..20].copy_from_slice(&[b"platmip1".as_slice(), words.as_flattened()].concat());
+        index[..20].copy_from_slice(&[b"platmip2".as_slice(), words.as_flattened()].concat());
         let (said, check) = index.split_at_mut(layout.index_len() - 16);
         check.copy_from_slice(&blake3::hash(said).as_bytes()[..16]);
         let Ok(index) = layout.index(&bytes[..layout.index_len()]) else { continue };

@@ -64,8 +64,14 @@ fn traffic_is_counted_apart() {
     other.blocking().put_name("a/b", "12345").unwrap();
     other.blocking().get_name("a/b").unwrap();
     assert_eq!(one.traffic(), Traffic { read: 0, written: 14 });
-    assert_eq!(other.clone().traffic(), Traffic { read: 14 + 9 + 5, written: 5 });
+    // The byte between the ranges came along.
+    assert_eq!(other.clone().traffic(), Traffic { read: 14 + 10 + 5, written: 5 });
     assert_eq!(all.traffic(), Traffic::default());
+    // What lies between ranges far apart stays where it is.
+    let far = other.blocking().put(vec![7; 10_000]).unwrap();
+    let before = other.traffic().read;
+    assert_eq!(other.blocking().get_ranges(far, &[9000..9100, 0..50]).unwrap(), [vec![7; 100], vec![7; 50]]);
+    assert_eq!(other.traffic().read, before + 150);
 }
 
 #[test]

@@ -66,7 +66,7 @@ fn plan() -> Plan {
         },
         levels: 1,
         rho_metres: vec![2.0, 1.0],
-        tasks: ["0/0/0", "1/0/0", "1/1/0", "1/0/1", "1/1/1"].map(task).to_vec(),
+        tasks: ["0/0/0", "1/0/0", "1/1/1", "1/1/0", "1/0/1"].map(task).to_vec(),
     }
 }
 

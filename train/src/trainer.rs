@@ -272,6 +272,9 @@ pub enum TrainError {
     Empty(u32),
 }
 
+/// Steps ahead of which the source hears what window they will ask for.
+const AHEAD: u32 = 8;
+
 /// Trains a block; `report` is called after every step.
 ///
 /// # Errors
@@ -321,6 +324,9 @@ pub fn train_on(
         .collect::<Result<Vec<f64>, _>>()?;
     let first_stage = now.need.stage;
     let until = (recipe.growth.until * steps as f32) as u32;
+    let [mut turns, mut turns_ahead] = [(); 2].map(|()| Turns::new(views.len(), job.seed));
+    // The first step whose window the source has not been told of.
+    let mut told = now.step + 1;
 
     while now.step < steps {
         let step = now.step;
@@ -330,12 +336,21 @@ pub fn train_on(
         let progress = step as f32 / steps as f32;
         let picked = match recipe.by_error > 0.0 {
             true => now.need.next_view(views.len(), recipe.by_error),
-            false => pick(views.len(), job.seed, step),
+            false => turns.of(step),
         };
         let view = &views[picked];
         let coarser = (recipe.coarse.len() as u8).saturating_sub(now.need.stage);
-        let (mip, rect, camera) = (0..=coarser).rev().find_map(|c| view.at(c)).expect("at(0) always is");
+        let window = |view: &TrainView| (0..=coarser).rev().find_map(|c| view.at(c)).expect("at(0) always is");
+        let (mip, rect, camera) = window(view);
         let photo = job.source.window(view.view, mip, rect).map_err(TrainError::Source)?;
+        if recipe.by_error == 0.0 {
+            while told < steps.min(step + 1 + AHEAD) {
+                let next = &views[turns_ahead.of(told)];
+                let (mip, rect, _) = window(next);
+                job.source.expect(next.view, mip, rect);
+                told += 1;
+            }
+        }
 
         let sh_degree = recipe.sh_from.iter().filter(|&&from| progress >= from).count() as u8;
         let options = Options {
@@ -426,10 +441,29 @@ pub fn train_on(
 }
 
 /// Every view once per epoch, each epoch in another order.
-fn pick(views: usize, seed: u64, step: u32) -> usize {
-    let n = views as u32;
-    let order = random::shuffle(random::bits(seed, u64::from(step / n)), views);
-    order[(step % n) as usize] as usize
+struct Turns {
+    seed: u64,
+    views: usize,
+    /// The epoch whose order is at hand.
+    epoch: Option<u32>,
+    order: Vec<u32>,
+}
+
+impl Turns {
+    fn new(views: usize, seed: u64) -> Self {
+        Self { seed, views, epoch: None, order: Vec::new() }
+    }
+
+    /// The view of a step.
+    fn of(&mut self, step: u32) -> usize {
+        let n = self.views as u32;
+        let epoch = step / n;
+        if self.epoch != Some(epoch) {
+            self.order = random::shuffle(random::bits(self.seed, u64::from(epoch)), self.views);
+            self.epoch = Some(epoch);
+        }
+        self.order[(step % n) as usize] as usize
+    }
 }
 
 /// A step size at a share of the way: geometric between first and last.

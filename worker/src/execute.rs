@@ -153,6 +153,7 @@ impl Execute for BlockTrainer {
         let training = tracing::info_span!("train", block = %task.block);
         let trained = self.pool.install(|| training.in_scope(|| block.train(results, &mut stopwatch, report)));
         drop(training);
+        self.shared.metrics.has_read(reader.stats());
         // The next block has splats and a cache of its own.
         self.shared.metrics.splats.set(0);
         self.shared.metrics.cache_bytes.set(0);

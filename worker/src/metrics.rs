@@ -5,6 +5,7 @@ use std::fmt;
 use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
 use std::sync::{Arc, OnceLock};
 
+use dataset::windows::WindowStats;
 use prometheus_client::collector::Collector;
 use prometheus_client::encoding::{DescriptorEncoder, EncodeMetric};
 use prometheus_client::metrics::counter::{ConstCounter, Counter};
@@ -29,6 +30,8 @@ pub struct Metrics {
     pub(crate) steps: Counter,
     pub(crate) splats: Gauge,
     pub(crate) cache_bytes: Gauge,
+    window_read_bytes: Counter,
+    window_used_bytes: Counter,
     pub(crate) checkpoints: Counter,
     store: Arc<OnceLock<Store>>,
 }
@@ -42,6 +45,8 @@ impl Default for Metrics {
             steps: Counter::default(),
             splats: Gauge::default(),
             cache_bytes: Gauge::default(),
+            window_read_bytes: Counter::default(),
+            window_used_bytes: Counter::default(),
             checkpoints: Counter::default(),
             store: Arc::default(),
         };
@@ -67,6 +72,12 @@ impl Metrics {
             "Bytes of windows that the block in hand keeps in memory",
             self.cache_bytes.clone(),
         );
+        worker.register("window_read_bytes", "Bytes read for windows of photos", self.window_read_bytes.clone());
+        worker.register(
+            "window_used_bytes",
+            "The part of them that the windows' own pixels take of their tiles",
+            self.window_used_bytes.clone(),
+        );
         worker.register("checkpoints", "Checkpoints left in the store", self.checkpoints.clone());
         worker.register_collector(Box::new(Usage { store: self.store.clone() }));
     }
@@ -74,6 +85,17 @@ impl Metrics {
     /// From now on what is moved from and to this store is told, as its meter shows it. The first one stays.
     pub fn moves_from_and_to(&self, store: Store) {
         let _ = self.store.set(store);
+    }
+
+    /// Counts what a reader of a task that ended has read.
+    pub(crate) fn has_read(&self, stats: WindowStats) {
+        self.window_read_bytes.inc_by(stats.bytes_read);
+        self.window_used_bytes.inc_by(stats.bytes_used);
+    }
+
+    /// Bytes read for windows of photos in tasks that ended, and the part of them that the windows' own pixels take.
+    pub fn window_bytes(&self) -> (u64, u64) {
+        (self.window_read_bytes.get(), self.window_used_bytes.get())
     }
 
     /// Tasks finished so far.

@@ -2,6 +2,7 @@
 
 use std::io::{BufRead, BufReader, Read};
 use std::process::{Child, Command, Stdio};
+use std::sync::mpsc::{self, Receiver};
 use std::time::Duration;
 
 use ::bench::parts::Scale;
@@ -49,12 +50,14 @@ pub(crate) fn scale(args: &ScaleArgs, output: &Output) -> Result<(), Failure> {
             for &workers in &args.workers {
                 // A store of its own, so that nothing of an earlier job is of use to a later one.
                 let place = format!("{store}/{}-{round}-{workers}", std::process::id());
-                let kind = if *store == folders { "file" } else { "s3" };
+                let kind = if store.starts_with("s3://") { "s3" } else { "file" };
+                let (turn, turns) = (lines.len() + 1, args.rounds as usize * stores.len() * args.workers.len());
+                output.note(format!("job {turn} of {turns}: {kind}, {workers} workers …"));
                 let line = measure(args, &scene, &place, kind, workers)?;
                 output.note(format!("{kind}, {workers} workers: {:.1} s for {} tasks", line.job_seconds, line.tasks));
                 append_part(&file, &PartLine::Scale(line.clone()))?;
                 lines.push(line);
-                if kind == "file" {
+                if *store == folders {
                     let _ = std::fs::remove_dir_all(&place);
                 }
             }
@@ -85,7 +88,7 @@ pub(crate) fn scale(args: &ScaleArgs, output: &Output) -> Result<(), Failure> {
 /// One job on a cluster of its own.
 fn measure(args: &ScaleArgs, scene: &str, store: &str, kind: &str, workers: u32) -> Result<Scale, Failure> {
     let host = ["coordinator", "--store", store, "--listen", "127.0.0.1:0"];
-    let mut host = Process::start(host.map(String::from).to_vec())?;
+    let host = Process::start(host.map(String::from).to_vec())?;
     let url = host.listens()?;
     let mut hands = Vec::new();
     for number in 0..workers {
@@ -95,7 +98,7 @@ fn measure(args: &ScaleArgs, scene: &str, store: &str, kind: &str, workers: u32)
             [&words[..], &["--json", "--quiet"]].concat().into_iter().map(String::from).collect(),
         )?);
     }
-    wait_for(&url, workers)?;
+    wait_for(&url, workers, &mut hands)?;
     let capture = args.capture.display().to_string();
     let words = ["submit", &capture, "--coordinator", &url, "--backend", "cpu", "--wait", "--json", "--quiet"];
     let words = words.into_iter().map(String::from).chain(args.plan.iter().cloned()).collect();
@@ -114,6 +117,8 @@ fn measure(args: &ScaleArgs, scene: &str, store: &str, kind: &str, workers: u32)
         cpu_seconds: 0.0,
         bytes_read: 0,
         bytes_written: 0,
+        window_bytes_read: 0,
+        window_bytes_used: 0,
         command: invoked(),
     };
     for hand in hands {
@@ -121,13 +126,15 @@ fn measure(args: &ScaleArgs, scene: &str, store: &str, kind: &str, workers: u32)
         line.cpu_seconds += said["cpu_seconds"].as_f64().unwrap_or(f64::NAN);
         line.bytes_read += said["bytes_read"].as_u64().unwrap_or_default();
         line.bytes_written += said["bytes_written"].as_u64().unwrap_or_default();
+        line.window_bytes_read += said["window_bytes_read"].as_u64().unwrap_or_default();
+        line.window_bytes_used += said["window_bytes_used"].as_u64().unwrap_or_default();
     }
     host.stop();
     Ok(line)
 }
 
-/// Waits until so many workers are there.
-fn wait_for(url: &str, workers: u32) -> Result<(), Failure> {
+/// Waits until so many workers are there; one that ended instead says why.
+fn wait_for(url: &str, workers: u32, hands: &mut Vec<Process>) -> Result<(), Failure> {
     let access =
         Connection { coordinator: url.to_owned(), tls_ca: None, tls_cert: None, tls_key: None, token_file: None };
     let mut remote = Remote::open(&access)?;
@@ -135,6 +142,11 @@ fn wait_for(url: &str, workers: u32) -> Result<(), Failure> {
         let about = remote.call(async |client: &mut Client| client.about(proto::AboutRequest {}).await)?;
         if about.backends.iter().map(|of| of.workers).sum::<u32>() >= workers {
             return Ok(());
+        }
+        if let Some(ended) = hands.iter_mut().position(Process::has_ended) {
+            let hand = hands.swap_remove(ended);
+            let words = hand.words.clone();
+            return hand.end(false).and_then(|_| Err(work(&words, "ended before the job began")));
         }
         std::thread::sleep(LOOK);
     }
@@ -144,6 +156,8 @@ fn wait_for(url: &str, workers: u32) -> Result<(), Failure> {
 struct Process {
     words: String,
     child: Child,
+    /// The lines of its stderr, which is always read: a full pipe would stop it.
+    troubles: Receiver<String>,
 }
 
 impl Process {
@@ -151,24 +165,34 @@ impl Process {
         let program = std::env::current_exe().map_err(|error| work("this program", error))?;
         let child = Command::new(program).args(&words).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn();
         let words = words.join(" ");
-        Ok(Self { child: child.map_err(|error| work(&words, error))?, words })
+        let mut child = child.map_err(|error| work(&words, error))?;
+        let (say, troubles) = mpsc::channel();
+        if let Some(stderr) = child.stderr.take() {
+            std::thread::spawn(move || {
+                // Nobody may want to hear it any more.
+                BufReader::new(stderr).lines().map_while(Result::ok).for_each(|line| drop(say.send(line)));
+            });
+        }
+        Ok(Self { words, child, troubles })
     }
 
-    /// The URL that it says it is reached at; what else it says is read and dropped.
-    fn listens(&mut self) -> Result<String, Failure> {
-        let Some(stderr) = self.child.stderr.take() else { return Err(work(&self.words, "has no stderr")) };
-        let mut lines = BufReader::new(stderr).lines().map_while(Result::ok);
-        let mut url = None;
-        // It answers once it leads.
-        for line in lines.by_ref() {
-            let said = line.split_whitespace().find(|word| word.starts_with("http://"));
-            url = url.or(said.map(|url| url.trim_end_matches(',').to_owned()));
-            if line.contains("leading") {
+    /// The URL that it says it is reached at, once it leads.
+    fn listens(&self) -> Result<String, Failure> {
+        let mut heard = Vec::new();
+        for line in &self.troubles {
+            let leads = line.contains("leading");
+            heard.push(line);
+            if leads {
                 break;
             }
         }
-        std::thread::spawn(move || lines.for_each(drop));
-        url.ok_or_else(|| work(&self.words, "does not say where it listens"))
+        let said = heard.iter().flat_map(|line| line.split_whitespace()).find(|word| word.starts_with("http://"));
+        let url = said.map(|url| url.trim_end_matches(',').to_owned());
+        url.ok_or_else(|| work(&self.words, format!("does not say where it listens: {}", heard.join("; "))))
+    }
+
+    fn has_ended(&mut self) -> bool {
+        !matches!(self.child.try_wait(), Ok(None))
     }
 
     /// Tells it to stop, where it does not by itself, and hears its result.
@@ -176,13 +200,14 @@ impl Process {
         if told {
             self.terminate();
         }
-        let (mut said, mut troubles) = (String::new(), String::new());
+        let mut said = String::new();
         let read = self.child.stdout.take().map_or(Ok(0), |mut stdout| stdout.read_to_string(&mut said));
         read.map_err(|error| work(&self.words, error))?;
-        let _ = self.child.stderr.take().map(|mut stderr| stderr.read_to_string(&mut troubles));
         let status = self.child.wait().map_err(|error| work(&self.words, error))?;
         let result = said.lines().last().and_then(|line| serde_json::from_str(line).ok());
-        result.filter(|_| status.success()).ok_or_else(|| work(&self.words, troubles.trim()))
+        result
+            .filter(|_| status.success())
+            .ok_or_else(|| work(&self.words, self.troubles.iter().collect::<Vec<_>>().join("; ")))
     }
 
     fn stop(mut self) {

@@ -35,6 +35,10 @@ struct Worked {
     bytes_read: u64,
     /// What it wrote to the store.
     bytes_written: u64,
+    /// What of the reading was for windows of photos, in tasks that ended.
+    window_bytes_read: u64,
+    /// The part of it that the windows' own pixels take of their tiles.
+    window_bytes_used: u64,
 }
 
 pub(crate) fn run(args: &WorkerArgs, output: &Output) -> Result<(), Failure> {
@@ -53,6 +57,8 @@ pub(crate) fn run(args: &WorkerArgs, output: &Output) -> Result<(), Failure> {
         cpu_seconds: 0.0,
         bytes_read: 0,
         bytes_written: 0,
+        window_bytes_read: 0,
+        window_bytes_used: 0,
     };
     let url = &args.connection.coordinator;
     let runtime = runtime()?;
@@ -87,6 +93,7 @@ pub(crate) fn run(args: &WorkerArgs, output: &Output) -> Result<(), Failure> {
             worked.cpu_seconds = worker::clock::cpu_seconds();
             let traffic = store.traffic();
             (worked.bytes_read, worked.bytes_written) = (traffic.read, traffic.written);
+            (worked.window_bytes_read, worked.window_bytes_used) = shared.metrics.window_bytes();
             worked.resumed = shared.resumed.load(Ordering::Relaxed);
         }
         told.abort();

@@ -191,6 +191,35 @@ fn what_is_not_there_is_said() {
 }
 
 #[test]
+fn what_is_expected_is_there_when_it_is_asked_for() {
+    let folder = tempfile::tempdir().unwrap();
+    let store = memory();
+    let mut capture = run(&source(folder.path(), 3), &store, options(1, 1)).unwrap().capture;
+    capture.views.push(View { mips: vec![ArtefactId::of(b"gone")], ..capture.views[0].clone() });
+    let capture = Arc::new(capture);
+    let rects: Vec<Rect> = (0..40).map(|i| Rect { x: i, y: i / 2, width: 30 + i, height: 20 + i }).collect();
+    let plain = WindowReader::new(Arc::clone(&capture), store.clone(), 0);
+    let reader = WindowReader::new(Arc::clone(&capture), store.clone(), 1 << 20);
+    for (i, &rect) in rects.iter().enumerate() {
+        let view = i as u32 % 3;
+        reader.expect(view, 0, rect);
+        // Again, and what cannot be had: neither is anybody's trouble.
+        reader.expect(view, 0, rect);
+        reader.expect(3, 0, rect);
+        reader.expect(99, 0, rect);
+        assert_eq!(*reader.window(view, 0, rect).unwrap(), *plain.window(view, 0, rect).unwrap());
+    }
+    assert!(reader.window(3, 0, rects[0]).is_err() && reader.window(99, 0, rects[0]).is_err());
+    let stats = reader.stats();
+    // What found no room in the queue was read by whoever asked.
+    assert!(stats.expected > 0 && stats.expected + stats.misses >= 40, "{stats:?}");
+    assert!(stats.bytes_used > 0 && stats.bytes_used < stats.bytes_read, "{stats:?}");
+    // Where there is no room, nothing is fetched to be thrown away.
+    plain.expect(0, 0, rects[0]);
+    assert_eq!(plain.stats().expected, 0);
+}
+
+#[test]
 fn masks_and_downscaling_reach_the_mips() {
     let folder = tempfile::tempdir().unwrap();
     let (mut source, store) = (source(folder.path(), 2), memory());
