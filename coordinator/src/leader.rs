@@ -33,38 +33,52 @@ pub(crate) async fn host(
     mut inbox: Inbox,
     stop: CancellationToken,
 ) -> Result<(), ServeError> {
+    let mut beaten = false;
     loop {
-        let Some(seen) = stand_by(&options.store, &durable, &mut inbox, &stop).await else { return Ok(()) };
+        let Some(seen) = stand_by(&options.store, &durable, beaten, &mut inbox, &stop).await else { return Ok(()) };
         match lead(&options, &durable, seen, &mut inbox, &stop).await {
             Err(ServeError::State(StateError::Fenced)) => {
                 tracing::warn!("another coordinator leads now: standing by");
+                beaten = true;
             }
             ended => return ended,
         }
     }
 }
 
-/// Waits until nobody leads: the highest epoch that a lease names, 0 if there is none; `None` once stopped. Calls are answered
-/// meanwhile: by saying who leads.
-async fn stand_by(store: &Store, durable: &Durable, inbox: &mut Inbox, stop: &CancellationToken) -> Option<u64> {
+/// Waits until nobody leads: the highest epoch that a lease names, 0 if there is none; `None` once stopped. Who was `beaten` gives
+/// the winner time to create its lease: of many that take over at once, each could fence the one before it for ever. Calls are
+/// answered meanwhile: by saying who leads.
+async fn stand_by(
+    store: &Store,
+    durable: &Durable,
+    mut beaten: bool,
+    inbox: &mut Inbox,
+    stop: &CancellationToken,
+) -> Option<u64> {
     let mut seen = None;
     let mut since = Instant::now();
     loop {
         let lease = match store.newest(FOLDER).await {
-            Ok(None) => return Some(0),
-            Ok(Some((epoch, bytes))) => {
-                let lease = Leader::from_bytes(epoch, &bytes);
-                if lease.as_ref().is_ok_and(|lease| lease.released) {
-                    return Some(epoch);
-                }
+            Ok(newest) => {
+                let epoch = newest.as_ref().map_or(0, |(epoch, _)| *epoch);
+                let lease = newest.as_ref().map(|(epoch, bytes)| Leader::from_bytes(*epoch, bytes));
+                let free = match &lease {
+                    None => true,
+                    Some(lease) => lease.as_ref().is_ok_and(|lease| lease.released),
+                };
                 // By this clock alone: those of other machines may say anything.
-                if seen.as_ref() != Some(&(epoch, bytes.clone())) {
-                    (seen, since) = (Some((epoch, bytes)), Instant::now());
+                if seen.as_ref() != Some(&newest) {
+                    beaten &= seen.is_none();
+                    (seen, since) = (Some(newest), Instant::now());
                 } else if since.elapsed() >= durable.patience {
                     tracing::warn!(epoch, "the leader is silent: taking over");
                     return Some(epoch);
                 }
-                lease
+                if free && !beaten {
+                    return Some(epoch);
+                }
+                lease.filter(|_| !free).unwrap_or_else(|| Err("it has yet to say so".into()))
             }
             Err(error) => {
                 // Who cannot see the lease must not judge by its silence.
