@@ -108,7 +108,7 @@ impl Block<'_> {
             steps,
             antialiased: plan.settings.antialiased,
             seed: self.seed(),
-            size_bounds_metres: self.size_bounds_metres(),
+            size_bounds_metres: self.size_bounds_metres(&views),
             exposures: self.exposures_given,
             trains_exposures: plan.settings.exposure && task.parent.is_none(),
             recipe: &recipe,
@@ -334,9 +334,14 @@ impl Block<'_> {
         train::random::bits(self.plan.settings.seed, place)
     }
 
-    /// From a twentieth of a pixel of the block's level to twice the edge of the scene, which the backdrop needs.
-    pub(crate) fn size_bounds_metres(&self) -> [f32; 2] {
-        [self.task.rho_metres as f32 * 0.05, 2.0 * self.plan.ground.edge_metres as f32]
+    /// From a twentieth of a pixel of the block's level to three times what the backdrop begins with. One of its splats that is let
+    /// grow much farther becomes a haze over every photo that looks its way; what has a parent has none of them.
+    pub(crate) fn size_bounds_metres(&self, views: &[TrainView]) -> [f32; 2] {
+        let largest = match self.task.parent {
+            None => 0.2 * self.surroundings(views).1,
+            Some(_) => 0.5 * self.plan.ground.edge_metres,
+        };
+        [self.task.rho_metres as f32 * 0.05, largest as f32]
     }
 
     pub(crate) fn windows(&self, uses: &[ViewUse]) -> Result<Vec<TrainView>, ExecuteError> {

@@ -39,7 +39,7 @@ impl Block<'_> {
                 colours: chosen.iter().map(|&i| points.colours[rows[i]]).collect(),
                 ..SparsePoints::default()
             };
-            let sizes = self.size_bounds_metres();
+            let sizes = self.size_bounds_metres(views);
             let mut initial = train::init::from_points(&points, sh_degree, recipe.initial_opacity, sizes);
             initial.append(&backdrop);
             return Ok((initial, None));
@@ -69,7 +69,7 @@ impl Block<'_> {
     }
 
     /// Where the backdrop stands: around the cameras, five times as far as all but the farthest points.
-    fn surroundings(&self, views: &[TrainView]) -> (glam::DVec3, f64) {
+    pub(crate) fn surroundings(&self, views: &[TrainView]) -> (glam::DVec3, f64) {
         let cameras = views.iter().map(|view| view.camera.centre());
         let centre = cameras.clone().sum::<glam::DVec3>() / views.len().max(1) as f64;
         let points = self.capture.points.positions.iter().copied();

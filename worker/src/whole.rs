@@ -118,7 +118,7 @@ impl Whole<'_> {
             steps: task.steps,
             antialiased: plan.settings.antialiased,
             seed: block.seed(),
-            size_bounds_metres: block.size_bounds_metres(),
+            size_bounds_metres: block.size_bounds_metres(&views),
             exposures: None,
             trains_exposures: false,
             recipe: &recipe,
