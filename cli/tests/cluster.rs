@@ -141,6 +141,50 @@ fn whoever_waits_for_a_job_waits_for_the_next_coordinator() {
 }
 
 #[test]
+fn a_block_goes_to_a_worker_that_has_the_memory() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    common::city(at, 20, 64, 48);
+    let (_host, url) = coordinator(at);
+    let asked = |words: &[&str]| common::done(at, &[words, &["--coordinator", &url]].concat());
+    let until = |job: &str, state: &str| loop {
+        let status = asked(&["status", job]);
+        if status["state"] == state {
+            break status;
+        }
+        assert_eq!(status["state"], "running", "{status}");
+        std::thread::sleep(Duration::from_millis(50));
+    };
+    // 40,000 splats under training are thought to take more than a hundred MiB, 2,000 less than 24: the program alone comes near that.
+    let plan = ["--blocks", "whole", "--steps", "200", "--tolerance-db", "0"];
+    asked(&[&["submit", "city", "--budget", "40000"][..], &plan].concat());
+    asked(&[&["submit", "city", "--budget", "2000"][..], &plan].concat());
+    let begin = |name: &str, memory: &str| {
+        let words = ["worker", "--coordinator", &url, "--name", name, "--threads", "1", "--memory", memory, "--json"];
+        Running::begin(&mut common::command(at, &words))
+    };
+    let small = begin("small", "24");
+    let failed = until("2", "incomplete");
+    let line = failed["failures"][0]["message"].as_str().unwrap();
+    assert!(line.contains("--memory gives it 24") && line.contains("add a larger one"), "{line}");
+    let first = asked(&["status", "1"]);
+    assert!(first["state"] == "running" && first["running"].as_array().unwrap().is_empty(), "{first}");
+    small.signal("-TERM");
+    let large = begin("large", "auto");
+    asked(&["retry", "2", "0/0/0"]);
+    until("1", "done");
+    until("2", "done");
+    let [small, large] = [small, large].map(|worker| {
+        worker.signal("-TERM");
+        serde_json::from_str::<Value>(&worker.end().stdout).unwrap()
+    });
+    assert_eq!((&small["done"], &small["memory_bytes"]), (&0.into(), &(24 << 20).into()));
+    assert_eq!((&large["done"], &large["resumed"]), (&2.into(), &1.into()), "it goes on from the checkpoint: {large}");
+    assert!(large["memory_bytes"].as_u64() > Some(256 << 20), "{large}");
+    common::refused(at, &["worker", "--coordinator", &url, "--memory", "8"], "--memory");
+}
+
+#[test]
 fn clusters_of_several_sizes_are_compared() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();

@@ -365,6 +365,7 @@ async fn workers_find_each_new_leader_and_no_work_is_done_twice() {
                 access: Access::default(),
                 worker_id: format!("w{number}"),
                 backend: BACKEND.into(),
+                memory_bytes: 0,
             };
             tokio::spawn(worker::run(options, fake.clone(), home.clone()))
         })

@@ -111,7 +111,7 @@ fn broken(message: &str, kind: FailureKind) -> ExecuteError {
 /// A worker of this name.
 fn hand(coordinator_url: String, name: &str) -> worker::Options {
     let (worker_id, backend) = (name.into(), BACKEND.into());
-    worker::Options { coordinator_url, access: Access::default(), worker_id, backend }
+    worker::Options { coordinator_url, access: Access::default(), worker_id, backend, memory_bytes: 0 }
 }
 
 /// Runs the plan on workers of this fake; quick retries, a patient lease.

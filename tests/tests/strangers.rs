@@ -73,7 +73,7 @@ impl Execute for Idle {
 /// How a worker ends that is not to find work.
 async fn work(coordinator_url: String, access: Access) -> Result<(), WorkerError> {
     let (worker_id, backend) = ("stranger".into(), "cpu-none".into());
-    let options = worker::Options { coordinator_url, access, worker_id, backend };
+    let options = worker::Options { coordinator_url, access, worker_id, backend, memory_bytes: 0 };
     tokio::time::timeout(Duration::from_secs(60), worker::run(options, Arc::new(Idle), CancellationToken::new()))
         .await
         .expect("a worker that is refused does not wait")

@@ -18,6 +18,7 @@ use crate::execute::{BlockTrainer, Shared, failed};
 use crate::memory::Memory;
 use crate::merged::{Judge, is_look};
 use crate::refine::{self, Start};
+use crate::room::Room;
 use crate::{ExecuteError, FULL_RATE, FailureKind, Flow, Report, TaskOrder};
 
 /// Steps between two reports: on a GPU each makes the device wait.
@@ -137,6 +138,9 @@ impl Block<'_> {
         };
         let steps = trained + pruning.map_or(0, |pruning| pruning.steps(whole));
         let (mut cancelled, mut late, mut diverged) = (false, false, false);
+        let memory_bytes = self.trainer.options.memory_bytes;
+        let mut room = (memory_bytes > 0).then(|| Room::of(memory_bytes)).flatten();
+        let mut overrun = None;
         let every = report_every(&self.trainer.backend);
         // Is a step to be reported, and the merged model measured for it?
         let due = |step: u32, last: bool| -> Option<bool> {
@@ -161,7 +165,8 @@ impl Block<'_> {
                 merged_splats: measured.map(|(_, splats)| splats),
             });
             cancelled |= flow == Flow::Stop && !last;
-            !cancelled
+            overrun = room.as_mut().filter(|_| !last).and_then(Room::overrun);
+            !cancelled && overrun.is_none()
         };
         let going = |on: bool| if on { train::Flow::Continue } else { train::Flow::Stop };
         let (mut loss, mut stopped) = (f64::NAN, false);
@@ -235,6 +240,11 @@ impl Block<'_> {
         if let Some(end) = end {
             let evaluate = due(end, true) == Some(true);
             tell(end, loss, splats.len(), evaluate.then_some(&splats), true);
+        }
+        if let Some(taken) = overrun {
+            let [taken, most] = [taken, memory_bytes].map(|bytes| bytes.div_ceil(1 << 20));
+            let message = format!("block {}: the worker takes {taken} MiB, --memory gives it {most}", task.block);
+            return Err(ExecuteError::of(FailureKind::OutOfMemory, message));
         }
         if cancelled {
             return Err(failed("stopped before its end, as asked"));

@@ -35,6 +35,8 @@ pub struct TrainerOptions {
     pub eval_every: u32,
     /// Bound on the windows kept in memory.
     pub cache_bytes: usize,
+    /// Bound on what the whole process takes: a task that takes more fails, and is another worker's. 0 bounds nothing.
+    pub memory_bytes: u64,
     /// Whether to take what an earlier run left in the store, and to leave such (never where there is a cap in time).
     pub resume: bool,
     /// Wall seconds between two checkpoints of a task.

@@ -21,6 +21,7 @@ mod memory;
 pub mod merged;
 pub mod metrics;
 mod refine;
+pub mod room;
 mod start;
 pub mod whole;
 
@@ -141,6 +142,8 @@ pub struct Options {
     pub worker_id: String,
     /// The backend's full name; only jobs whose plan names the same are granted.
     pub backend: String,
+    /// Only tasks that are thought to need no more memory than this are granted, bytes; 0 takes them all.
+    pub memory_bytes: u64,
 }
 
 /// Why a worker gave up.
@@ -183,7 +186,8 @@ pub async fn run(options: Options, executor: Arc<dyn Execute>, shutdown: Cancell
     let mut link = Link::new(&options)?;
     while !shutdown.is_cancelled() {
         let (worker, backend, epoch) = (options.worker_id.clone(), options.backend.clone(), link.epoch());
-        let request = proto::LeaseRequest { worker, backend, epoch, ..Default::default() };
+        let memory_bytes = options.memory_bytes;
+        let request = proto::LeaseRequest { worker, backend, memory_bytes, epoch, ..Default::default() };
         let answer = tokio::select! {
             biased;
             () = shutdown.cancelled() => break,

@@ -185,7 +185,7 @@ mod tests {
 
     fn options(url: &str) -> Options {
         let access = Access::default();
-        Options { coordinator_url: url.into(), access, worker_id: "w".into(), backend: "b".into() }
+        Options { coordinator_url: url.into(), access, worker_id: "w".into(), backend: "b".into(), memory_bytes: 0 }
     }
 
     fn url_of(folder: &std::path::Path) -> String {

@@ -60,6 +60,7 @@ impl Whole<'_> {
             threads: self.threads,
             eval_every: 0,
             cache_bytes: self.cache_bytes,
+            memory_bytes: 0,
             resume: false,
             checkpoint_seconds: f64::INFINITY,
         };

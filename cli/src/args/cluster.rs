@@ -105,6 +105,13 @@ pub(crate) struct WorkerArgs {
     /// Threads; auto takes all cores
     #[arg(long, value_name = "N|auto", default_value_t)]
     pub(crate) threads: Auto<u32>,
+    /// Memory that it may take: it is given no block that is thought to need more, and leaves one that turns out to, which goes to
+    /// a worker that may take more. auto: what this machine has, or the container that it runs in
+    #[arg(long, value_name = "MIB|auto", default_value_t)]
+    pub(crate) memory: Auto<u64>,
+    /// The part of it that photos may take, decoded
+    #[arg(long, value_name = "MIB", default_value_t = 128, value_parser = clap::value_parser!(u32).range(1..=1 << 20))]
+    pub(crate) cache: u32,
     /// Its name, unlike any other worker's; by default the machine's and the process's number
     #[arg(long, value_name = "NAME")]
     pub(crate) name: Option<String>,

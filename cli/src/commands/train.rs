@@ -115,6 +115,7 @@ pub(crate) fn train(args: &TrainArgs, output: &Output) -> Result<Trained, Failur
         threads: threads as usize,
         eval_every: args.eval_every,
         cache_bytes: CACHE_BYTES,
+        memory_bytes: 0,
         resume: !args.fresh,
         checkpoint_seconds: args.checkpoint_every,
     };
@@ -263,7 +264,8 @@ fn train_blocks(
     let runtime = runtime.map_err(|error| Failure::Work(format!("cannot start threads: {error}")))?;
     let start_worker = |coordinator_url, number: usize, shutdown| {
         let (worker_id, backend) = (format!("local-{number}"), backend.to_owned());
-        let options = worker::Options { coordinator_url, access: Access::default(), worker_id, backend };
+        let access = Access::default();
+        let options = worker::Options { coordinator_url, access, worker_id, backend, memory_bytes: 0 };
         worker::run(options, trainers[number].clone(), shutdown)
     };
     let _traced = tracing::info_span!("job").entered();

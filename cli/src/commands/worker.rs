@@ -12,7 +12,7 @@ use worker::execute::{BlockTrainer, Shared, TrainerOptions};
 use worker::metrics::Measured;
 
 use crate::args::WorkerArgs;
-use crate::commands::train::{CACHE_BYTES, compute_on};
+use crate::commands::train::compute_on;
 use crate::failure::Failure;
 use crate::output::Output;
 use crate::remote::{access, runtime, shared_store};
@@ -25,6 +25,8 @@ struct Worked {
     name: String,
     backend: String,
     threads: u32,
+    /// What it may take; 0 where nothing bounds it.
+    memory_bytes: u64,
     /// Tasks that it finished.
     done: u64,
     /// Tasks that it found finished, or begun with a checkpoint.
@@ -47,11 +49,13 @@ pub(crate) fn run(args: &WorkerArgs, output: &Output) -> Result<(), Failure> {
     let backend = compute_on(args.backend)?;
     let cores = std::thread::available_parallelism().map_or(1, |n| n.get() as u32);
     let threads = args.threads.0.unwrap_or(cores).max(1);
+    let memory_bytes = memory_of(args)?;
     let mut worked = Worked {
         command: "worker",
         name,
         backend: backend.name(),
         threads,
+        memory_bytes,
         done: 0,
         resumed: 0,
         cpu_seconds: 0.0,
@@ -74,13 +78,15 @@ pub(crate) fn run(args: &WorkerArgs, output: &Output) -> Result<(), Failure> {
             access,
             worker_id: worked.name.clone(),
             backend: worked.backend.clone(),
+            memory_bytes,
         };
         if let Some(about) = worker::greet(&worker, &stop).await.map_err(of_worker)? {
             let store = shared_store(&about.store_url).await?.metered();
             let options = TrainerOptions {
                 threads: threads as usize,
                 eval_every: 0,
-                cache_bytes: CACHE_BYTES,
+                cache_bytes: (args.cache as usize) << 20,
+                memory_bytes,
                 resume: true,
                 checkpoint_seconds: args.checkpoint_every,
             };
@@ -101,6 +107,18 @@ pub(crate) fn run(args: &WorkerArgs, output: &Output) -> Result<(), Failure> {
     })?;
     let text = format!("{} left after {} tasks, {} of them resumed", worked.name, worked.done, worked.resumed);
     output.result(&worked, &text)
+}
+
+/// What the worker may take, bytes; 0 where nothing bounds it.
+fn memory_of(args: &WorkerArgs) -> Result<u64, Failure> {
+    /// What the program takes before it has a block.
+    const LEAST_MIB: u64 = 16;
+    let Some(mebibytes) = args.memory.0 else { return Ok(worker::room::bytes().unwrap_or(0)) };
+    if !(LEAST_MIB..1 << 40).contains(&mebibytes) {
+        let what = format!("{mebibytes} MiB are not what a worker can do with");
+        return Err(BadInput::new("--memory", what, format!("give {LEAST_MIB} or more, or auto")).into());
+    }
+    Ok(mebibytes << 20)
 }
 
 /// The worker's name: the one asked for, else the machine's and the process's number.
