@@ -7,14 +7,14 @@
 //! Everything here follows from the plan and its inputs, so an attempt anywhere gives the same bytes.
 
 use std::collections::BTreeMap;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
 
 use blocks::{Plan, Task};
 use dataset::ingest::IngestError;
 use dataset::windows::WindowReader;
 use scene::frame::{self, About};
-use scene::{ArtefactId, BlockId, Exposures, Splats};
+use scene::{ArtefactId, BlockId, Capture, Exposures, Splats};
 use store::BlockingStore;
 use train::Backend;
 
@@ -65,6 +65,8 @@ pub struct BlockTrainer {
     pub(crate) shared: Arc<Shared>,
     pub(crate) backend: Backend,
     pool: rayon::ThreadPool,
+    /// That of the task before. A city's has tens of megabytes, and the next task is mostly of the same job.
+    capture: Mutex<Option<(ArtefactId, Arc<Capture>)>>,
 }
 
 impl BlockTrainer {
@@ -82,7 +84,7 @@ impl BlockTrainer {
             .num_threads(options.threads.max(1))
             .build()
             .map_err(|error| format!("cannot start {} threads: {error}", options.threads))?;
-        Ok(Self { store, options, shared, backend, pool })
+        Ok(Self { store, options, shared, backend, pool, capture: Mutex::default() })
     }
 
     /// Does something on the trainer's threads.
@@ -106,7 +108,7 @@ impl Execute for BlockTrainer {
             return Err(failed(format!("the plan is for the backend {planned}, this worker computes on {own}")));
         }
         let task = plan.tasks.get(order.task as usize).ok_or_else(|| failed("the plan has no such task"))?;
-        let capture = Arc::new(dataset::ingest::load_capture(&self.store, plan.capture).map_err(unread)?);
+        let capture = self.capture(plan.capture)?;
         let reader = WindowReader::new(capture.clone(), self.store.clone(), self.options.cache_bytes);
         let (results, given) = self.results(&plan, task, order, report)?;
         let memory = self.options.resume.then(|| Memory::of(order)).filter(|_| self.shared.cap.is_none());
@@ -176,6 +178,20 @@ impl Execute for BlockTrainer {
 }
 
 impl BlockTrainer {
+    fn capture(&self, id: ArtefactId) -> Result<Arc<Capture>, ExecuteError> {
+        let mut kept = self.capture.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some((of, capture)) = &*kept
+            && *of == id
+        {
+            return Ok(capture.clone());
+        }
+        // Not both at once.
+        *kept = None;
+        let capture = Arc::new(dataset::ingest::load_capture(&self.store, id).map_err(unread)?);
+        *kept = Some((id, capture.clone()));
+        Ok(capture)
+    }
+
     /// The splats of the blocks that the task needs, and what else its parent hands down.
     fn results(
         &self,
