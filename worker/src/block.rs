@@ -344,7 +344,7 @@ impl Block<'_> {
         train::random::bits(self.plan.settings.seed, place)
     }
 
-    /// From a twentieth of a pixel of the block's level to three times what the backdrop begins with. One of its splats that is let
+    /// From a twentieth of a pixel of the block's level to a fifth of the backdrop's distance, three times what it begins with. One of its splats that is let
     /// grow much farther becomes a haze over every photo that looks its way; what has a parent has none of them.
     pub(crate) fn size_bounds_metres(&self, views: &[TrainView]) -> [f32; 2] {
         let largest = match self.task.parent {

@@ -106,7 +106,8 @@ pub(crate) struct WorkerArgs {
     #[arg(long, value_name = "N|auto", default_value_t)]
     pub(crate) threads: Auto<u32>,
     /// Memory that it may take: it is given no block that is thought to need more, and leaves one that turns out to, which goes to
-    /// a worker that may take more. auto: what this machine has, or the container that it runs in
+    /// a worker that may take more. auto: what this machine has, or the container that it runs in; give each its part where several
+    /// workers share a machine
     #[arg(long, value_name = "MIB|auto", default_value_t)]
     pub(crate) memory: Auto<u64>,
     /// The part of it that photos may take, decoded
