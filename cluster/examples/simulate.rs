@@ -7,6 +7,7 @@
 //! ```
 //! Exits with 1 at the first seed that fails, and says how to replay it.
 
+use std::fmt;
 use std::io::{BufWriter, Write};
 use std::process::ExitCode;
 
@@ -64,7 +65,7 @@ fn asked(mut args: impl Iterator<Item = String>) -> Result<Asked, String> {
 
 fn play(asked: &Asked) -> Result<String, String> {
     let mut out = BufWriter::new(std::io::stdout());
-    let mut trace = |line: &str| {
+    let mut trace = |line: fmt::Arguments<'_>| {
         if asked.trace {
             // A reader that had enough closes the pipe; there is nobody left to tell.
             let _ = writeln!(out, "{line}");

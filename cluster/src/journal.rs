@@ -7,6 +7,8 @@
 //! Written beside a running coordinator and replayed by [`replay`], which is deterministic: the same events give the same
 //! actions, and `said` tells whether they did.
 
+use std::fmt;
+
 use serde::{Deserialize, Serialize};
 
 use scene::ArtefactId;
@@ -76,7 +78,10 @@ pub struct Replayed {
 ///
 /// # Errors
 /// The line, and what is wrong with it: not a line of a journal, an invariant that does not hold, another answer.
-pub fn replay<'a>(lines: impl Iterator<Item = &'a str>, mut trace: impl FnMut(&str)) -> Result<Replayed, String> {
+pub fn replay<'a>(
+    lines: impl Iterator<Item = &'a str>,
+    mut trace: impl FnMut(fmt::Arguments<'_>),
+) -> Result<Replayed, String> {
     let mut lines = (1u64..).zip(lines).peekable();
     let mut scheduler: Option<Scheduler> = None;
     let (mut steps, mut starts) = (0, 0);
@@ -100,7 +105,7 @@ pub fn replay<'a>(lines: impl Iterator<Item = &'a str>, mut trace: impl FnMut(&s
             (Line::Step { now_millis, event, said }, Some(scheduler)) => {
                 let before = (scheduler.total() <= CHECKED_TASKS).then(|| scheduler.clone());
                 let actions = scheduler.step(now_millis, event.clone());
-                trace(&format!("{now_millis} {event:?} -> {actions:?}"));
+                trace(format_args!("{now_millis} {event:?} -> {actions:?}"));
                 if let Some(before) = before {
                     let held = check(scheduler).and_then(|()| check_step(&before, scheduler, &event, &actions));
                     held.map_err(|violation| wrong(violation.to_string()))?;

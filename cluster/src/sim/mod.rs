@@ -18,6 +18,7 @@ mod worker;
 mod world;
 
 use std::collections::BTreeMap;
+use std::fmt;
 
 pub use random::Random;
 
@@ -51,11 +52,11 @@ impl Report {
     }
 }
 
-/// Plays the world of a seed, and tells each happening to `trace`.
+/// Plays the world of a seed, and tells each happening to `trace`, which writes it out only if anyone reads it.
 ///
 /// # Errors
 /// What does not hold, one line.
-pub fn run(seed: u64, options: Options, trace: &mut dyn FnMut(&str)) -> Result<Report, String> {
+pub fn run(seed: u64, options: Options, trace: &mut dyn FnMut(fmt::Arguments<'_>)) -> Result<Report, String> {
     let mut world = world::World::new(seed, options);
     let held = world.play(trace);
     held.map(|()| world.report()).map_err(|what| format!("seed {seed}: {what}"))

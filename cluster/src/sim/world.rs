@@ -6,6 +6,7 @@ mod messages;
 mod verdict;
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::fmt;
 
 use scene::ArtefactId;
 
@@ -178,10 +179,10 @@ impl World {
     }
 
     /// Plays to the end.
-    pub(crate) fn play(&mut self, trace: &mut dyn FnMut(&str)) -> Result<(), String> {
+    pub(crate) fn play(&mut self, trace: &mut dyn FnMut(fmt::Arguments<'_>)) -> Result<(), String> {
         while let Some(((now, _), happening)) = self.queue.pop_first() {
             self.now = now;
-            trace(&format!("{now:>8} {happening:?}"));
+            trace(format_args!("{now:>8} {happening:?}"));
             self.happens(happening)?;
             if self.peace && self.is_over() {
                 return self.check_end();
