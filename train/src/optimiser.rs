@@ -120,54 +120,73 @@ impl Adam {
 
 kernel!(fn update(chunk: &mut Chunk, rates: &Rates, correction: [f32; 2]) = update_lanes);
 
+/// Column after column: with its moments and its gradient each is four walks through memory already, and a core foresees only a
+/// few. Means and scales go by threes, as they need what all scales were before.
 #[inline(always)]
 fn update_lanes<L: Lanes>(chunk: &mut Chunk, rates: &Rates, correction: [f32; 2]) {
-    let n = chunk.values[0].len();
-    for group in 0..n.div_ceil(LANES) {
-        let seen = chunk.seen[group];
-        if seen == 0 {
-            continue;
-        }
-        update_group::<L>(chunk, group * LANES, seen, rates, correction);
-    }
-}
-
-#[inline(always)]
-fn update_group<L: Lanes>(chunk: &mut Chunk, i: usize, seen: u16, rates: &Rates, correction: [f32; 2]) {
+    let step = Step::<L> { beta2: L::splat(rates.beta2), correction: correction.map(|c| 1.0 / c) };
+    let groups = chunk.values[0].len().div_ceil(LANES);
     let free = [f32::MIN, f32::MAX];
-    let step = Step::<L> { i, seen, beta2: L::splat(rates.beta2), correction: correction.map(|c| 1.0 / c) };
-    let scales = each!(c in [0, 1, 2] => L::load_from(chunk.values[column::LOG_SCALE + c], i, 0.0));
-    let size = ((scales[0] + scales[1] + scales[2]) * L::splat(std::f32::consts::LOG2_E / 3.0)).exp2();
-    for c in 0..3 {
-        step.column(chunk, column::MEAN + c, size * L::splat(rates.mean), L::zero(), free);
+    for group in 0..groups {
+        let at = Group::of(chunk, group);
+        let scales = at.scales::<L>(chunk);
+        let size = ((scales[0] + scales[1] + scales[2]) * L::splat(std::f32::consts::LOG2_E / 3.0)).exp2();
+        for c in 0..3 {
+            step.column(chunk, at, column::MEAN + c, size * L::splat(rates.mean), L::zero(), free);
+        }
     }
-    let longest = scales[0].max(scales[1]).max(scales[2]);
-    let shortest = scales[0].min(scales[1]).min(scales[2]);
-    let middle = scales[0] + scales[1] + scales[2] - longest - shortest;
-    let needle = L::splat(std::f32::consts::LN_10).lt(longest - middle);
-    for c in 0..3 {
-        let pull = L::select(needle & longest.le(scales[c]), L::splat(rates.needle_pull), L::zero());
-        step.column(chunk, column::LOG_SCALE + c, L::splat(rates.log_scale), pull, rates.log_scale_bounds);
+    for group in 0..groups {
+        let at = Group::of(chunk, group);
+        let scales = at.scales::<L>(chunk);
+        let longest = scales[0].max(scales[1]).max(scales[2]);
+        let shortest = scales[0].min(scales[1]).min(scales[2]);
+        let middle = scales[0] + scales[1] + scales[2] - longest - shortest;
+        let needle = L::splat(std::f32::consts::LN_10).lt(longest - middle);
+        for c in 0..3 {
+            let pull = L::select(needle & longest.le(scales[c]), L::splat(rates.needle_pull), L::zero());
+            let bounds = rates.log_scale_bounds;
+            step.column(chunk, at, column::LOG_SCALE + c, L::splat(rates.log_scale), pull, bounds);
+        }
     }
-    for c in 0..4 {
-        step.column(chunk, column::QUAT + c, L::splat(rates.quat), L::zero(), free);
+    for group in 0..groups {
+        let at = Group::of(chunk, group);
+        let logit = L::load_from(chunk.values[column::OPACITY], at.first, 0.0);
+        let opacity = L::splat(1.0) / (L::splat(1.0) + (logit * L::splat(-std::f32::consts::LOG2_E)).exp2());
+        let pull = opacity * (L::splat(1.0) - opacity) * L::splat(rates.opacity_pull);
+        step.column(chunk, at, column::OPACITY, L::splat(rates.opacity), pull, [-15.0, 15.0]);
     }
-    let logit = L::load_from(chunk.values[column::OPACITY], i, 0.0);
-    let opacity = L::splat(1.0) / (L::splat(1.0) + (logit * L::splat(-std::f32::consts::LOG2_E)).exp2());
-    let pull = opacity * (L::splat(1.0) - opacity) * L::splat(rates.opacity_pull);
-    step.column(chunk, column::OPACITY, L::splat(rates.opacity), pull, [-15.0, 15.0]);
-    for c in 0..3 {
-        step.column(chunk, column::SH + c, L::splat(rates.sh_dc), L::zero(), free);
-    }
-    for c in column::SH + 3..chunk.values.len() {
-        step.column(chunk, c, L::splat(rates.sh_rest), L::zero(), free);
+    let quats = (column::QUAT..column::QUAT + 4).map(|c| (c, rates.quat));
+    let colours =
+        (column::SH..chunk.values.len()).map(|c| (c, if c < column::SH + 3 { rates.sh_dc } else { rates.sh_rest }));
+    for (c, rate) in quats.chain(colours) {
+        for group in 0..groups {
+            step.column(chunk, Group::of(chunk, group), c, L::splat(rate), L::zero(), free);
+        }
     }
 }
 
-/// What a step has in common over the columns of sixteen splats.
-struct Step<L> {
-    i: usize,
+/// Sixteen splats of a chunk.
+#[derive(Clone, Copy)]
+struct Group {
+    first: usize,
+    /// Bit `n`: the view has seen splat `first + n`.
     seen: u16,
+}
+
+impl Group {
+    #[inline(always)]
+    fn of(chunk: &Chunk, group: usize) -> Self {
+        Self { first: group * LANES, seen: chunk.seen[group] }
+    }
+
+    #[inline(always)]
+    fn scales<L: Lanes>(self, chunk: &Chunk) -> [L; 3] {
+        each!(c in [0, 1, 2] => L::load_from(chunk.values[column::LOG_SCALE + c], self.first, 0.0))
+    }
+}
+
+/// What a step has in common over all splats.
+struct Step<L> {
     beta2: L,
     /// 1 / (1 - βᵗ) of both moments.
     correction: [f32; 2],
@@ -175,8 +194,11 @@ struct Step<L> {
 
 impl<L: Lanes> Step<L> {
     #[inline(always)]
-    fn column(&self, chunk: &mut Chunk, c: usize, rate: L, pull: L, bounds: [f32; 2]) {
-        let i = self.i;
+    fn column(&self, chunk: &mut Chunk, at: Group, c: usize, rate: L, pull: L, bounds: [f32; 2]) {
+        if at.seen == 0 {
+            return;
+        }
+        let i = at.first;
         let value = L::load_from(chunk.values[c], i, 0.0);
         let gradient = L::load_from(chunk.gradients[c], i, 0.0) + pull;
         let (m0, v0) = (L::load_from(chunk.first[c], i, 0.0), L::load_from(chunk.second[c], i, 0.0));
@@ -186,7 +208,7 @@ impl<L: Lanes> Step<L> {
         let next = value - rate * L::splat(self.correction[0]) * m / root;
         let next = next.max(L::splat(bounds[0])).min(L::splat(bounds[1]));
         // A gradient that is not finite moves nothing: NaN and infinity fail these comparisons.
-        let good = self.seen & gradient.abs().lt(L::splat(f32::MAX)) & next.abs().lt(L::splat(f32::MAX));
+        let good = at.seen & gradient.abs().lt(L::splat(f32::MAX)) & next.abs().lt(L::splat(f32::MAX));
         L::select(good, next, value).store_to(chunk.values[c], i);
         L::select(good, m, m0).store_to(chunk.first[c], i);
         L::select(good, v, v0).store_to(chunk.second[c], i);

@@ -4,11 +4,13 @@
 //! exactly from one front-to-back walk: `δ = -α·dI/dα`, with `dI/dα = T·c - (what lies behind) / (1 - α)`. All sums here are
 //! over pixels, of squares, which a gradient of the loss (a sum of signed terms) cannot give.
 
+use std::hint::cold_path;
+
 use rayon::prelude::*;
 
 use super::bin::TILE;
 use super::project::at;
-use super::rasterize::{Alpha, BLOCKS, Moments, Plane, Spread, TileInput, lane_offsets};
+use super::rasterize::{AHEAD, BLOCKS, Moments, Plane, Spread, TileInput, lane_offsets};
 use super::simd::Lanes;
 use super::{CHUNK, Renderer, simd};
 use crate::{Contributions, TRANSMITTANCE_MIN, each, kernel};
@@ -94,15 +96,17 @@ kernel!(fn contribute(tile: &TileInput, band: &Band, out: &mut [Moments]) = cont
 fn contribute_lanes<L: Lanes>(tile: &TileInput, band: &Band, out: &mut [Moments]) {
     let (mut live, mut alive) = tile.start();
     // The colour behind the splats seen so far; at first all of it.
-    let mut behind = [[[0.0; 16]; BLOCKS]; 3];
-    let mut weights: Plane = [[1.0; 16]; BLOCKS];
+    let mut behind = [Plane::filled(0.0); 3];
+    let mut weights = Plane::filled(1.0);
     for c in 0..3 {
         tile.gather(band.colour[c], 1.0, &mut behind[c]);
     }
     tile.gather(band.weights, 1.0, &mut weights);
 
+    let mut alphas = Plane::filled(0.0);
     let (lane_x, lane_y) = lane_offsets::<L>();
-    for (pair, out) in tile.pairs.iter().zip(out) {
+    for (n, (pair, out)) in tile.pairs.iter().zip(out).enumerate() {
+        tile.fetch(n + AHEAD);
         *out = Moments::default();
         let mut blocks = u32::from(pair.blocks) & alive;
         if blocks == 0 {
@@ -112,11 +116,12 @@ fn contribute_lanes<L: Lanes>(tile: &TileInput, band: &Band, out: &mut [Moments]
         let spread = Spread::<L>::new(r, tile);
         let own = r[at::OWN] > 0.0;
         let opacity = L::splat(r[at::LOG2_OPACITY]).exp2();
+        spread.alphas(blocks, lane_x, lane_y, &mut alphas);
         let mut sums = [L::zero(); 16];
         while blocks != 0 {
             let b = blocks.trailing_zeros() as usize & (BLOCKS - 1);
             blocks &= blocks - 1;
-            let Alpha { alpha, .. } = spread.alpha(b, lane_x, lane_y);
+            let alpha = L::load(&alphas[b]);
             let t = L::load(&live[b]);
             let weight = alpha * t;
             let next = t - weight;
@@ -124,6 +129,7 @@ fn contribute_lanes<L: Lanes>(tile: &TileInput, band: &Band, out: &mut [Moments]
             let weight = weight.unless_le(next, end);
             next.unless_le(next, end).store(&mut live[b]);
             if next.all_le(end) {
+                cold_path();
                 alive &= !(1 << b);
             }
             let rest = each!(c in [0, 1, 2] => {

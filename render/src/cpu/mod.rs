@@ -24,8 +24,9 @@ use crate::{Contributions, Frame, Gradients, Options, Stages, Upstream};
 use bin::{Bins, SortScratch, TILE};
 use project::{Projected, View};
 use project_backward::Sink;
-use rasterize::{BackwardBand, Band, Moments, TileInput, Visited};
+use rasterize::{AHEAD, BackwardBand, Band, Moments, TileInput, Visited};
 pub use simd::Isa;
+use simd::prefetch;
 
 /// Splats per parallel chunk; a multiple of the lanes.
 const CHUNK: usize = 1024;
@@ -294,21 +295,21 @@ impl Renderer {
         );
     }
 
-    /// Adds up the pairs of each splat, in the order of its tiles.
+    /// Adds up the pairs of each splat, in the order of its tiles. Splats are taken by depth, as pairs are numbered: only the pairs' own
+    /// places then lie anywhere, and those are known ahead.
     fn reduce(&mut self, count: usize) {
         self.rank_splats();
-        self.sums.resize(count, Moments::default());
-        let (bins, seen, rank, moments) = (&self.bins, &self.seen, &self.rank, &self.moments);
+        self.sums.resize(self.order.len(), Moments::default());
+        let (bins, order, moments) = (&self.bins, &self.order, &self.moments);
         self.sums.par_chunks_mut(CHUNK).enumerate().for_each(|(chunk, sums)| {
-            for (n, sum) in sums.iter_mut().enumerate() {
-                let i = chunk * CHUNK + n;
-                if seen[i / simd::LANES] >> (i % simd::LANES) & 1 == 0 {
-                    continue;
-                }
-                let rank = rank[i] as usize;
+            let first = chunk * CHUNK;
+            for (rank, sum) in (first..).zip(sums).filter(|(rank, _)| (order[*rank] as usize) < count) {
                 let mut total = [0.0f32; 16];
-                for &place in &bins.place[bins.emitted[rank] as usize..bins.emitted[rank + 1] as usize] {
-                    for (total, value) in total.iter_mut().zip(&moments[place as usize].0) {
+                let pairs = bins.emitted[rank] as usize..bins.emitted[rank + 1] as usize;
+                for pair in pairs {
+                    let ahead = bins.place.get(pair + AHEAD).and_then(|&place| moments.get(place as usize));
+                    ahead.into_iter().for_each(prefetch);
+                    for (total, value) in total.iter_mut().zip(&moments[bins.place[pair] as usize].0) {
                         *total += value;
                     }
                 }
@@ -348,13 +349,13 @@ impl Renderer {
                 sink.columns.push(chunk);
             }
         }
-        let (isa, seen, sums) = (self.isa, &self.seen, &self.sums);
+        let (isa, seen, sums, rank) = (self.isa, &self.seen, &self.sums, &self.rank);
         let poses: Vec<[f32; 6]> = (sinks.par_iter_mut().enumerate())
             .map(|(chunk, sink)| {
                 let first = chunk * CHUNK;
-                let sums = &sums[first..(first + CHUNK).min(n)];
+                let rank = &rank[first..(first + CHUNK).min(n)];
                 let seen = &seen[first / simd::LANES..];
-                project_backward::project_backward(isa, splats, first, view, options, seen, sums, sink)
+                project_backward::project_backward(isa, splats, first, view, options, seen, rank, sums, sink)
             })
             .collect();
         out.pose = [0.0; 6];

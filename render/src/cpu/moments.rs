@@ -19,7 +19,7 @@ impl Renderer {
         seen.sort_unstable();
         Moments {
             pairs: all.filter(|(_, splat, _)| *splat < own).collect(),
-            splats: seen.into_iter().map(|i| (i, first(&self.sums[i as usize]))).collect(),
+            splats: seen.into_iter().map(|i| (i, first(&self.sums[self.rank[i as usize] as usize]))).collect(),
         }
     }
 }

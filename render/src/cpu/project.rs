@@ -6,7 +6,7 @@
 use scene::{Camera, Splats, column};
 
 use super::sh;
-use super::simd::{LANES, Lanes};
+use super::simd::{LANES, Lanes, prefetch};
 use crate::{ALPHA_MIN, BLUR, NEAR_METRES, Options, each, kernel};
 
 /// Places of the values in a [`Projected`] record.
@@ -238,6 +238,9 @@ fn project_group<L: Lanes>(
     if in_front == 0 || in_front & near_image(splats, i, view, p) == 0 {
         return 0;
     }
+    // More columns than a core expects to walk at once.
+    let used = column::SH + 3 * scene::splats::sh_coefficients(options.sh_degree);
+    splats.columns()[..used].iter().filter_map(|column| column.get(i + LANES - 1)).for_each(prefetch);
     let e = ewa(splats, i, view, p);
     let inv_det = L::splat(1.0) / e.det1;
     let mut opacity = opacity::<L>(splats, i);

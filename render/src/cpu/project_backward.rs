@@ -8,7 +8,7 @@ use scene::{Splats, column};
 use super::project::{Ewa, View, camera_point, directions, dot, ewa, opacity};
 use super::rasterize::{Moments, moment};
 use super::sh;
-use super::simd::{LANES, Lanes};
+use super::simd::{LANES, Lanes, prefetch};
 use crate::{BLUR, Options, each, kernel};
 
 /// Where the gradients of a chunk of splats go.
@@ -21,9 +21,10 @@ pub(crate) struct Sink<'a> {
 }
 
 kernel!(
-    /// Gradients of splats `first ..` from the 2D sums of each; returns the chunk's part of the pose gradient.
+    /// Gradients of splats `first ..` from the 2D sums of each, which lie by depth; returns the chunk's part of the pose gradient.
     pub(crate) fn project_backward(
-        splats: &Splats, first: usize, view: &View, options: &Options, seen: &[u16], sums: &[Moments], sink: &mut Sink,
+        splats: &Splats, first: usize, view: &View, options: &Options, seen: &[u16], rank: &[u32], sums: &[Moments],
+        sink: &mut Sink,
     ) -> [f32; 6] = project_backward_lanes
 );
 
@@ -34,20 +35,26 @@ fn project_backward_lanes<L: Lanes>(
     view: &View,
     options: &Options,
     seen: &[u16],
+    rank: &[u32],
     sums: &[Moments],
     sink: &mut Sink,
 ) -> [f32; 6] {
     let mut pose = [L::zero(); 16];
-    for (group, (sums, &seen)) in sums.chunks(LANES).zip(seen).enumerate() {
+    for (group, (ranks, &seen)) in rank.chunks(LANES).zip(seen).enumerate() {
         let at = group * LANES;
+        // Of splats that were not seen the rank is any.
+        let ahead = rank.get(at + LANES..).unwrap_or(&[]);
+        ahead.iter().take(LANES).filter_map(|&rank| sums.get(rank as usize)).for_each(prefetch);
+        let columns = splats.columns()[..sink.columns.len()].iter().filter_map(|column| column.get(first + at + LANES));
+        columns.chain(sink.columns.iter().filter_map(|column| column.get(at + LANES))).for_each(prefetch);
         if seen == 0 {
-            let range = at..at + sums.len();
+            let range = at..at + ranks.len();
             for column in sink.columns.iter_mut().chain([&mut sink.screen, &mut sink.screen_abs, &mut sink.weight]) {
                 column[range.clone()].fill(0.0);
             }
             continue;
         }
-        backward_group::<L>(splats, first + at, at, view, options, seen, sums, sink, &mut pose);
+        backward_group::<L>(splats, first + at, at, view, options, seen, ranks, sums, sink, &mut pose);
     }
     L::sums(&pose).to_array()[..6].try_into().expect("six of sixteen")
 }
@@ -60,15 +67,16 @@ fn backward_group<L: Lanes>(
     view: &View,
     options: &Options,
     seen: u16,
+    ranks: &[u32],
     sums: &[Moments],
     sink: &mut Sink,
     pose: &mut [L; 16],
 ) {
     let (half, one, two) = (L::splat(0.5), L::splat(1.0), L::splat(2.0));
     let mut lanes = [[0.0; 16]; 16];
-    for (lane, sum) in sums.iter().enumerate() {
+    for (lane, &rank) in ranks.iter().enumerate() {
         if seen >> lane & 1 == 1 {
-            for (m, value) in sum.0.iter().enumerate() {
+            for (m, value) in sums[rank as usize].0.iter().enumerate() {
                 lanes[m][lane] = *value;
             }
         }

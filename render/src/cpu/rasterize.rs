@@ -5,18 +5,48 @@
 //! back-to-front pass is needed (the replay of Taming-3DGS and Brush, on lanes instead of threads). A pair's gradient is
 //! the sums over its pixels of a few moments; the conic's and the mean's gradients are linear in them.
 
+use std::hint::cold_path;
+use std::ops::{Index, IndexMut};
+
 use super::bin::{Pair, TILE};
 use super::project::{Projected, at};
 use super::simd::{Lanes, prefetch};
-use crate::{ALPHA_MAX, ALPHA_MIN, Frame, TRANSMITTANCE_MIN, Upstream, each, kernel};
+use crate::{ALPHA_MAX, ALPHA_MIN, Frame, TRANSMITTANCE_MIN, Upstream, kernel};
 
 /// Pairs ahead whose records are fetched.
-const AHEAD: usize = 12;
+pub(crate) const AHEAD: usize = 12;
 /// Blocks in a tile, lanes in a block.
 pub(crate) const BLOCKS: usize = 16;
 
-/// Sixteen blocks of sixteen pixels.
-pub(crate) type Plane = [[f32; 16]; BLOCKS];
+/// Left column and top row of each block in its tile.
+const BLOCK_X: [f32; BLOCKS] = [0.0, 4.0, 8.0, 12.0, 0.0, 4.0, 8.0, 12.0, 0.0, 4.0, 8.0, 12.0, 0.0, 4.0, 8.0, 12.0];
+const BLOCK_Y: [f32; BLOCKS] = [0.0, 0.0, 0.0, 0.0, 4.0, 4.0, 4.0, 4.0, 8.0, 8.0, 8.0, 8.0, 12.0, 12.0, 12.0, 12.0];
+
+/// Sixteen blocks of sixteen pixels, each a cache line of its own: a register's load that crosses two costs twice.
+#[derive(Clone, Copy)]
+#[repr(align(64))]
+pub(crate) struct Plane([[f32; 16]; BLOCKS]);
+
+impl Plane {
+    pub(crate) fn filled(value: f32) -> Self {
+        Self([[value; 16]; BLOCKS])
+    }
+}
+
+impl Index<usize> for Plane {
+    type Output = [f32; 16];
+    #[inline(always)]
+    fn index(&self, block: usize) -> &[f32; 16] {
+        &self.0[block]
+    }
+}
+
+impl IndexMut<usize> for Plane {
+    #[inline(always)]
+    fn index_mut(&mut self, block: usize) -> &mut [f32; 16] {
+        &mut self.0[block]
+    }
+}
 
 /// Places of the moments in a pair's gradient; `v = dL/dα · α`, `w = α T`.
 pub(crate) mod moment {
@@ -78,7 +108,7 @@ impl TileInput<'_> {
 
     /// Begins to bring the record of a pair from memory: in depth order they lie anywhere.
     #[inline(always)]
-    fn fetch(&self, pair: usize) {
+    pub(crate) fn fetch(&self, pair: usize) {
         let record = self.pairs.get(pair).and_then(|pair| self.ranked.get(pair.rank as usize));
         record.into_iter().for_each(prefetch);
     }
@@ -98,36 +128,42 @@ impl TileInput<'_> {
     #[inline(always)]
     fn scatter(&self, from: &Plane, plane: &mut [f32]) {
         self.runs(|block, lane, count, offset| {
-            plane[offset..offset + count].copy_from_slice(&from[block][lane..lane + count]);
+            let from = &from[block][lane..lane + 4];
+            match plane.get_mut(offset..offset + 4).filter(|_| count == 4) {
+                // Of a length that is known, so no call.
+                Some(whole) => whole.copy_from_slice(from),
+                None => plane[offset..offset + count].copy_from_slice(&from[..count]),
+            }
         });
     }
 
     /// Transmittance one inside the image, zero outside: pixels that do not exist are finished from the start.
     #[inline(always)]
     pub(crate) fn start(&self) -> (Plane, u32) {
-        let mut live = [[0.0; 16]; BLOCKS];
+        let mut live = Plane::filled(0.0);
         self.runs(|block, lane, count, _| live[block][lane..lane + count].fill(1.0));
-        let alive = live.iter().enumerate().fold(0, |mask, (b, lanes)| mask | (u32::from(lanes[0] > 0.0) << b));
+        let alive = live.0.iter().enumerate().fold(0, |mask, (b, lanes)| mask | (u32::from(lanes[0] > 0.0) << b));
         (live, alive)
     }
 }
 
-/// Of each block the last pair of a splat under training that touches it, `u32::MAX` where there is none; and the mask of the
-/// blocks that have one. What lies behind it, or where there is none, is of no gradient.
-pub(crate) fn last_own(pairs: &[Pair]) -> ([u32; BLOCKS], u32) {
-    let (mut last, mut found) = ([u32::MAX; BLOCKS], 0);
+/// After which pairs which blocks are of no gradient any more: what lies behind the last splat under training that touches a
+/// block, or where there is none. Ascending, and ended by a pair that is never reached; and the mask of the blocks that have one.
+pub(crate) fn ends_of_own(pairs: &[Pair]) -> ([(u32, u32); BLOCKS + 1], u32) {
+    let (mut ends, mut first, mut found) = ([(u32::MAX, 0); BLOCKS + 1], BLOCKS, 0);
     for (n, pair) in pairs.iter().enumerate().rev().filter(|(_, pair)| pair.own) {
-        let mut blocks = u32::from(pair.blocks) & !found;
-        found |= blocks;
-        while blocks != 0 {
-            last[blocks.trailing_zeros() as usize & (BLOCKS - 1)] = n as u32;
-            blocks &= blocks - 1;
+        let blocks = u32::from(pair.blocks) & !found;
+        if blocks != 0 {
+            found |= blocks;
+            first -= 1;
+            ends[first] = (n as u32, blocks);
         }
         if found == 0xffff {
             break;
         }
     }
-    (last, found)
+    ends.rotate_left(first);
+    (ends, found)
 }
 
 /// What a tile's pixels took before all of them were finished.
@@ -137,14 +173,6 @@ pub(crate) struct Visited {
     pub(crate) pairs: u32,
     /// Blocks of pixels, each for one pair.
     pub(crate) blocks: u32,
-}
-
-/// α of sixteen pixels under a splat, zero where it is skipped; dx, dy from its mean; and α before it was clamped or skipped.
-pub(crate) struct Alpha<L> {
-    pub(crate) alpha: L,
-    pub(crate) dx: L,
-    pub(crate) dy: L,
-    pub(crate) raw: L,
 }
 
 /// A splat's record spread over lanes.
@@ -171,15 +199,25 @@ impl<L: Lanes> Spread<L> {
         }
     }
 
+    /// dx, dy of a block's pixels from the mean.
     #[inline(always)]
-    pub(crate) fn alpha(&self, block: usize, lane_x: L, lane_y: L) -> Alpha<L> {
-        let dx = lane_x + L::splat(self.x + (block % 4 * 4) as f32);
-        let dy = lane_y + L::splat(self.y + (block / 4 * 4) as f32);
-        let (u, v) = (self.a.fma(dx, self.b * dy), self.c * dy);
-        let exponent = (-u).fma(u, (-v).fma(v, self.log2_opacity));
-        let raw = exponent.exp2();
-        let alpha = raw.min(L::splat(ALPHA_MAX)).where_le(L::splat(ALPHA_MIN), raw);
-        Alpha { alpha, dx, dy, raw }
+    pub(crate) fn offset(&self, block: usize, lane_x: L, lane_y: L) -> (L, L) {
+        (lane_x + L::splat(self.x + BLOCK_X[block]), lane_y + L::splat(self.y + BLOCK_Y[block]))
+    }
+
+    /// α of the pixels of some blocks, zero where the splat is skipped. A loop of its own: nothing in it waits for what came before,
+    /// so a core works at several blocks at once. With the blending in one loop the chain of a block is so long that it did not.
+    #[inline(always)]
+    pub(crate) fn alphas(&self, mut blocks: u32, lane_x: L, lane_y: L, out: &mut Plane) {
+        while blocks != 0 {
+            let b = blocks.trailing_zeros() as usize & (BLOCKS - 1);
+            blocks &= blocks - 1;
+            let (dx, dy) = self.offset(b, lane_x, lane_y);
+            let (u, v) = (self.a.fma(dx, self.b * dy), self.c * dy);
+            let exponent = (-u).fma(u, (-v).fma(v, self.log2_opacity));
+            let raw = exponent.exp2_at_most();
+            raw.min(L::splat(ALPHA_MAX)).where_le(L::splat(ALPHA_MIN), raw).store(&mut out[b]);
+        }
     }
 }
 
@@ -207,10 +245,10 @@ fn rasterize_lanes<L: Lanes>(tile: &TileInput, background: &[f32; 3], extras: bo
 #[inline(always)]
 fn rasterize_tile<L: Lanes, const EXTRAS: bool>(tile: &TileInput, background: &[f32; 3], band: &mut Band) -> Visited {
     let (mut live, mut alive) = tile.start();
-    let mut last: Plane = live; // the transmittance that is kept once a pixel is finished
-    let mut colour = [[[0.0; 16]; BLOCKS]; 3];
-    let mut depth: Plane = [[0.0; 16]; BLOCKS];
-    let mut own: Plane = [[0.0; 16]; BLOCKS];
+    let mut colour = [Plane::filled(0.0); 3];
+    let mut depth = Plane::filled(0.0);
+    let mut own = Plane::filled(0.0);
+    let mut alphas = Plane::filled(0.0);
     let (lane_x, lane_y) = lane_offsets::<L>();
 
     let mut visited = Visited::default();
@@ -227,17 +265,18 @@ fn rasterize_tile<L: Lanes, const EXTRAS: bool>(tile: &TileInput, background: &[
         }
         let r = &tile.ranked[pair.rank as usize].0;
         let spread = Spread::<L>::new(r, tile);
+        spread.alphas(blocks, lane_x, lane_y, &mut alphas);
         while blocks != 0 {
             let b = blocks.trailing_zeros() as usize & (BLOCKS - 1);
             blocks &= blocks - 1;
-            let Alpha { alpha, .. } = spread.alpha(b, lane_x, lane_y);
-            let t = L::load(&live[b]);
+            let alpha = L::load(&alphas[b]);
+            let kept = L::load(&live[b]);
+            let t = kept.max(L::zero());
             let weight = alpha * t;
             let next = t - weight;
             let end = L::splat(TRANSMITTANCE_MIN);
             let weight = weight.unless_le(next, end);
-            next.unless_le(next, end).store(&mut live[b]);
-            (L::load(&last[b]) - weight).store(&mut last[b]);
+            next.or_if_le(next, end, kept.min(-kept)).store(&mut live[b]);
             for c in 0..3 {
                 weight.fma(L::splat(r[at::RED + c]), L::load(&colour[c][b])).store(&mut colour[c][b]);
             }
@@ -246,13 +285,15 @@ fn rasterize_tile<L: Lanes, const EXTRAS: bool>(tile: &TileInput, background: &[
                 weight.fma(L::splat(r[at::OWN]), L::load(&own[b])).store(&mut own[b]);
             }
             if next.all_le(end) {
+                cold_path();
                 alive &= !(1 << b);
             }
         }
     }
 
     for b in 0..BLOCKS {
-        let t = L::load(&last[b]);
+        let t = L::load(&live[b]).abs();
+        t.store(&mut live[b]);
         for c in 0..3 {
             t.fma(L::splat(background[c]), L::load(&colour[c][b])).store(&mut colour[c][b]);
         }
@@ -260,7 +301,7 @@ fn rasterize_tile<L: Lanes, const EXTRAS: bool>(tile: &TileInput, background: &[
     for c in 0..3 {
         tile.scatter(&colour[c], band.colour[c]);
     }
-    tile.scatter(&last, band.transmittance);
+    tile.scatter(&live, band.transmittance);
     if EXTRAS {
         tile.scatter(&depth, band.depth);
         tile.scatter(&own, band.own);
@@ -313,7 +354,8 @@ fn rasterize_backward_lanes<L: Lanes>(tile: &TileInput, band: &BackwardBand, out
 #[inline(always)]
 fn rasterize_backward_tile<L: Lanes, const DEPTH: bool>(tile: &TileInput, band: &BackwardBand, out: &mut [Moments]) {
     let (mut live, mut alive) = tile.start();
-    let (last, owned) = last_own(tile.pairs);
+    let (ends, owned) = ends_of_own(tile.pairs);
+    let mut ended = 0;
     alive &= owned;
     if alive == 0 {
         return out
@@ -322,13 +364,13 @@ fn rasterize_backward_tile<L: Lanes, const DEPTH: bool>(tile: &TileInput, band: 
             .filter(|(_, pair)| pair.own)
             .for_each(|(out, _)| *out = Moments::default());
     }
-    let mut d_colour = [[[0.0; 16]; BLOCKS]; 3];
-    let mut d_depth: Plane = [[0.0; 16]; BLOCKS];
+    let mut d_colour = [Plane::filled(0.0); 3];
+    let mut d_depth = Plane::filled(0.0);
     for c in 0..3 {
         tile.gather(band.d_colour[c], 1.0, &mut d_colour[c]);
     }
     // What lies behind the splats seen so far, weighted by the upstream gradient; at first all of it.
-    let mut behind: Plane = [[0.0; 16]; BLOCKS];
+    let mut behind = Plane::filled(0.0);
     let mut product = |value: &[f32], gradient: &[f32]| {
         if !gradient.is_empty() {
             tile.runs(|block, lane, count, offset| {
@@ -347,12 +389,18 @@ fn rasterize_backward_tile<L: Lanes, const DEPTH: bool>(tile: &TileInput, band: 
         tile.gather(band.d_depth, 1.0, &mut d_depth);
     }
 
+    let [mut alphas, mut vs, mut weights] = [Plane::filled(0.0); 3];
     let (lane_x, lane_y) = lane_offsets::<L>();
     for (n, (pair, out)) in tile.pairs.iter().zip(out).enumerate() {
         if pair.own {
             *out = Moments::default();
         }
-        let mut blocks = u32::from(pair.blocks) & alive;
+        tile.fetch(n + AHEAD);
+        if ends[ended].0 < n as u32 {
+            alive &= !ends[ended].1;
+            ended += 1;
+        }
+        let blocks = u32::from(pair.blocks) & alive;
         if blocks == 0 {
             continue;
         }
@@ -363,28 +411,28 @@ fn rasterize_backward_tile<L: Lanes, const DEPTH: bool>(tile: &TileInput, band: 
         let (a, b, c) = (r[at::A], r[at::B], r[at::C]);
         let (a2, b1, c2) =
             (L::splat(2.0 * ln2 * a * a), L::splat(2.0 * ln2 * a * b), L::splat(2.0 * ln2 * (b * b + c * c)));
-        let mut sums = [L::zero(); 16];
-        while blocks != 0 {
-            let b = blocks.trailing_zeros() as usize & (BLOCKS - 1);
-            blocks &= blocks - 1;
-            let Alpha { alpha, dx, dy, raw } = spread.alpha(b, lane_x, lane_y);
+        spread.alphas(blocks, lane_x, lane_y, &mut alphas);
+        let (mut visits, mut rest_of) = (blocks, blocks);
+        while rest_of != 0 {
+            let b = rest_of.trailing_zeros() as usize & (BLOCKS - 1);
+            rest_of &= rest_of - 1;
+            let alpha = L::load(&alphas[b]);
             let t = L::load(&live[b]);
             let weight = alpha * t;
             let next = t - weight;
             let end = L::splat(TRANSMITTANCE_MIN);
             let weight = weight.unless_le(next, end);
             next.unless_le(next, end).store(&mut live[b]);
-            if last[b] == n as u32 || next.all_le(end) {
+            if next.all_le(end) {
+                cold_path();
                 alive &= !(1 << b);
             }
-            let gradient = each!(c in [0, 1, 2] => L::load(&d_colour[c][b]));
-            let mut along = gradient[0].fma(
+            let mut along = L::load(&d_colour[0][b]).fma(
                 L::splat(r[at::RED]),
-                gradient[1].fma(L::splat(r[at::GREEN]), gradient[2] * L::splat(r[at::BLUE])),
+                L::load(&d_colour[1][b]).fma(L::splat(r[at::GREEN]), L::load(&d_colour[2][b]) * L::splat(r[at::BLUE])),
             );
-            let g_depth = L::load(&d_depth[b]);
             if DEPTH {
-                along = g_depth.fma(L::splat(r[at::Z]), along);
+                along = L::load(&d_depth[b]).fma(L::splat(r[at::Z]), along);
             }
             let rest = L::load(&behind[b]) - weight * along;
             rest.store(&mut behind[b]);
@@ -393,7 +441,19 @@ fn rasterize_backward_tile<L: Lanes, const DEPTH: bool>(tile: &TileInput, band: 
             }
             // α dL/dα = α (T·along - rest / (1 - α)); zero where clamped, finished or skipped.
             let d_alpha = t * along - rest * (L::splat(1.0) - alpha).recip();
-            let v = (alpha * d_alpha).unless_le(next, end).unless_le(L::splat(ALPHA_MAX), raw);
+            let v = (alpha * d_alpha).unless_le(next, end).unless_le(L::splat(ALPHA_MAX), alpha);
+            v.store(&mut vs[b]);
+            weight.store(&mut weights[b]);
+        }
+        if !pair.own {
+            continue;
+        }
+        let mut sums = [L::zero(); 16];
+        while visits != 0 {
+            let b = visits.trailing_zeros() as usize & (BLOCKS - 1);
+            visits &= visits - 1;
+            let (v, weight) = (L::load(&vs[b]), L::load(&weights[b]));
+            let (dx, dy) = spread.offset(b, lane_x, lane_y);
             let (vx, vy) = (v * dx, v * dy);
             sums[moment::V] = sums[moment::V] + v;
             sums[moment::VX] = sums[moment::VX] + vx;
@@ -402,17 +462,15 @@ fn rasterize_backward_tile<L: Lanes, const DEPTH: bool>(tile: &TileInput, band: 
             sums[moment::VXY] = vx.fma(dy, sums[moment::VXY]);
             sums[moment::VYY] = vy.fma(dy, sums[moment::VYY]);
             for c in 0..3 {
-                sums[moment::RED + c] = weight.fma(gradient[c], sums[moment::RED + c]);
+                sums[moment::RED + c] = weight.fma(L::load(&d_colour[c][b]), sums[moment::RED + c]);
             }
             if DEPTH {
-                sums[moment::Z] = weight.fma(g_depth, sums[moment::Z]);
+                sums[moment::Z] = weight.fma(L::load(&d_depth[b]), sums[moment::Z]);
             }
             sums[moment::WEIGHT] = sums[moment::WEIGHT] + weight;
             sums[moment::ABS_X] = sums[moment::ABS_X] + a2.fma(vx, b1 * vy).abs();
             sums[moment::ABS_Y] = sums[moment::ABS_Y] + c2.fma(vy, b1 * vx).abs();
         }
-        if pair.own {
-            L::sums(&sums).store(&mut out.0);
-        }
+        L::sums(&sums).store(&mut out.0);
     }
 }

@@ -160,13 +160,28 @@ pub trait Lanes:
     fn unless_le(self, a: Self, b: Self) -> Self {
         Self::select(a.le(b), Self::zero(), self)
     }
+    /// `other` where `a <= b`, `self` elsewhere (and where one of them is NaN).
+    #[inline(always)]
+    fn or_if_le(self, a: Self, b: Self, other: Self) -> Self {
+        Self::select(a.le(b), other, self)
+    }
     /// `self <= b` in every lane.
     #[inline(always)]
     fn all_le(self, b: Self) -> bool {
         self.le(b) == u16::MAX
     }
     /// 2^self, relative error below 3e-7 for exponents in -126 ..= 126; clamped outside.
-    fn exp2(self) -> Self;
+    #[inline(always)]
+    fn exp2(self) -> Self {
+        self.max(Self::splat(-126.0)).min(Self::splat(126.0)).exp2_in_range()
+    }
+    /// The same for exponents up to 126. Below -126 it comes out as at most 2^-126, and may be NaN where `self` is not finite.
+    #[inline(always)]
+    fn exp2_at_most(self) -> Self {
+        self.max(Self::splat(-126.0)).exp2_in_range()
+    }
+    /// The same for exponents in -126 ..= 126.
+    fn exp2_in_range(self) -> Self;
     /// 1 / self, relative error below 2e-7, for normal numbers.
     fn recip(self) -> Self;
     /// Sums of the sixteen vectors: lane `i` of the result is the sum over the lanes of `v[i]`, added in a fixed order.
@@ -344,12 +359,11 @@ impl Lanes for Portable {
         Self(std::array::from_fn(|i| if mask >> i & 1 == 1 { a.0[i] } else { b.0[i] }))
     }
     #[inline(always)]
-    fn exp2(self) -> Self {
+    fn exp2_in_range(self) -> Self {
         // Adding 1.5·2^23 rounds to an integer that then sits in the low bits.
         const MAGIC: f32 = 12_582_912.0;
-        let x = self.max(Self::splat(-126.0)).min(Self::splat(126.0));
-        let shifted = x + Self::splat(MAGIC);
-        let f = x - (shifted - Self::splat(MAGIC));
+        let shifted = self + Self::splat(MAGIC);
+        let f = self - (shifted - Self::splat(MAGIC));
         let mut p = Self::splat(EXP2[0]);
         for c in &EXP2[1..] {
             p = p.fma(f, Self::splat(*c));
@@ -452,10 +466,14 @@ mod x86 {
             Self(unsafe { _mm512_mask_blend_ps(mask, b.0, a.0) })
         }
         #[inline(always)]
-        fn exp2(self) -> Self {
-            let x = self.max(Self::splat(-126.0)).min(Self::splat(126.0));
-            let whole = unsafe { _mm512_roundscale_ps::<0>(x.0) };
-            let f = x - Self(whole);
+        fn exp2_at_most(self) -> Self {
+            // Scaling saturates by itself.
+            self.exp2_in_range()
+        }
+        #[inline(always)]
+        fn exp2_in_range(self) -> Self {
+            let whole = unsafe { _mm512_roundscale_ps::<0>(self.0) };
+            let f = self - Self(whole);
             let mut p = Self::splat(EXP2[0]);
             for c in &EXP2[1..] {
                 p = p.fma(f, Self::splat(*c));
@@ -609,6 +627,13 @@ mod x86 {
             }
         }
         #[inline(always)]
+        fn or_if_le(self, a: Self, b: Self, other: Self) -> Self {
+            unsafe {
+                let (lo, hi) = (_mm256_cmp_ps::<_CMP_LE_OQ>(a.0, b.0), _mm256_cmp_ps::<_CMP_LE_OQ>(a.1, b.1));
+                Self(_mm256_blendv_ps(self.0, other.0, lo), _mm256_blendv_ps(self.1, other.1, hi))
+            }
+        }
+        #[inline(always)]
         fn all_le(self, b: Self) -> bool {
             unsafe {
                 let (lo, hi) = (_mm256_cmp_ps::<_CMP_LE_OQ>(self.0, b.0), _mm256_cmp_ps::<_CMP_LE_OQ>(self.1, b.1));
@@ -616,10 +641,9 @@ mod x86 {
             }
         }
         #[inline(always)]
-        fn exp2(self) -> Self {
-            let x = self.max(Self::splat(-126.0)).min(Self::splat(126.0));
-            let whole = Self(Self::round(x.0), Self::round(x.1));
-            let f = x - whole;
+        fn exp2_in_range(self) -> Self {
+            let whole = Self(Self::round(self.0), Self::round(self.1));
+            let f = self - whole;
             let mut p = Self::splat(EXP2[0]);
             for c in &EXP2[1..] {
                 p = p.fma(f, Self::splat(*c));
