@@ -1,5 +1,4 @@
-//! The variants of training that `plat bench ablate` compares: each takes away one of the recipe's accelerations, or turns on one
-//! that it has a switch for.
+//! The variants of training that `plat bench ablate` compares: each takes away one of the recipe's accelerations.
 //!
 //! To add one: a row here.
 
@@ -21,7 +20,7 @@ pub(crate) struct Variant {
 pub(crate) const DEFAULT: &str = "default";
 
 /// All of them.
-pub(crate) const VARIANTS: [Variant; 9] = [
+pub(crate) const VARIANTS: [Variant; 6] = [
     Variant { name: DEFAULT, about: "the recipe as it is", recipe: |recipe| recipe },
     Variant {
         name: "fine",
@@ -51,21 +50,6 @@ pub(crate) const VARIANTS: [Variant; 9] = [
         name: "all-growth",
         about: "growth to the budget, whatever it brings; without its early end (train/src/need.rs)",
         recipe: |recipe| Recipe { growth: Growth { worth_db: 0.0, ..recipe.growth }, ..recipe },
-    },
-    Variant {
-        name: "rare-colours",
-        about: "coefficients beyond the constant one move every fourth step (Taming 3DGS, Mallick et al. 2024)",
-        recipe: |recipe| Recipe { sh_every: 4, ..recipe },
-    },
-    Variant {
-        name: "by-error",
-        about: "views that are off get more steps than those that are not (after SkipGS, which leaves converged views out)",
-        recipe: |recipe| Recipe { by_error: 0.7, ..recipe },
-    },
-    Variant {
-        name: "views-agree",
-        about: "only splats that show in what is off in several views are split (FastGS, Ren et al. 2025)",
-        recipe: |recipe| Recipe { growth: Growth { consistent_views: 8, ..recipe.growth }, ..recipe },
     },
 ];
 

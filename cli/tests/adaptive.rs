@@ -2,7 +2,7 @@
 
 mod common;
 
-use blocks::Plan;
+use blocks::{Plan, Task};
 use city::CitySettings;
 use common::json_of;
 use dataset::rehearse::{self, Settings};
@@ -28,14 +28,18 @@ fn a_plain_stays_coarse_beside_houses() {
     let result = |out: &str, BlockId { level, x, y }: BlockId| -> Splats {
         frame::decode_splats(&bytes(&format!("{out}/model/blocks/{level}-{x}-{y}.plat"))).unwrap()
     };
-    // A settled block has the splats that its parent had there: nothing was added.
-    let owned = |splats: &Splats, block: BlockId| {
-        (0..splats.len()).filter(|&i| plan.ground.owns(block, splats.mean(i).as_dvec3())).count()
+    // A settled block has the splats that its parent had there: nothing was added. Along a face it has those of a neighbour that was
+    // trained before it.
+    let owned = |splats: &Splats, task: &Task| {
+        let place = |i: usize| splats.mean(i).as_dvec3();
+        let of_block =
+            |i: &usize| plan.ground.owns(task.block, place(*i)) && task.lender(&plan.ground, place(*i)).is_none();
+        (0..splats.len()).filter(of_block).count()
     };
     let (mut settled, mut refined) = (Vec::new(), Vec::new());
     for task in plan.tasks.iter().filter(|task| task.block.level == 2) {
-        let of_parent = owned(&result("adaptive", task.parent.unwrap()), task.block);
-        let grown = owned(&result("adaptive", task.block), task.block) > of_parent;
+        let of_parent = owned(&result("adaptive", task.parent.unwrap()), task);
+        let grown = owned(&result("adaptive", task.block), task) > of_parent;
         let west = plan.ground.core(task.block).centre().x < -10.0;
         if grown { refined.push(west) } else { settled.push(west) }
     }

@@ -210,13 +210,16 @@ impl Job<'_> {
     }
 
     fn store_mips(&self, finest: Pixels, name: &str, path: &Path) -> Result<Memo, IngestError> {
-        let mut memo = Memo { mips: Vec::new(), masked: finest.mask.is_some() };
+        let masked = finest.mask.is_some();
+        let mut encoded = Vec::new();
         mips::for_each(finest, |mip| {
-            let bytes = mips::encode(mip).map_err(|e| at(path, &e))?;
-            let length = bytes.len() as u64;
-            memo.mips.push((self.store.put(bytes)?, length));
+            encoded.push(mips::encode(mip).map_err(|e| at(path, &e))?);
             Ok::<_, IngestError>(())
         })?;
+        let lengths: Vec<u64> = encoded.iter().map(|bytes: &Vec<u8>| bytes.len() as u64).collect();
+        // To a bucket each takes its time, whatever its size.
+        let ids = self.store.put_all(encoded)?;
+        let memo = Memo { mips: ids.into_iter().zip(lengths).collect(), masked };
         self.store.put_name(name, frame::encode(MEMO, &memo, &[]))?;
         Ok(memo)
     }

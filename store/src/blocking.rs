@@ -5,6 +5,7 @@ use std::ops::Range;
 
 use bytes::Bytes;
 use futures::executor::block_on;
+use futures::future::try_join_all;
 use scene::ArtefactId;
 
 use crate::open::Network;
@@ -36,6 +37,14 @@ impl BlockingStore {
         self.wait(|store| async move { store.put(bytes).await })
     }
 
+    /// See [`Store::put`]: all of them side by side.
+    ///
+    /// # Errors
+    /// The first of theirs.
+    pub fn put_all(&self, all: Vec<Vec<u8>>) -> Result<Vec<ArtefactId>, StoreError> {
+        self.wait(|store| async move { try_join_all(all.into_iter().map(|bytes| store.put(bytes.into()))).await })
+    }
+
     /// See [`Store::get`].
     ///
     /// # Errors
@@ -50,6 +59,15 @@ impl BlockingStore {
     /// As there.
     pub fn get_or_discard(&self, id: ArtefactId) -> Result<Option<Bytes>, StoreError> {
         self.wait(|store| async move { store.get_or_discard(id).await })
+    }
+
+    /// See [`Store::get_or_discard`]: all of them side by side.
+    ///
+    /// # Errors
+    /// The first of theirs.
+    pub fn get_all_or_discard(&self, ids: &[ArtefactId]) -> Result<Vec<Option<Bytes>>, StoreError> {
+        let ids = ids.to_vec();
+        self.wait(|store| async move { try_join_all(ids.into_iter().map(|id| store.get_or_discard(id))).await })
     }
 
     /// See [`Store::get_ranges`].

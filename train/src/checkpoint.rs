@@ -13,7 +13,7 @@ use crate::optimiser::Adam;
 /// A checkpoint; the header is [`Header`], the bulk all columns of the splats and of both moments, then what was seen of each
 /// splat since the last refinement: error, weight (f32) and views (u32); then of each
 /// exposure under training its view, its steps (u32), itself and both moments (twelve f32 each).
-const CHECKPOINT: Kind = Kind(*b"ckpt", 2);
+const CHECKPOINT: Kind = Kind(*b"ckpt", 3);
 
 /// All that a step depends on besides its job.
 #[derive(Debug, Clone)]

@@ -6,12 +6,11 @@
 //! "split" with one rule. Counts follow a schedule, not a threshold: a budget is a target, not only a cap.
 
 use glam::{Mat3, Quat, Vec3};
-use render::cpu::Renderer;
-use render::{Gradients, Options};
+use render::Gradients;
 use scene::{Splats, column};
 use serde::{Deserialize, Serialize};
 
-use crate::{TrainError, TrainView, WindowSource, morton};
+use crate::morton;
 
 /// When and how splats are added and removed.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -24,9 +23,6 @@ pub struct Growth {
     pub until: f32,
     /// Growth ends when it brings less than this for each five percent of splats, dB; with 0 not before its time.
     pub worth_db: f32,
-    /// Views that every refinement draws for what is off in them: only splats that show there are split (the multi-view consistency
-    /// of FastGS, Ren et al. 2025); 0 asks none.
-    pub consistent_views: u32,
     /// Most new splats in one refinement, as a share of those there.
     pub at_most: f32,
     /// Splats less opaque than this are removed.
@@ -46,7 +42,6 @@ impl Default for Growth {
             from: 0.05,
             until: 0.7,
             worth_db: 0.02,
-            consistent_views: 0,
             at_most: 0.3,
             min_opacity: 0.01,
             offset: 0.7,
@@ -121,52 +116,6 @@ impl Evidence {
         self.weight.clear();
         self.views.clear();
     }
-}
-
-/// A pixel is off where its error is this share of the view's largest.
-const OFF: f32 = 0.1;
-/// A splat is split where it explains so many of such pixels of a view, on average.
-const OFF_PIXELS: f32 = 1.0;
-
-/// Forgets the evidence of splats that explain hardly any pixel that is off in these views.
-///
-/// # Errors
-/// A window that cannot be read.
-pub(crate) fn only_where_views_agree(
-    evidence: &mut Evidence,
-    splats: &Splats,
-    context: Option<&Splats>,
-    views: &[TrainView],
-    coarser: u8,
-    options: &Options,
-    source: &dyn WindowSource,
-) -> Result<(), TrainError> {
-    let mut renderer = Renderer::default();
-    let mut counts = vec![0.0f32; splats.len()];
-    for view in views {
-        let at = (0..=coarser).rev().find_map(|c| view.at(c));
-        let (mip, rect, camera) = at.expect("at(0) always is");
-        let photo = source.window(view.view, mip, rect).map_err(TrainError::Source)?;
-        let frame = renderer.forward(splats, context, &camera, options);
-        let area = photo.area();
-        let error = |i: usize| -> f32 {
-            let of = |c: usize| (frame.colour[c * area + i] - f32::from(photo.rgb[c * area + i]) / 255.0).abs();
-            let masked = photo.mask.as_ref().is_some_and(|mask| mask[i] < 128);
-            if masked { 0.0 } else { of(0) + of(1) + of(2) }
-        };
-        let errors: Vec<f32> = (0..area).map(error).collect();
-        let largest = errors.iter().copied().fold(0.0, f32::max);
-        let off: Vec<f32> = errors.iter().map(|e| if *e > OFF * largest { 1.0 } else { 0.0 }).collect();
-        let said = renderer.contributions(&off);
-        counts.iter_mut().zip(&said.weight).for_each(|(count, weight)| *count += weight);
-    }
-    evidence.resize(splats.len());
-    for (error, count) in evidence.error.iter_mut().zip(&counts) {
-        if *count < OFF_PIXELS * views.len() as f32 {
-            *error = 0.0;
-        }
-    }
-    Ok(())
 }
 
 /// What a refinement did.

@@ -48,6 +48,11 @@ pub fn thinned(places: &[DVec3], most: usize) -> Vec<usize> {
 /// Splats of a backdrop; 6° apart.
 const BACKDROP: usize = 1024;
 
+/// Standard deviation of a backdrop's splats at this distance.
+pub fn backdrop_size_metres(radius_metres: f64) -> f64 {
+    radius_metres * (4.0 * std::f64::consts::PI / BACKDROP as f64).sqrt() * 0.6
+}
+
 /// A sphere of opaque splats around everything, wherever a view looks, coloured by what the views show in each direction: the sky, and whatever
 /// else no point was found on. It gives every ray something to end in, so that near splats are not stretched to fill
 /// the distance. `centre` and `radius_metres` should enclose cameras and points with room to spare.
@@ -103,7 +108,7 @@ pub fn backdrop(
     let cosine = |a: &[f64; 3], b: &[f64; 3]| a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
     let seen: Vec<&[f64; 3]> = directions.iter().zip(&sums).filter(|(_, sum)| sum[3] > 0.0).map(|(d, _)| d).collect();
     let shown = |direction: &[f64; 3]| seen.iter().any(|other| cosine(direction, other) > beside);
-    let size = radius_metres * (4.0 * std::f64::consts::PI / BACKDROP as f64).sqrt() * 0.6;
+    let size = backdrop_size_metres(radius_metres);
     let mut splats = Splats::new(sh_degree);
     for (direction, sum) in directions.iter().zip(&sums).filter(|(direction, _)| shown(direction)) {
         // At the rim: what all views show on average.

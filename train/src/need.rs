@@ -81,41 +81,9 @@ pub(crate) struct Need {
     pub(crate) tally: Tally,
     /// Of the epochs of this stage: splats at the end, and the mean error in dB.
     epochs: Vec<(u32, f32)>,
-    /// Of each view, where those that are off get more steps: its last error, and what it has waited.
-    views: Vec<[f32; 2]>,
-    /// The tally's sum before the last step.
-    before: f64,
 }
 
 impl Need {
-    /// The view that has waited longest, weighted by its error: each gets steps in proportion to `1 - by_error + by_error *` its
-    /// error over the mean.
-    pub(crate) fn next_view(&mut self, count: usize, by_error: f32) -> usize {
-        self.before = self.tally.sum;
-        if self.views.len() != count {
-            self.views = vec![[f32::INFINITY, 0.0]; count];
-        }
-        let known = self.views.iter().filter(|view| view[0].is_finite());
-        let (sum, seen) = known.fold((0.0, 0.0f32), |(sum, n), view| (sum + view[0], n + 1.0));
-        let mean = (sum / seen.max(1.0)).max(1e-9);
-        let mut total = 0.0;
-        for view in &mut self.views {
-            let weight = if view[0].is_finite() { 1.0 - by_error + by_error * view[0] / mean } else { 1.0 };
-            view[1] += weight;
-            total += weight;
-        }
-        let waited = |view: &[f32; 2]| if view[0].is_finite() { view[1] } else { f32::MAX };
-        let longest =
-            (0..count).fold(0, |best, i| if waited(&self.views[i]) > waited(&self.views[best]) { i } else { best });
-        self.views[longest][1] -= total;
-        longest
-    }
-
-    /// Notes the error of the view that was just looked at.
-    pub(crate) fn saw(&mut self, view: usize) {
-        self.views[view][0] = (self.tally.sum - self.before) as f32;
-    }
-
     /// Ends an epoch of so many steps: its mean error, if none was left out.
     pub(crate) fn end_epoch(&mut self, splats: usize, epoch: u32) -> Option<f64> {
         let Tally { sum, count } = std::mem::take(&mut self.tally);

@@ -71,8 +71,6 @@ pub(crate) struct Step {
     /// Of the window that the photo is.
     pub(crate) camera: Camera,
     pub(crate) options: Options,
-    /// Up to which degree of the spherical harmonics splats are moved.
-    pub(crate) moved_degree: u8,
     pub(crate) rates: Rates,
     /// Of the view, where exposures are given, not trained.
     pub(crate) exposure: Option<Exposure>,

@@ -47,10 +47,6 @@ pub struct Recipe {
     pub needle_pull: f32,
     /// Each entry is the share of the steps after which the next SH degree joins.
     pub sh_from: [f32; 3],
-    /// Coefficients beyond the constant one move every so many steps.
-    pub sh_every: u32,
-    /// How much views that are off get more steps than others: 0 all alike, 1 in proportion to their error.
-    pub by_error: f32,
     /// Each entry is the largest share of the steps that is trained at one mip coarser than the next, coarsest first.
     pub coarse: Vec<f32>,
     /// Finer pixels are looked at once the error is this many times what coarse photos lack (see [`crate::need`]); with 0 only
@@ -76,9 +72,7 @@ impl Default for Recipe {
             beta2: 0.99,
             opacity_pull: 0.0,
             needle_pull: 0.01,
-            sh_from: [0.3, 0.45, 0.6],
-            sh_every: 1,
-            by_error: 0.0,
+            sh_from: [0.1, 0.2, 0.3],
             coarse: vec![0.2, 0.5],
             closer_at: 2.0,
             initial_opacity: 0.1,
@@ -334,22 +328,16 @@ pub fn train_on(
             return Err(TrainError::Empty(step));
         }
         let progress = step as f32 / steps as f32;
-        let picked = match recipe.by_error > 0.0 {
-            true => now.need.next_view(views.len(), recipe.by_error),
-            false => turns.of(step),
-        };
-        let view = &views[picked];
+        let view = &views[turns.of(step)];
         let coarser = (recipe.coarse.len() as u8).saturating_sub(now.need.stage);
         let window = |view: &TrainView| (0..=coarser).rev().find_map(|c| view.at(c)).expect("at(0) always is");
         let (mip, rect, camera) = window(view);
         let photo = job.source.window(view.view, mip, rect).map_err(TrainError::Source)?;
-        if recipe.by_error == 0.0 {
-            while told < steps.min(step + 1 + AHEAD) {
-                let next = &views[turns_ahead.of(told)];
-                let (mip, rect, _) = window(next);
-                job.source.expect(next.view, mip, rect);
-                told += 1;
-            }
+        while told < steps.min(step + 1 + AHEAD) {
+            let next = &views[turns_ahead.of(told)];
+            let (mip, rect, _) = window(next);
+            job.source.expect(next.view, mip, rect);
+            told += 1;
         }
 
         let sh_degree = recipe.sh_from.iter().filter(|&&from| progress >= from).count() as u8;
@@ -360,10 +348,8 @@ pub fn train_on(
             extras: context.is_some(),
         };
         let visits = (steps as f32 / views.len() as f32).max(1.0);
-        let moved = if step.is_multiple_of(recipe.sh_every.max(1)) { options.sh_degree } else { 0 };
         let drawn = Step {
             view: view.view,
-            moved_degree: moved,
             photo,
             camera,
             options,
@@ -372,10 +358,6 @@ pub fn train_on(
             exposure_rate: between(recipe.exposure, progress) / visits,
         };
         side.step(&mut now, drawn)?;
-        if recipe.by_error > 0.0 {
-            side.fetch(&mut now, Part::Tally)?;
-            now.need.saw(picked);
-        }
 
         let growth = &recipe.growth;
         now.step = step + 1;
@@ -404,22 +386,6 @@ pub fn train_on(
         if now.step.is_multiple_of(every) && progress >= growth.from && now.step <= until + every && now.step < steps {
             let target = growth.target(now.step, steps, now.start_count, budget);
             side.fetch(&mut now, Part::All)?;
-            if growth.consistent_views > 0 {
-                let seed = random::bits(job.seed, u64::from(now.step) | 1 << 40);
-                let order = random::shuffle(seed, views.len());
-                let some: Vec<TrainView> =
-                    order.iter().take(growth.consistent_views as usize).map(|&i| views[i as usize]).collect();
-                let options = Options { sh_degree: now.splats.sh_degree(), ..options };
-                growth::only_where_views_agree(
-                    &mut now.evidence,
-                    &now.splats,
-                    context,
-                    &some,
-                    coarser,
-                    &options,
-                    job.source,
-                )?;
-            }
             let (grown, rows, _) = growth::refine(&now.splats, &mut now.evidence, growth, target, counts, keeps);
             now.splats = grown;
             now.adam.rearrange(&rows);

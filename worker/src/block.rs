@@ -344,11 +344,11 @@ impl Block<'_> {
         train::random::bits(self.plan.settings.seed, place)
     }
 
-    /// From a twentieth of a pixel of the block's level to a fifth of the backdrop's distance, three times what it begins with. One of its splats that is let
+    /// From a twentieth of a pixel of the block's level to three times what the backdrop begins with. One of its splats that is let
     /// grow much farther becomes a haze over every photo that looks its way; what has a parent has none of them.
     pub(crate) fn size_bounds_metres(&self, views: &[TrainView]) -> [f32; 2] {
         let largest = match self.task.parent {
-            None => 0.2 * self.surroundings(views).1,
+            None => 3.0 * train::init::backdrop_size_metres(self.surroundings(views).1),
             Some(_) => 0.5 * self.plan.ground.edge_metres,
         };
         [self.task.rho_metres as f32 * 0.05, largest as f32]

@@ -36,7 +36,7 @@ impl<'a> CpuSide<'a> {
 
 impl Side for CpuSide<'_> {
     fn step(&mut self, now: &mut State, step: Step) -> Result<(), TrainError> {
-        let Step { view, photo, camera, options, moved_degree, rates, exposure, exposure_rate } = step;
+        let Step { view, photo, camera, options, rates, exposure, exposure_rate } = step;
         let frame = self.renderer.forward(&now.splats, self.context, &camera, &options);
         pixel_weights(frame, &photo, &mut self.weights);
         let exposure = now.exposures.as_ref().map_or(exposure, |exposures| exposures.of(view));
@@ -58,7 +58,7 @@ impl Side for CpuSide<'_> {
         }
         let gradients = self.renderer.backward(&now.splats, &self.upstream);
         now.evidence.add(gradients, photo.area() as f32);
-        now.adam.step(&mut now.splats, gradients, moved_degree, &rates);
+        now.adam.step(&mut now.splats, gradients, options.sh_degree, &rates);
         now.need.tally.add(value.l1);
         Ok(())
     }

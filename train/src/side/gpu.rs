@@ -178,7 +178,7 @@ impl GpuSide {
             loss_backward.run(&gpu, pass, &bindings, tiles);
         }
         self.renderer.backward(&mut encoder, &self.splats, UpstreamPlanes::default())?;
-        self.move_splats(&mut encoder, step.moved_degree, rates, area);
+        self.move_splats(&mut encoder, options.sh_degree, rates, area);
         self.in_flight.push_back(gpu.submit(encoder)?);
         match self.in_flight.len() > IN_FLIGHT {
             true => self.in_flight.pop_front().map_or(Ok(()), |index| gpu.wait_for(index)),

@@ -50,7 +50,6 @@ fn step(masked: bool, extras: bool, key: u64) -> Step {
     let camera_from_world = Rigid { rotation: DQuat::IDENTITY, translation: DVec3::ZERO };
     Step {
         view: 0,
-        moved_degree: 3,
         photo: Arc::new(Pixels { width, height, rgb, mask }),
         camera: Camera { pinhole, camera_from_world },
         options: Options { extras, sh_degree: 3, ..Options::default() },
