@@ -289,6 +289,11 @@ pub struct Index {
 }
 
 impl Index {
+    /// Bytes that it takes in memory, roughly.
+    pub(crate) fn size(&self) -> usize {
+        4 * self.ends.len() + 64
+    }
+
     /// The ranges of the artefact's bytes that hold a window, in the order in which [`Index::window`] wants them;
     /// neighbouring tiles share one. `None` for a window that is empty or not inside the image.
     pub fn ranges(&self, rect: Rect) -> Option<Vec<Range<u64>>> {

@@ -13,7 +13,7 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, OnceLock, PoisonError};
 use scene::{Capture, CodecError, Pixels, Rect};
 use store::{BlockingStore, StoreError};
 
-use crate::mips::Layout;
+use crate::mips::{Index, Layout};
 
 /// A window that could not be read.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -75,6 +75,39 @@ pub struct WindowStats {
     pub cached_bytes: u64,
 }
 
+/// Where the tiles of mips lie, as far as readers of one capture have learnt: a window of such a mip takes one answer of the store
+/// instead of two. For whoever reads a capture again and again.
+#[derive(Debug, Default)]
+pub struct Indexes(Mutex<Known>);
+
+#[derive(Debug, Default)]
+struct Known {
+    /// By view and mip.
+    indexes: HashMap<(u32, u8), Arc<Index>>,
+    bytes: usize,
+}
+
+impl Indexes {
+    /// What is learnt beyond so many bytes is not kept: the mips of some thousand photos.
+    const LIMIT: usize = 32 << 20;
+
+    fn known(&self) -> MutexGuard<'_, Known> {
+        // A thread that panicked while it held the lock left at worst an index out.
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn of(&self, mip: (u32, u8)) -> Option<Arc<Index>> {
+        self.known().indexes.get(&mip).cloned()
+    }
+
+    fn learn(&self, mip: (u32, u8), index: &Arc<Index>) {
+        let mut known = self.known();
+        if known.bytes + index.size() <= Self::LIMIT && known.indexes.insert(mip, Arc::clone(index)).is_none() {
+            known.bytes += index.size();
+        }
+    }
+}
+
 /// Threads that fetch what is expected: a window takes two answers of the store, one after the other.
 const FETCHERS: usize = 4;
 /// Expected windows that wait for them at most.
@@ -91,9 +124,14 @@ pub struct WindowReader {
 impl WindowReader {
     /// A reader that keeps at most `cache_bytes` bytes of pixels.
     pub fn new(capture: Arc<Capture>, store: BlockingStore, cache_bytes: usize) -> Self {
+        Self::sharing(Arc::default(), capture, store, cache_bytes)
+    }
+
+    /// The same, with what other readers of the capture have learnt of it.
+    pub fn sharing(indexes: Arc<Indexes>, capture: Arc<Capture>, store: BlockingStore, cache_bytes: usize) -> Self {
         let cache = Mutex::new(Cache { limit: cache_bytes, ..Cache::default() });
         let (arrived, stats) = (Condvar::new(), Counters::default());
-        Self { shared: Arc::new(Shared { capture, store, cache, arrived, stats }), fetchers: OnceLock::new() }
+        Self { shared: Arc::new(Shared { capture, store, indexes, cache, arrived, stats }), fetchers: OnceLock::new() }
     }
 
     /// The capture.
@@ -165,6 +203,7 @@ impl train::WindowSource for WindowReader {
 struct Shared {
     capture: Arc<Capture>,
     store: BlockingStore,
+    indexes: Arc<Indexes>,
     cache: Mutex<Cache>,
     /// An expected window came, or failed.
     arrived: Condvar,
@@ -181,10 +220,10 @@ struct Counters {
 }
 
 impl Shared {
-    fn read(&self, (view, mip, rect): Key) -> Result<Arc<Pixels>, WindowError> {
-        let view = match self.capture.views.get(view as usize) {
+    fn read(&self, (number, mip, rect): Key) -> Result<Arc<Pixels>, WindowError> {
+        let view = match self.capture.views.get(number as usize) {
             Some(found) if usize::from(mip) < found.mips.len() => found,
-            _ => return Err(WindowError::Absent { view, mip }),
+            _ => return Err(WindowError::Absent { view: number, mip }),
         };
         let name = || view.name.clone();
         let id = view.mips[usize::from(mip)];
@@ -201,8 +240,15 @@ impl Shared {
         };
         let camera = view.camera.mip(mip).pinhole;
         let layout = Layout { width: camera.width, height: camera.height, masked: view.masked };
-        let head = read(std::slice::from_ref(&(0..layout.index_len() as u64)))?;
-        let index = layout.index(&head[0]).map_err(damaged)?;
+        let index = match self.indexes.of((number, mip)) {
+            Some(index) => index,
+            None => {
+                let head = read(std::slice::from_ref(&(0..layout.index_len() as u64)))?;
+                let index = Arc::new(layout.index(&head[0]).map_err(damaged)?);
+                self.indexes.learn((number, mip), &index);
+                index
+            }
+        };
         let ranges = index.ranges(rect).ok_or_else(|| WindowError::Outside { name: name(), mip, rect })?;
         self.stats.bytes_used.fetch_add(index.bytes_of(rect), Ordering::Relaxed);
         index.window(rect, &read(&ranges)?).map(Arc::new).map_err(damaged)

@@ -101,6 +101,11 @@ impl Store {
         &self.url
     }
 
+    /// Is it reached over a network, so that an answer takes its time, and what was read is worth keeping?
+    pub fn is_far(&self) -> bool {
+        self.network.is_some()
+    }
+
     /// The same store for code that is not async.
     pub fn blocking(&self) -> BlockingStore {
         BlockingStore::new(self.clone())

@@ -11,8 +11,9 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 
 use blocks::{Plan, Task};
+use bytes::Bytes;
 use dataset::ingest::IngestError;
-use dataset::windows::WindowReader;
+use dataset::windows::{Indexes, WindowReader};
 use scene::frame::{self, About};
 use scene::{ArtefactId, BlockId, Capture, Exposures, Splats};
 use store::BlockingStore;
@@ -21,6 +22,7 @@ use train::Backend;
 use crate::block::{Block, Trained};
 use crate::cap::Cap;
 use crate::clock::Stopwatch;
+use crate::kept::Kept;
 use crate::memory::Memory;
 use crate::merged::{Finished, Judge, is_look};
 use crate::metrics::Metrics;
@@ -58,6 +60,9 @@ pub struct Shared {
     pub metrics: Metrics,
 }
 
+/// Of the bound on the cache results of tasks take one part of so many, where the store is far.
+const RESULTS_PART: usize = 4;
+
 /// Trains blocks.
 pub struct BlockTrainer {
     pub(crate) store: BlockingStore,
@@ -66,8 +71,13 @@ pub struct BlockTrainer {
     pub(crate) backend: Backend,
     pool: rayon::ThreadPool,
     /// That of the task before. A city's has tens of megabytes, and the next task is mostly of the same job.
-    capture: Mutex<Option<(ArtefactId, Arc<Capture>)>>,
+    capture: Mutex<Option<KnownCapture>>,
+    /// Results of tasks, where the store is far.
+    kept: Kept,
 }
+
+/// A capture, and where the tiles of its mips lie.
+type KnownCapture = (ArtefactId, Arc<Capture>, Arc<Indexes>);
 
 impl BlockTrainer {
     /// A trainer over this store.
@@ -84,7 +94,9 @@ impl BlockTrainer {
             .num_threads(options.threads.max(1))
             .build()
             .map_err(|error| format!("cannot start {} threads: {error}", options.threads))?;
-        Ok(Self { store, options, shared, backend, pool, capture: Mutex::default() })
+        let near = !store.store().is_far();
+        let kept = Kept::new(if near { 0 } else { options.cache_bytes / RESULTS_PART });
+        Ok(Self { store, options, shared, backend, pool, capture: Mutex::default(), kept })
     }
 
     /// Does something on the trainer's threads.
@@ -108,8 +120,9 @@ impl Execute for BlockTrainer {
             return Err(failed(format!("the plan is for the backend {planned}, this worker computes on {own}")));
         }
         let task = plan.tasks.get(order.task as usize).ok_or_else(|| failed("the plan has no such task"))?;
-        let capture = self.capture(plan.capture)?;
-        let reader = WindowReader::new(capture.clone(), self.store.clone(), self.options.cache_bytes);
+        let (capture, indexes) = self.capture(plan.capture)?;
+        let windows = self.options.cache_bytes - self.kept.limit();
+        let reader = WindowReader::sharing(indexes, capture.clone(), self.store.clone(), windows);
         let (results, given) = self.results(&plan, task, order, report)?;
         let memory = self.options.resume.then(|| Memory::of(order)).filter(|_| self.shared.cap.is_none());
         if let Some((artefact, splats)) = memory.as_ref().and_then(|memory| memory.result(&self.store)) {
@@ -178,18 +191,19 @@ impl Execute for BlockTrainer {
 }
 
 impl BlockTrainer {
-    fn capture(&self, id: ArtefactId) -> Result<Arc<Capture>, ExecuteError> {
+    fn capture(&self, id: ArtefactId) -> Result<(Arc<Capture>, Arc<Indexes>), ExecuteError> {
         let mut kept = self.capture.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some((of, capture)) = &*kept
+        if let Some((of, capture, indexes)) = &*kept
             && *of == id
         {
-            return Ok(capture.clone());
+            return Ok((capture.clone(), indexes.clone()));
         }
         // Not both at once.
         *kept = None;
         let capture = Arc::new(dataset::ingest::load_capture(&self.store, id).map_err(unread)?);
-        *kept = Some((id, capture.clone()));
-        Ok(capture)
+        let indexes = Arc::<Indexes>::default();
+        *kept = Some((id, capture.clone(), indexes.clone()));
+        Ok((capture, indexes))
     }
 
     /// The splats of the blocks that the task needs, and what else its parent hands down.
@@ -212,8 +226,14 @@ impl BlockTrainer {
         });
         let wanted: Vec<_> = wanted.collect::<Result<_, _>>()?;
         for some in wanted.chunks(AT_ONCE) {
-            let ids: Vec<ArtefactId> = some.iter().map(|(.., id)| *id).collect();
-            for (&(block, index, id), found) in some.iter().zip(self.store.get_all_or_discard(&ids)?) {
+            let mut found: Vec<Option<Bytes>> = some.iter().map(|(.., id)| self.kept.get(*id)).collect();
+            let missing: Vec<usize> = (0..some.len()).filter(|&i| found[i].is_none()).collect();
+            let ids: Vec<ArtefactId> = missing.iter().map(|&i| some[i].2).collect();
+            for (i, bytes) in missing.into_iter().zip(self.store.get_all_or_discard(&ids)?) {
+                bytes.iter().for_each(|bytes| self.kept.put(some[i].2, bytes));
+                found[i] = bytes;
+            }
+            for (&(block, index, id), found) in some.iter().zip(found) {
                 let bytes = match found {
                     Some(bytes) => bytes,
                     None => self.make_again(plan, order, index, id, report)?,

@@ -16,6 +16,7 @@ pub mod clock;
 pub mod estimate;
 pub mod execute;
 mod heal;
+mod kept;
 mod link;
 mod memory;
 pub mod merged;
