@@ -10,6 +10,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::exposure::{expose, square_gain};
 use crate::metrics::PSNR_OF_EQUALS;
+use crate::source;
 use crate::{TrainError, TrainView, WindowSource};
 
 /// An order of splats by what they are worth.
@@ -165,9 +166,10 @@ impl<'a> Views<'a> {
     ) -> Result<(), TrainError> {
         let mut renderer = Renderer::default();
         let (mut weights, mut exposed) = (Vec::new(), Vec::new());
-        for (n, view) in self.views.iter().enumerate() {
-            let (mip, rect, camera) = view.at(0).expect("at(0) always is");
-            let photo = self.source.window(view.view, mip, rect).map_err(TrainError::Source)?;
+        let windows = self.views.iter().filter_map(|view| view.at(0).map(|(mip, rect, _)| (view.view, mip, rect)));
+        for ((n, view), photo) in self.views.iter().enumerate().zip(source::each(self.source, windows)) {
+            let (_, _, camera) = view.at(0).expect("at(0) always is");
+            let photo = photo.map_err(TrainError::Source)?;
             let extras = self.context.is_some();
             let sh_degree = splats.sh_degree();
             let options = Options { antialiased: self.antialiased, sh_degree, background: [0.0; 3], extras };

@@ -78,10 +78,10 @@ pub fn backdrop(
         .collect();
     let tree = ImmutableKdTree::<f64, 3>::new_from_slice(&directions).map_err(|_| "no backdrop lattice".to_string())?;
     let mut sums = vec![[0.0f64; 4]; BACKDROP];
-    for view in views {
-        let coarsest = (0..=8).rev().find_map(|c| view.at(c));
-        let Some((mip, rect, camera)) = coarsest else { continue };
-        let photo = source.window(view.view, mip, rect)?;
+    let coarsest = views.iter().filter_map(|view| Some((view.view, (0..=8).rev().find_map(|c| view.at(c))?)));
+    let windows = coarsest.clone().map(|(view, (mip, rect, _))| (view, mip, rect));
+    for ((_, (_, _, camera)), photo) in coarsest.zip(crate::source::each(source, windows)) {
+        let photo = photo?;
         let area = photo.area();
         let world_from_camera = camera.camera_from_world.rotation.inverse();
         for (i, y, x) in (0..area).map(|i| (i, i / photo.width as usize, i % photo.width as usize)) {

@@ -8,6 +8,7 @@
 //! - **Growth that pays.** When the last tenths of growth brought less than [`Growth::worth_db`](crate::growth::Growth::worth_db)
 //!   for each five percent of splats, it ends, and the rest of the schedule follows at once.
 
+use scene::{Camera, Rect};
 use serde::{Deserialize, Serialize};
 
 use crate::{TrainError, TrainView, WindowSource};
@@ -24,12 +25,15 @@ const JUDGED_GROWTH: f64 = 1.3;
 /// A window that cannot be read.
 pub fn detail(views: &[TrainView], source: &dyn WindowSource, coarser: u8) -> Result<f64, TrainError> {
     let (mut sum, mut count) = (0.0, 0.0f64);
-    for view in views.iter().step_by(views.len().div_ceil(DETAIL_VIEWS).max(1)) {
-        let (Some((mip, rect, _)), Some((fine_mip, fine_rect, _))) = (view.at(coarser), view.at(coarser - 1)) else {
-            continue;
-        };
-        let coarse = source.window(view.view, mip, rect).map_err(TrainError::Source)?;
-        let fine = source.window(view.view, fine_mip, fine_rect).map_err(TrainError::Source)?;
+    let some = views.iter().step_by(views.len().div_ceil(DETAIL_VIEWS).max(1));
+    let pairs = some.filter_map(|view| {
+        let of = |(mip, rect, _): (u8, Rect, Camera)| (view.view, mip, rect);
+        Some([view.at(coarser).map(of)?, view.at(coarser - 1).map(of)?])
+    });
+    let mut photos = crate::source::each(source, pairs.clone().flatten());
+    for [(_, _, rect), (_, _, fine_rect)] in pairs {
+        let mut next = || photos.next().unwrap_or_else(|| Err("no window".into())).map_err(TrainError::Source);
+        let (coarse, fine) = (next()?, next()?);
         let (width, fine_width) = (coarse.width as usize, fine.width as usize);
         for y in 0..fine.height {
             for x in 0..fine.width {
@@ -117,7 +121,7 @@ mod tests {
     use std::sync::Arc;
 
     use glam::DVec3;
-    use scene::{Camera, Pinhole, Pixels, Rect, Rigid};
+    use scene::{Pinhole, Pixels, Rigid};
 
     use super::*;
 

@@ -15,6 +15,7 @@ use crate::growth::{self, Evidence, Growth};
 use crate::need::{self, Need};
 use crate::optimiser::{Adam, Rates};
 use crate::side::{Backend, Part, Side, Step};
+use crate::source::AHEAD;
 use crate::{State, WindowSource, random};
 
 /// How a block is trained. Shares are of the number of steps; rates are per step of Adam.
@@ -266,9 +267,6 @@ pub enum TrainError {
     Empty(u32),
 }
 
-/// Steps ahead of which the source hears what window they will ask for.
-const AHEAD: u32 = 8;
-
 /// Trains a block; `report` is called after every step.
 ///
 /// # Errors
@@ -333,7 +331,7 @@ pub fn train_on(
         let window = |view: &TrainView| (0..=coarser).rev().find_map(|c| view.at(c)).expect("at(0) always is");
         let (mip, rect, camera) = window(view);
         let photo = job.source.window(view.view, mip, rect).map_err(TrainError::Source)?;
-        while told < steps.min(step + 1 + AHEAD) {
+        while told < steps.min(step + 1 + AHEAD as u32) {
             let next = &views[turns_ahead.of(told)];
             let (mip, rect, _) = window(next);
             job.source.expect(next.view, mip, rect);
