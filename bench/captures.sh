@@ -1,11 +1,11 @@
 #!/usr/bin/env bash
 # The captures' lines of bench/results: each trained whole and as a tree of one level, three seeds, one thread, nothing pruned.
-# Takes the folder of the captures, and the names of those to train (all where none is named). About a quarter of an hour on one core.
+# Takes the folder of the captures, and the names of those to train (all where none is named). Ten minutes on one core.
 set -euo pipefail
+data=$(realpath "${1:?the folder of the captures}")
+shift
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 plat=${PLAT:-target/release/plat}
-data=${1:?the folder of the captures}
-shift
 
 # Name on the chart, folder, downscale, steps, splats, steps between looks.
 while read -r scene folder downscale steps budget looks; do
