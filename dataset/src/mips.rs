@@ -18,7 +18,7 @@
 //! less the one above it. Measured on the photos of three captures, per core, with tiles of 128: 0.20 to 0.45 of the raw size
 //! and 0.8 to 1.1 GB/s back to pixels; PNG's fast mode takes 0.42 to 0.56 at 0.36 GB/s, QOI 0.41 to 0.60 at 0.7, LZ4 over the
 //! same planes 0.34 to 0.75 at 1.4. Tiles of 64 halve that speed, but a block looks at windows of a photo: those of a city's
-//! blocks read 1.35 times what they use (`bench/results/scale.jsonl`; 1.7 with tiles of 128, by a probe that was not kept).
+//! blocks read 1.35 to 1.54 times what they use (`bench/results/scale.jsonl`; 1.7 with tiles of 128, by a probe that was not kept).
 
 use std::ops::Range;
 
