@@ -244,6 +244,7 @@ fn rasterize_lanes<L: Lanes>(tile: &TileInput, background: &[f32; 3], extras: bo
 
 #[inline(always)]
 fn rasterize_tile<L: Lanes, const EXTRAS: bool>(tile: &TileInput, background: &[f32; 3], band: &mut Band) -> Visited {
+    // Of each pixel its transmittance; negative once the pixel is finished, and then what it is to end with.
     let (mut live, mut alive) = tile.start();
     let mut colour = [Plane::filled(0.0); 3];
     let mut depth = Plane::filled(0.0);
@@ -412,10 +413,10 @@ fn rasterize_backward_tile<L: Lanes, const DEPTH: bool>(tile: &TileInput, band: 
         let (a2, b1, c2) =
             (L::splat(2.0 * ln2 * a * a), L::splat(2.0 * ln2 * a * b), L::splat(2.0 * ln2 * (b * b + c * c)));
         spread.alphas(blocks, lane_x, lane_y, &mut alphas);
-        let (mut visits, mut rest_of) = (blocks, blocks);
-        while rest_of != 0 {
-            let b = rest_of.trailing_zeros() as usize & (BLOCKS - 1);
-            rest_of &= rest_of - 1;
+        let (mut unblended, mut unsummed) = (blocks, blocks);
+        while unblended != 0 {
+            let b = unblended.trailing_zeros() as usize & (BLOCKS - 1);
+            unblended &= unblended - 1;
             let alpha = L::load(&alphas[b]);
             let t = L::load(&live[b]);
             let weight = alpha * t;
@@ -449,9 +450,10 @@ fn rasterize_backward_tile<L: Lanes, const DEPTH: bool>(tile: &TileInput, band: 
             continue;
         }
         let mut sums = [L::zero(); 16];
-        while visits != 0 {
-            let b = visits.trailing_zeros() as usize & (BLOCKS - 1);
-            visits &= visits - 1;
+        // A loop of its own, so that the sums stay in registers.
+        while unsummed != 0 {
+            let b = unsummed.trailing_zeros() as usize & (BLOCKS - 1);
+            unsummed &= unsummed - 1;
             let (v, weight) = (L::load(&vs[b]), L::load(&weights[b]));
             let (dx, dy) = spread.offset(b, lane_x, lane_y);
             let (vx, vy) = (v * dx, v * dy);
