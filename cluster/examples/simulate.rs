@@ -1,15 +1,22 @@
 //! Plays the scheduler's simulation for many seeds, or one with every happening told, or replays a journal.
 //!
 //! ```text
-//! cargo run --release -p cluster --example simulate -- --seeds 0..10000
+//! cargo run --release -p cluster --example simulate -- --seeds 0..10000 [--threads N]
 //! cargo run --release -p cluster --example simulate -- --seed 17 --trace
 //! cargo run --release -p cluster --example simulate -- --replay journal.jsonl [--trace]
 //! ```
-//! Exits with 1 at the first seed that fails, and says how to replay it.
+//! Seeds are shared out over all cores (`--threads N` for fewer) with a bar on a terminal; a trace is told by one thread, in order.
+//! Exits with 1 at a seed that fails, the lowest that was found, and says how to replay it.
 
 use std::fmt;
 use std::io::{BufWriter, Write};
+use std::num::NonZero;
 use std::process::ExitCode;
+use std::sync::Mutex;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::thread;
+
+use indicatif::{ProgressBar, ProgressStyle};
 
 use cluster::sim::{Options, Report, run};
 
@@ -17,6 +24,7 @@ use cluster::sim::{Options, Report, run};
 #[derive(Default)]
 struct Asked {
     seeds: Option<(u64, u64)>,
+    threads: Option<NonZero<usize>>,
     trace: bool,
     replay: Option<String>,
 }
@@ -24,7 +32,7 @@ struct Asked {
 fn main() -> ExitCode {
     match asked(std::env::args().skip(1)) {
         Err(what) => {
-            eprintln!("{what}\nusage: simulate [--seeds A..B | --seed N] [--trace] [--replay FILE]");
+            eprintln!("{what}\nusage: simulate [--seeds A..B | --seed N] [--threads N] [--trace] [--replay FILE]");
             ExitCode::from(2)
         }
         Ok(asked) => match play(&asked) {
@@ -55,6 +63,10 @@ fn asked(mut args: impl Iterator<Item = String>) -> Result<Asked, String> {
                 let (from, to) = range.split_once("..").ok_or_else(|| format!("'{range}' is not of the form A..B"))?;
                 asked.seeds = Some((number(from)?, number(to)?));
             }
+            "--threads" => {
+                let text = value()?;
+                asked.threads = Some(text.parse().map_err(|_| format!("'{text}' is not a number of threads"))?);
+            }
             "--trace" => asked.trace = true,
             "--replay" => asked.replay = Some(value()?),
             _ => return Err(format!("'{arg}' is not known")),
@@ -77,14 +89,66 @@ fn play(asked: &Asked) -> Result<String, String> {
         return Ok(format!("{} steps and {} restarts replayed", replayed.steps, replayed.restarts));
     }
     let (from, to) = asked.seeds.unwrap_or((0, 1000));
-    let mut all = Report::default();
-    for seed in from..to {
-        let report = run(seed, Options::default(), &mut trace).map_err(|what| {
-            format!("{what}\nreplay: cargo run --release -p cluster --example simulate -- --seed {seed} --trace")
-        })?;
-        all.add(report);
-    }
+    let all = if asked.trace {
+        let mut all = Report::default();
+        for seed in from..to {
+            all.add(held(seed, &mut trace)?);
+        }
+        all
+    } else {
+        let cores = || thread::available_parallelism().unwrap_or(NonZero::<usize>::MIN);
+        play_all(from, to, asked.threads.unwrap_or_else(cores))?
+    };
     let counts: Vec<String> = all.counts.iter().map(|(what, count)| format!("{what} {count}")).collect();
     let (steps, hours) = (all.steps, all.millis / 3_600_000);
-    Ok(format!("{} seeds held: {steps} steps, {hours} simulated hours; {}", to - from, counts.join(", ")))
+    Ok(format!("{} seeds held: {steps} steps, {hours} simulated hours; {}", to.saturating_sub(from), counts.join(", ")))
+}
+
+fn held(seed: u64, trace: &mut dyn FnMut(fmt::Arguments<'_>)) -> Result<Report, String> {
+    run(seed, Options::default(), trace).map_err(|what| {
+        format!("{what}\nreplay: cargo run --release -p cluster --example simulate -- --seed {seed} --trace")
+    })
+}
+
+/// Plays the seeds on several threads, each taking the next one. What happened adds up to the same in any order.
+fn play_all(from: u64, to: u64, threads: NonZero<usize>) -> Result<Report, String> {
+    let (next, stop) = (AtomicU64::new(from), AtomicBool::new(false));
+    let wrong: Mutex<Option<(u64, String)>> = Mutex::new(None);
+    let bar = ProgressBar::new(to.saturating_sub(from));
+    if let Ok(style) = ProgressStyle::with_template("{bar:40} {pos}/{len} seeds, {eta} left") {
+        bar.set_style(style);
+    }
+    let play = || {
+        let mut all = Report::default();
+        while !stop.load(Ordering::Relaxed) {
+            let seed = next.fetch_add(1, Ordering::Relaxed);
+            if seed >= to {
+                break;
+            }
+            match held(seed, &mut |_| {}) {
+                Ok(report) => all.add(report),
+                Err(what) => {
+                    stop.store(true, Ordering::Relaxed);
+                    let mut wrong = wrong.lock().expect("nobody panics with it");
+                    if wrong.as_ref().is_none_or(|(lowest, _)| seed < *lowest) {
+                        *wrong = Some((seed, what));
+                    }
+                }
+            }
+            bar.inc(1);
+        }
+        all
+    };
+    let reports = thread::scope(|scope| {
+        let threads: Vec<_> = (0..threads.get()).map(|_| scope.spawn(play)).collect();
+        threads.into_iter().map(thread::ScopedJoinHandle::join).collect::<Result<Vec<_>, _>>()
+    });
+    bar.finish_and_clear();
+    let reports = reports.map_err(|_| "a thread panicked: see above".to_string())?;
+    if let Some((_, what)) = wrong.into_inner().expect("nobody panics with it") {
+        return Err(what);
+    }
+    let mut all = Report::default();
+    reports.into_iter().for_each(|report| all.add(report));
+    Ok(all)
 }
