@@ -113,7 +113,7 @@ async fn lead(
     inbox: &mut Inbox,
     stop: &CancellationToken,
 ) -> Result<(), ServeError> {
-    let (state, restored) = State::take_over(&options.store, durable.flush, seen).await?;
+    let (state, restored) = State::take_over(&options.store, seen).await?;
     let ended = lead_with(options, durable, &state, restored, inbox, stop).await;
     // Also of a state that failed or is another's by now: what it does in the background must end.
     if timeout(GRACE, state.close()).await.is_err() {

@@ -103,8 +103,6 @@ impl Options {
 pub struct Durable {
     /// How workers reach this coordinator, as the lease says it to them: `http://host:port` or `https://host:port`.
     pub address: String,
-    /// How long a write waits for others to go with it.
-    pub flush: Duration,
     /// The leader shows this often that it lives, and others look this often.
     pub beat: Duration,
     /// A leader that is silent for this long is followed by another.
@@ -112,7 +110,7 @@ pub struct Durable {
 }
 
 impl Durable {
-    /// The defaults: writes every 50 ms, a beat each second, followed after four of silence.
+    /// The defaults: a beat each second, followed after four of silence.
     ///
     /// # Errors
     /// An address that is no URL of a host and a port.
@@ -122,8 +120,7 @@ impl Durable {
             let problem = "is not where a worker could reach a coordinator";
             return Err(BadInput::new(address.escape_default().to_string(), problem, "give it as http://host:port"));
         }
-        let (flush, beat) = (Duration::from_millis(50), Duration::from_secs(1));
-        Ok(Self { address: address.into(), flush, beat, patience: Duration::from_secs(4) })
+        Ok(Self { address: address.into(), beat: Duration::from_secs(1), patience: Duration::from_secs(4) })
     }
 }
 

@@ -168,6 +168,19 @@ fn span_of(parent: Option<TraceParent>, span: impl FnOnce() -> Span) -> Span {
     span
 }
 
+/// Who asks for a task, what it offers, and the highest epoch that it knows of.
+fn offer_of(request: LeaseRequest) -> Result<(String, Offer, u64), Status> {
+    let LeaseRequest { worker, backend, memory_bytes, cached, epoch } = request;
+    proto::check_name("worker", &worker)?;
+    proto::check_name("backend", &backend)?;
+    if cached.len() > cluster::CACHED_LIMIT {
+        let problem = format!("a call names {} cached artefacts, at most {}", cached.len(), cluster::CACHED_LIMIT);
+        return Err(Status::invalid_argument(problem));
+    }
+    let cached = cached.iter().map(|id| proto::artefact_id(id)).collect::<Result<BTreeSet<_>, Status>>()?;
+    Ok((worker, Offer { backend, memory_bytes, cached: cached.into_iter().collect() }, epoch))
+}
+
 fn attempt_of(attempt: Option<proto::Attempt>) -> Result<proto::Attempt, Status> {
     attempt.ok_or_else(|| Status::invalid_argument("the call names no attempt"))
 }
@@ -192,16 +205,7 @@ impl Coordinator for Service {
     }
 
     async fn lease(&self, request: Request<LeaseRequest>) -> Answer<LeaseReply> {
-        let LeaseRequest { worker, backend, memory_bytes, cached, epoch } = request.into_inner();
-        proto::check_name("worker", &worker)?;
-        proto::check_name("backend", &backend)?;
-        if cached.len() > cluster::CACHED_LIMIT {
-            let problem = format!("a call names {} cached artefacts, at most {}", cached.len(), cluster::CACHED_LIMIT);
-            return Err(Status::invalid_argument(problem));
-        }
-        let cached = cached.iter().map(|id| proto::artefact_id(id)).collect::<Result<BTreeSet<_>, Status>>()?;
-        let cached = cached.into_iter().collect();
-        let offer = Offer { backend, memory_bytes, cached };
+        let (worker, offer, epoch) = offer_of(request.into_inner())?;
         let reply = self.ask(move |jobs, now| jobs.lease(now, &worker, offer, epoch)).await?;
         Ok(Response::new(LeaseReply { reply: Some(reply) }))
     }
@@ -219,16 +223,22 @@ impl Coordinator for Service {
 
     async fn complete(&self, request: Request<CompleteRequest>) -> Answer<AttemptReply> {
         let parent = TraceParent::of_header(request.metadata());
-        let CompleteRequest { attempt, artefact } = request.into_inner();
+        let CompleteRequest { attempt, artefact, then } = request.into_inner();
         let (attempt, artefact) = (attempt_of(attempt)?, proto::artefact_id(&artefact)?);
+        let then = then.map(offer_of).transpose()?;
         let span = span_of(parent, || {
             let proto::Attempt { job, task, number: attempt, .. } = attempt;
             tracing::info_span!("commit", otel.kind = "server", job, task, attempt, %artefact, accepted = Empty)
         });
-        let work = self.ask(move |jobs, now| jobs.complete(now, attempt, artefact));
-        let accepted = work.instrument(span.clone()).await?;
+        let work = self.ask(move |jobs, now| {
+            let accepted = jobs.complete(now, attempt, artefact)?;
+            // That the result counts is said in any case; why there is nothing next, to whoever asks.
+            let next = then.and_then(|(worker, offer, epoch)| jobs.lease(now, &worker, offer, epoch).ok());
+            Ok((accepted, next))
+        });
+        let (accepted, next) = work.instrument(span.clone()).await?;
         span.record("accepted", accepted);
-        Ok(Response::new(AttemptReply { accepted }))
+        Ok(Response::new(AttemptReply { accepted, next: next.map(|reply| LeaseReply { reply: Some(reply) }) }))
     }
 
     async fn fail(&self, request: Request<FailRequest>) -> Answer<AttemptReply> {
@@ -250,7 +260,7 @@ impl Coordinator for Service {
         let work = self.ask(move |jobs, now| jobs.fail(now, attempt, Failure { kind, message }));
         let accepted = work.instrument(span.clone()).await?;
         span.record("accepted", accepted);
-        Ok(Response::new(AttemptReply { accepted }))
+        Ok(Response::new(AttemptReply { accepted, next: None }))
     }
 
     type WatchStream = Pin<Box<dyn Stream<Item = Result<WatchEvent, Status>> + Send>>;

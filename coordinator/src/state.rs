@@ -15,7 +15,6 @@
 
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicU32, Ordering};
-use std::time::Duration;
 
 use cluster::{Changes, JobHeader, JobId, JobSnapshot, Snapshot, TaskRecord};
 use scene::frame::{self, Kind};
@@ -125,11 +124,11 @@ pub(crate) struct State {
 }
 
 impl State {
-    /// Opens the state of this store, fences whoever had it open, and takes the next epoch, above `seen` as well. `flush` is how
-    /// long a write may wait for others to share its place in the log.
-    pub(crate) async fn take_over(store: &Store, flush: Duration, seen: u64) -> Result<(Self, Restored), StateError> {
+    /// Opens the state of this store, fences whoever had it open, and takes the next epoch, above `seen` as well.
+    pub(crate) async fn take_over(store: &Store, seen: u64) -> Result<(Self, Restored), StateError> {
         let store_url = store.url().to_owned();
-        let settings = Settings { flush_interval: Some(flush), ..Settings::default() };
+        // Writes are pushed out one by one: what comes while one is under way shares the next, so nothing need wait to be joined.
+        let settings = Settings { flush_interval: None, ..Settings::default() };
         // All of it fits into memory, where the scheduler has it anyway: what is read once need not be cached.
         let builder = Db::builder(FOLDER, store.objects()).with_settings(settings).with_db_cache_disabled();
         let db = builder.build().await.map_err(|error| match is_outrun(&error) {
@@ -206,6 +205,8 @@ impl State {
 
     async fn put(&self, rows: WriteBatch) -> Result<(), StateError> {
         let written = self.db.write(rows).await.map_err(failed(&self.store_url, "written"))?;
+        let log = FlushOptions { flush_type: FlushType::Wal };
+        self.db.flush_with_options(log).await.map_err(failed(&self.store_url, "written"))?;
         written.await_durable().await.map_err(failed(&self.store_url, "written"))
     }
 
@@ -307,10 +308,8 @@ mod tests {
 
     use super::*;
 
-    const FLUSH: Duration = Duration::from_millis(1);
-
     async fn open(store: &Store) -> (State, Restored) {
-        State::take_over(store, FLUSH, 0).await.unwrap()
+        State::take_over(store, 0).await.unwrap()
     }
 
     /// Every second job is traced.
@@ -402,7 +401,7 @@ mod tests {
         assert_eq!(open_ones[0].write(name("first")).await, Err(StateError::Fenced));
         open_ones[2].write(name("third")).await.unwrap();
         assert_eq!(open_ones[1].write(name("second")).await, Err(StateError::Fenced));
-        let (state, restored) = State::take_over(&store, FLUSH, 17).await.unwrap();
+        let (state, restored) = State::take_over(&store, 17).await.unwrap();
         assert_eq!((state.epoch(), restored.workers), (18, vec!["third".to_owned()]));
     }
 
@@ -414,7 +413,7 @@ mod tests {
         for _ in 0..20 {
             let opening = (0..6).map(|_| {
                 let store = store.clone();
-                tokio::spawn(async move { State::take_over(&store, FLUSH, seen).await })
+                tokio::spawn(async move { State::take_over(&store, seen).await })
             });
             let opening: Vec<_> = opening.collect();
             let mut opened = Vec::new();
@@ -473,11 +472,10 @@ mod tests {
             let mut rows = WriteBatch::new();
             rows.put(key, value);
             state.put(rows).await.unwrap();
-            let line = State::take_over(&store, FLUSH, 0).await.err().unwrap().to_string();
+            let line = State::take_over(&store, 0).await.err().unwrap().to_string();
             assert!(line.contains(words) && line.contains("memory://"), "{line}");
             // Mended by hand: who was refused took no epoch, and fenced the one before.
-            let settings = Settings { flush_interval: Some(FLUSH), ..Settings::default() };
-            let db = Db::builder(FOLDER, store.objects()).with_settings(settings).build().await.unwrap();
+            let db = Db::builder(FOLDER, store.objects()).build().await.unwrap();
             db.delete(key).await.unwrap();
             db.close().await.unwrap();
         }

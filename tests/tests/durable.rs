@@ -90,8 +90,7 @@ impl Host {
     ) -> Self {
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
         let address = format!("http://{}", listener.local_addr().unwrap());
-        let flush = Duration::from_millis(2);
-        let durable = Durable { flush, beat, patience, ..Durable::new(&address).unwrap() };
+        let durable = Durable { beat, patience, ..Durable::new(&address).unwrap() };
         // No second attempts: here each task is to be worked on once.
         let settings = Settings { duplicates: false, ..Settings::default() };
         let options =
@@ -137,7 +136,7 @@ impl Host {
 
     async fn complete(&mut self, attempt: proto::Attempt, result: &[u8]) -> Result<bool, tonic::Status> {
         let artefact = ArtefactId::of(result).0.to_vec();
-        let reply = self.client.complete(proto::CompleteRequest { attempt: Some(attempt), artefact }).await;
+        let reply = self.client.complete(proto::CompleteRequest { attempt: Some(attempt), artefact, then: None }).await;
         reply.map(|reply| reply.into_inner().accepted)
     }
 
@@ -221,6 +220,39 @@ async fn what_was_answered_outlives_a_kill_and_the_epoch_rises() {
     }
     let replayed = cluster::journal::replay(text.iter().map(String::as_str), |_| {}).unwrap();
     assert_eq!((replayed.last.epoch, replayed.last.jobs.len()), (2, 2));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_result_and_the_next_task_take_one_call() {
+    let store = Store::open("memory://").unwrap();
+    let mut host = Host::start(&store, LONG, LONG).await.leads().await;
+    let job = host.submit(&store).await;
+    let ask = proto::LeaseRequest { worker: "w1".into(), backend: BACKEND.into(), ..Default::default() };
+    let complete = |attempt, then| proto::CompleteRequest { attempt: Some(attempt), artefact: vec![7; 32], then };
+    let root = host.lease("w1").await;
+    let reply = host.client.complete(complete(root, Some(ask.clone()))).await.unwrap().into_inner();
+    assert!(reply.accepted);
+    let Some(Reply::Grant(grant)) = reply.next.unwrap().reply else { panic!("the root's children are ready") };
+    let child = grant.attempt.unwrap();
+    assert_ne!(child.task, root.task);
+    let status = host.status(job).await;
+    assert_eq!((status.done, status.leased, status.ready), (1, 1, 3));
+    // The answer was lost and the call comes again: the result counts still, and the grant that nobody heard of is void.
+    let again = host.client.complete(complete(root, Some(ask))).await.unwrap().into_inner();
+    assert!(again.accepted && matches!(again.next.unwrap().reply, Some(Reply::Grant(_))));
+    assert_eq!(host.status(job).await.leased, 1);
+    assert!(!host.complete(child, b"child").await.unwrap());
+    // What is asked for must make sense, else nothing is done; and who does not ask gets nothing.
+    let other = host.lease("w2").await;
+    let wrong = proto::LeaseRequest { worker: "no name".into(), ..Default::default() };
+    let refused = host.client.complete(complete(other, Some(wrong))).await.unwrap_err();
+    assert_eq!((refused.code(), host.status(job).await.done), (Code::InvalidArgument, 1));
+    assert_eq!(host.client.complete(complete(other, None)).await.unwrap().into_inner().next, None);
+    // What was granted so is durable before it is said, as any grant is.
+    host.kill().await;
+    let mut second = Host::start(&store, QUICK, Duration::from_millis(50)).await.leads().await;
+    let status = second.status(job).await;
+    assert_eq!((status.done, status.leased), (2, 1));
 }
 
 #[tokio::test(flavor = "multi_thread")]

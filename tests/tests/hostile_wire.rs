@@ -202,7 +202,7 @@ impl Target {
         let artefact = ArtefactId([random.next() as u8; 32]).0.to_vec();
         let job = if is_stranger { self.job } else { *random.of(&[0, self.job + 1, u64::MAX]) };
         match random.below(if is_stranger { 8 } else { 6 }) {
-            0 => ("Complete", proto::CompleteRequest { attempt, artefact }.encode_to_vec()),
+            0 => ("Complete", proto::CompleteRequest { attempt, artefact, then: None }.encode_to_vec()),
             1 => ("Fail", proto::FailRequest { attempt, message: "x".into(), kind: 1 }.encode_to_vec()),
             2 => ("Report", proto::ReportRequest { attempt, reports: vec![] }.encode_to_vec()),
             3 => ("Cancel", proto::CancelRequest { job }.encode_to_vec()),
@@ -338,7 +338,7 @@ async fn attack(target: &Target, random: &mut Random) -> Result<(), String> {
             let (attempt, result) = target.ended;
             let same = random.below(2) == 0;
             let artefact = if same { result } else { ArtefactId([random.next() as u8; 32]) };
-            let request = proto::CompleteRequest { attempt: Some(attempt), artefact: artefact.0.to_vec() };
+            let request = proto::CompleteRequest { attempt: Some(attempt), artefact: artefact.0.to_vec(), then: None };
             let reply = target.call("Complete", &own_headers(), request.encode_to_vec()).await;
             let accepted = reply.ok().and_then(|bytes| proto::AttemptReply::decode(&*bytes).ok()).map(|r| r.accepted);
             if accepted == Some(same) {
@@ -430,7 +430,7 @@ async fn hostile_traffic_changes_nothing() {
     let root = lease(&mut client, "w1").await;
     assert_eq!((root.task, root.number), (0, 2));
     let result = ArtefactId::of(b"root");
-    let request = proto::CompleteRequest { attempt: Some(root), artefact: result.0.to_vec() };
+    let request = proto::CompleteRequest { attempt: Some(root), artefact: result.0.to_vec(), then: None };
     assert!(client.complete(request).await.unwrap().into_inner().accepted);
     let held = [lease(&mut client, "w1").await, lease(&mut client, "w2").await];
 
@@ -463,7 +463,7 @@ async fn hostile_traffic_changes_nothing() {
     assert_eq!(seen(&mut client, job).await, before);
     // Who holds a lease goes on as if nothing had been.
     for of in held {
-        let request = proto::CompleteRequest { attempt: Some(of), artefact: vec![3; 32] };
+        let request = proto::CompleteRequest { attempt: Some(of), artefact: vec![3; 32], then: None };
         assert!(client.complete(request).await.unwrap().into_inner().accepted);
     }
     println!("{total} cases, nothing changed");

@@ -290,7 +290,7 @@ async fn a_stale_attempt_is_refused() {
     assert_eq!((zombie.task, zombie.number, heir.task), (0, 1, 0));
     assert!(heir.number > zombie.number);
     let artefact = ArtefactId::of(b"zombie's").0.to_vec();
-    let complete = proto::CompleteRequest { attempt: Some(zombie), artefact };
+    let complete = proto::CompleteRequest { attempt: Some(zombie), artefact, then: None };
     assert!(!client.complete(complete).await.unwrap().into_inner().accepted);
     let report = proto::ReportRequest { attempt: Some(zombie), reports: vec![proto::Report::default()] };
     assert!(client.report(report).await.unwrap().into_inner().cancelled);
@@ -367,7 +367,7 @@ async fn a_job_is_paused_resumed_and_retried_and_its_journal_replays() {
     let attempt = lease(&mut client, "idle").await;
     assert_eq!(attempt, proto::Attempt { job, task: 0, number: 1, epoch: 7 });
     let earlier = proto::Attempt { epoch: 6, ..attempt };
-    let complete = proto::CompleteRequest { attempt: Some(earlier), artefact: vec![0; 32] };
+    let complete = proto::CompleteRequest { attempt: Some(earlier), artefact: vec![0; 32], then: None };
     assert!(!client.complete(complete).await.unwrap().into_inner().accepted, "of an earlier coordinator");
     let wrong = proto::FailRequest {
         attempt: Some(attempt),
@@ -412,7 +412,7 @@ async fn what_comes_off_the_wire_is_checked() {
     assert_eq!(code(client.report(proto::ReportRequest::default()).await.map(|_| ())), Code::InvalidArgument);
 
     let attempt = Some(lease(&mut client, "honest").await);
-    let short = proto::CompleteRequest { attempt, artefact: vec![0; 31] };
+    let short = proto::CompleteRequest { attempt, artefact: vec![0; 31], then: None };
     assert_eq!(code(client.complete(short).await.map(|_| ())), Code::InvalidArgument);
     let reports = vec![proto::Report { wall_seconds: f64::INFINITY, ..proto::Report::default() }];
     assert_eq!(code(client.report(proto::ReportRequest { attempt, reports }).await.map(|_| ())), Code::InvalidArgument);
@@ -420,7 +420,7 @@ async fn what_comes_off_the_wire_is_checked() {
     assert!(client.submit(huge).await.is_err());
 
     // None of this did any harm.
-    let complete = proto::CompleteRequest { attempt, artefact: vec![0; 32] };
+    let complete = proto::CompleteRequest { attempt, artefact: vec![0; 32], then: None };
     assert!(client.complete(complete).await.unwrap().into_inner().accepted);
     client.cancel(proto::CancelRequest { job }).await.unwrap();
     let status = client.status(proto::StatusRequest { job }).await.unwrap().into_inner();

@@ -15,7 +15,7 @@ use tracing::field::Empty;
 use tracing::{Instrument, Span};
 
 use crate::link::Link;
-use crate::{Execute, ExecuteError, FULL_RATE, Flow, Report, TaskOrder, is_passing};
+use crate::{Execute, ExecuteError, FULL_RATE, Flow, Options, Report, TaskOrder, asks, is_passing};
 
 /// News go out this often, if there are any.
 const NEWS_PERIOD: Duration = Duration::from_millis(250);
@@ -24,37 +24,39 @@ const BEATS_PER_LEASE: u32 = 4;
 /// Tries to deliver the last word before the lease is left to expire: about half a minute.
 const LAST_WORD_TRIES: u32 = 13;
 
-/// Carries out what was granted and says how it ended. Troubles on the wire are logged, not returned: the lease expires
-/// and the coordinator grants the task anew.
+/// Carries out what was granted, says how it ended, and returns what the coordinator answered to the worker's asking for more, if
+/// it did. Troubles on the wire are logged, not returned: the lease expires and the coordinator grants the task anew.
 pub(crate) async fn run(
     link: &mut Link,
-    worker: &str,
+    options: &Options,
     grant: proto::Grant,
     executor: Arc<dyn Execute>,
     shutdown: &CancellationToken,
-) {
+) -> Option<proto::LeaseReply> {
     let lease = Duration::from_millis(grant.lease_millis.into());
     let parent = TraceParent::parse(&grant.traceparent);
     let Some((key, order)) = order_of(grant) else {
         tracing::error!("a grant that makes no sense was dropped");
-        return tokio::time::sleep(NEWS_PERIOD).await;
+        tokio::time::sleep(NEWS_PERIOD).await;
+        return None;
     };
     link.saw(key.epoch);
     let proto::Attempt { job, task, number: attempt, .. } = key;
     // Of the highest level, so that whatever is logged within says of which attempt it is.
+    let worker = &options.worker_id;
     let span = tracing::error_span!("task", job, task, attempt, worker, artefact = Empty, otel.status_code = Empty);
     parent.iter().for_each(|parent| parent.adopt(&span));
-    carry_out(link, key, order, lease, executor, shutdown).instrument(span).await;
+    carry_out(link, options, (key, order), lease, executor, shutdown).instrument(span).await
 }
 
 async fn carry_out(
     link: &mut Link,
-    key: proto::Attempt,
-    order: TaskOrder,
+    options: &Options,
+    (key, order): (proto::Attempt, TaskOrder),
     lease: Duration,
     executor: Arc<dyn Execute>,
     shutdown: &CancellationToken,
-) {
+) -> Option<proto::LeaseReply> {
     tracing::info!("begins");
     let stop = Arc::new(AtomicBool::new(false));
     let (sender, mut news) = mpsc::channel(REPORTS_LIMIT);
@@ -106,23 +108,25 @@ async fn carry_out(
     if !void {
         while !news.is_empty() && tell(link, key, &mut news).await == Told::Counts {}
     }
-    if !void {
-        let result = result.unwrap_or_else(|error| {
-            let message = if error.is_panic() { panic_text(&*error.into_panic()) } else { error.to_string() };
-            Err(ExecuteError::of(FailureKind::Work, message))
-        });
-        match &result {
-            Ok(artefact) => {
-                Span::current().record("artefact", tracing::field::display(artefact));
-                tracing::info!(%artefact, "done");
-            }
-            Err(error) => {
-                Span::current().record("otel.status_code", "ERROR");
-                tracing::warn!("ends without a result: {error}");
-            }
-        }
-        say_last_word(link, key, result, leaving).await;
+    if void {
+        return None;
     }
+    let result = result.unwrap_or_else(|error| {
+        let message = if error.is_panic() { panic_text(&*error.into_panic()) } else { error.to_string() };
+        Err(ExecuteError::of(FailureKind::Work, message))
+    });
+    match &result {
+        Ok(artefact) => {
+            Span::current().record("artefact", tracing::field::display(artefact));
+            tracing::info!(%artefact, "done");
+        }
+        Err(error) => {
+            Span::current().record("otel.status_code", "ERROR");
+            tracing::warn!("ends without a result: {error}");
+        }
+    }
+    let then = (!shutdown.is_cancelled()).then(|| asks(options, link));
+    say_last_word(link, key, result, leaving, then).await
 }
 
 fn order_of(grant: proto::Grant) -> Option<(proto::Attempt, TaskOrder)> {
@@ -188,11 +192,13 @@ async fn say_last_word(
     key: proto::Attempt,
     result: Result<scene::ArtefactId, ExecuteError>,
     leaving: bool,
-) {
+    then: Option<proto::LeaseRequest>,
+) -> Option<proto::LeaseReply> {
     for _ in 0..LAST_WORD_TRIES {
         let answer = match &result {
             Ok(artefact) => {
-                let request = proto::CompleteRequest { attempt: Some(key), artefact: artefact.0.to_vec() };
+                let (attempt, artefact) = (Some(key), artefact.0.to_vec());
+                let request = proto::CompleteRequest { attempt, artefact, then: then.clone() };
                 async { link.client().await?.complete(traced(request)).await }.await
             }
             Err(error) => {
@@ -208,13 +214,17 @@ async fn say_last_word(
                 if !reply.get_ref().accepted {
                     tracing::warn!("the coordinator refuses the result of a stale attempt");
                 }
-                return;
+                return reply.into_inner().next;
             }
             Err(status) if is_passing(&status) => tokio::time::sleep(link.lost()).await,
-            Err(status) => return tracing::warn!("{}", status.message()),
+            Err(status) => {
+                tracing::warn!("{}", status.message());
+                return None;
+            }
         }
     }
     tracing::warn!("the coordinator could not be told how it ended");
+    None
 }
 
 fn panic_text(panic: &(dyn Any + Send)) -> String {

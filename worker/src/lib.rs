@@ -1,7 +1,7 @@
 //! Pulls tasks from a coordinator and carries them out, one at a time.
 //!
 //! ```text
-//! ask ──wait──▶ ask ──grant──▶ execute (blocking thread) ──▶ complete | fail | give back ──▶ ask … drained ──▶ home
+//! ask ──wait──▶ ask ──grant──▶ execute (blocking thread) ──▶ complete and ask | fail | give back ──▶ ask … drained ──▶ home
 //!                               │ reports ▼   ▲ stop
 //!                              heartbeat (async, several per lease)
 //! ```
@@ -16,7 +16,6 @@ pub mod clock;
 pub mod estimate;
 pub mod execute;
 mod heal;
-mod kept;
 mod link;
 mod memory;
 pub mod merged;
@@ -36,7 +35,7 @@ use proto::lease_reply::Reply;
 use scene::{ArtefactId, BadInput};
 use store::StoreError;
 use tokio_util::sync::CancellationToken;
-use tonic::{Code, Status};
+use tonic::{Code, Response, Status};
 
 use link::Link;
 pub use link::leader_of;
@@ -185,19 +184,21 @@ pub async fn greet(options: &Options, shutdown: &CancellationToken) -> Result<Op
 /// [`WorkerError`].
 pub async fn run(options: Options, executor: Arc<dyn Execute>, shutdown: CancellationToken) -> Result<(), WorkerError> {
     let mut link = Link::new(&options)?;
+    let mut said = None;
     while !shutdown.is_cancelled() {
-        let (worker, backend, epoch) = (options.worker_id.clone(), options.backend.clone(), link.epoch());
-        let memory_bytes = options.memory_bytes;
-        let request = proto::LeaseRequest { worker, backend, memory_bytes, epoch, ..Default::default() };
-        let answer = tokio::select! {
-            biased;
-            () = shutdown.cancelled() => break,
-            answer = async { link.client().await?.lease(request).await } => answer,
+        let request = asks(&options, &link);
+        let answer = match said.take() {
+            Some(reply) => Ok(reply),
+            None => tokio::select! {
+                biased;
+                () = shutdown.cancelled() => break,
+                answer = async { link.client().await?.lease(request).await } => answer.map(Response::into_inner),
+            },
         };
-        match answer.map(|reply| reply.into_inner().reply) {
+        match answer.map(|answer| answer.reply) {
             Ok(Some(Reply::Grant(grant))) => {
                 link.found();
-                attempt::run(&mut link, &options.worker_id, grant, executor.clone(), &shutdown).await;
+                said = attempt::run(&mut link, &options, grant, executor.clone(), &shutdown).await;
             }
             Ok(Some(Reply::WaitMillis(millis))) => {
                 link.found();
@@ -210,6 +211,12 @@ pub async fn run(options: Options, executor: Arc<dyn Execute>, shutdown: Cancell
     }
     leave(&mut link, options.worker_id).await;
     Ok(())
+}
+
+/// The call for a task.
+fn asks(options: &Options, link: &Link) -> proto::LeaseRequest {
+    let Options { worker_id: worker, backend, memory_bytes, .. } = options.clone();
+    proto::LeaseRequest { worker, backend, memory_bytes, epoch: link.epoch(), ..Default::default() }
 }
 
 /// Waits before the same call is tried again.
