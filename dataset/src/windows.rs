@@ -1,18 +1,21 @@
 //! Windows of views for whoever trains: read by ranges, decoded once, kept in a cache of bounded size.
 //!
 //! A training task looks at the same few windows hundreds of times, so what is kept is the finished window, and a hit
-//! costs a lookup and no copy. Tiles are not kept: windows of one task rarely share them. What training expects to look at in a
+//! costs a lookup and no copy. Tiles are kept where asked for: windows of one task rarely share them, those of different tasks do,
+//! and that is worth it where the store is far. What training expects to look at in a
 //! few steps is fetched meanwhile, so that nobody waits for a store that is far away.
 
-use std::collections::{BTreeMap, HashMap, HashSet};
+use std::collections::HashSet;
 use std::ops::Range;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, OnceLock, PoisonError};
 
+use bytes::Bytes;
 use scene::{Capture, CodecError, Pixels, Rect};
 use store::{BlockingStore, StoreError};
 
+use crate::bounded::Bounded;
 use crate::mips::{Index, Layout};
 
 /// A window that could not be read.
@@ -75,37 +78,62 @@ pub struct WindowStats {
     pub cached_bytes: u64,
 }
 
-/// Where the tiles of mips lie, as far as readers of one capture have learnt: a window of such a mip takes one answer of the store
-/// instead of two. For whoever reads a capture again and again.
-#[derive(Debug, Default)]
-pub struct Indexes(Mutex<Known>);
-
-#[derive(Debug, Default)]
-struct Known {
-    /// By view and mip.
-    indexes: HashMap<(u32, u8), Arc<Index>>,
-    bytes: usize,
+/// What readers of one capture have in common, for whoever reads it again and again: where the tiles of its mips lie, so that a
+/// window takes one answer of the store instead of two, and tiles as they were read, where that is asked for: blocks side by side look
+/// at the same parts of the same photos.
+#[derive(Debug)]
+pub struct Common {
+    indexes: Mutex<Bounded<Mip, Arc<Index>>>,
+    /// By mip and place in its artefact.
+    tiles: Mutex<Bounded<(Mip, u64), Bytes>>,
 }
 
-impl Indexes {
-    /// What is learnt beyond so many bytes is not kept: the mips of some thousand photos.
-    const LIMIT: usize = 32 << 20;
+/// A view, and which of its mips.
+type Mip = (u32, u8);
 
-    fn known(&self) -> MutexGuard<'_, Known> {
-        // A thread that panicked while it held the lock left at worst an index out.
-        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+impl Common {
+    /// The indexes of the mips of some thousand photos.
+    const INDEX_BYTES: usize = 32 << 20;
+
+    /// Keeps so many bytes of tiles: none is right where the store is as near as memory.
+    pub fn keeping(tile_bytes: usize) -> Self {
+        Self { indexes: Mutex::new(Bounded::new(Self::INDEX_BYTES)), tiles: Mutex::new(Bounded::new(tile_bytes)) }
     }
 
-    fn of(&self, mip: (u32, u8)) -> Option<Arc<Index>> {
-        self.known().indexes.get(&mip).cloned()
+    fn index(&self, mip: Mip) -> Option<Arc<Index>> {
+        locked(&self.indexes).get(&mip).cloned()
     }
 
-    fn learn(&self, mip: (u32, u8), index: &Arc<Index>) {
-        let mut known = self.known();
-        if known.bytes + index.size() <= Self::LIMIT && known.indexes.insert(mip, Arc::clone(index)).is_none() {
-            known.bytes += index.size();
+    fn learn(&self, mip: Mip, index: &Arc<Index>) {
+        locked(&self.indexes).put(mip, Arc::clone(index), index.size());
+    }
+
+    /// The tiles that begin in these places, as far as they are kept.
+    fn tiles(&self, mip: Mip, ranges: &[Range<u64>]) -> Vec<Option<Bytes>> {
+        let mut tiles = locked(&self.tiles);
+        ranges.iter().map(|range| tiles.get(&(mip, range.start)).cloned()).collect()
+    }
+
+    /// Keeps tiles that were found to be whole.
+    fn keep(&self, mip: Mip, read: impl Iterator<Item = (u64, Bytes)>) {
+        let mut tiles = locked(&self.tiles);
+        if tiles.limit() > 0 {
+            for (start, tile) in read {
+                // Not a part of whatever was read with it.
+                let tile = Bytes::copy_from_slice(&tile);
+                let bytes = tile.len() + TILE_BYTES;
+                tiles.put((mip, start), tile, bytes);
+            }
         }
     }
+}
+
+/// What it takes to find a tile, roughly.
+const TILE_BYTES: usize = 96;
+
+/// A thread that panicked while it held a lock left at worst something out of what is kept.
+fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 /// Threads that fetch what is expected: a window takes two answers of the store, one after the other.
@@ -124,14 +152,14 @@ pub struct WindowReader {
 impl WindowReader {
     /// A reader that keeps at most `cache_bytes` bytes of pixels.
     pub fn new(capture: Arc<Capture>, store: BlockingStore, cache_bytes: usize) -> Self {
-        Self::sharing(Arc::default(), capture, store, cache_bytes)
+        Self::sharing(Arc::new(Common::keeping(0)), capture, store, cache_bytes)
     }
 
-    /// The same, with what other readers of the capture have learnt of it.
-    pub fn sharing(indexes: Arc<Indexes>, capture: Arc<Capture>, store: BlockingStore, cache_bytes: usize) -> Self {
-        let cache = Mutex::new(Cache { limit: cache_bytes, ..Cache::default() });
+    /// The same, with what other readers of the capture have read of it.
+    pub fn sharing(common: Arc<Common>, capture: Arc<Capture>, store: BlockingStore, cache_bytes: usize) -> Self {
+        let cache = Mutex::new(Cache { windows: Bounded::new(cache_bytes), coming: HashSet::new() });
         let (arrived, stats) = (Condvar::new(), Counters::default());
-        Self { shared: Arc::new(Shared { capture, store, indexes, cache, arrived, stats }), fetchers: OnceLock::new() }
+        Self { shared: Arc::new(Shared { capture, store, common, cache, arrived, stats }), fetchers: OnceLock::new() }
     }
 
     /// The capture.
@@ -147,9 +175,9 @@ impl WindowReader {
         let (key, shared) = ((view, mip, rect), &*self.shared);
         let mut cache = shared.cache();
         loop {
-            if let Some(pixels) = cache.get(key) {
+            if let Some(pixels) = cache.windows.get(&key) {
                 shared.stats.hits.fetch_add(1, Ordering::Relaxed);
-                return Ok(pixels);
+                return Ok(Arc::clone(pixels));
             }
             if !cache.coming.contains(&key) {
                 break;
@@ -159,7 +187,7 @@ impl WindowReader {
         drop(cache);
         shared.stats.misses.fetch_add(1, Ordering::Relaxed);
         let pixels = shared.read(key)?;
-        shared.cache().put(key, &pixels);
+        shared.keep(key, &pixels);
         Ok(pixels)
     }
 
@@ -169,8 +197,8 @@ impl WindowReader {
         let key = (view, mip, rect);
         let fetchers = self.fetchers.get_or_init(|| fetchers(&self.shared));
         let mut cache = self.shared.cache();
-        let fits = rect.area().saturating_mul(4 * 2 * QUEUE as u64) <= cache.limit as u64;
-        if !fits || cache.windows.contains_key(&key) || !cache.coming.insert(key) {
+        let fits = rect.area().saturating_mul(4 * 2 * QUEUE as u64) <= cache.windows.limit() as u64;
+        if !fits || cache.windows.contains(&key) || !cache.coming.insert(key) {
             return;
         }
         if fetchers.try_send(key).is_err() {
@@ -183,7 +211,7 @@ impl WindowReader {
         let Counters { hits, misses, expected, bytes_read, bytes_used } = &self.shared.stats;
         let [hits, misses, expected, bytes_read, bytes_used] =
             [hits, misses, expected, bytes_read, bytes_used].map(|count| count.load(Ordering::Relaxed));
-        let cached_bytes = self.shared.cache().bytes as u64;
+        let cached_bytes = self.shared.cache().windows.bytes() as u64;
         WindowStats { hits, misses, expected, bytes_read, bytes_used, cached_bytes }
     }
 }
@@ -203,7 +231,7 @@ impl train::WindowSource for WindowReader {
 struct Shared {
     capture: Arc<Capture>,
     store: BlockingStore,
-    indexes: Arc<Indexes>,
+    common: Arc<Common>,
     cache: Mutex<Cache>,
     /// An expected window came, or failed.
     arrived: Condvar,
@@ -231,7 +259,7 @@ impl Shared {
             let error = CodecError::new(format!("artefact {id}: {error}"));
             WindowError::Damaged { name: name(), mip, error }
         };
-        let read = |ranges: &[Range<u64>]| {
+        let read = |ranges: &[Range<u64>]| -> Result<Vec<Bytes>, WindowError> {
             let parts = self.store.get_ranges(id, ranges);
             let parts = parts.map_err(|error| WindowError::Store { name: name(), mip, error })?;
             let bytes: usize = parts.iter().map(|part| part.len()).sum();
@@ -240,23 +268,35 @@ impl Shared {
         };
         let camera = view.camera.mip(mip).pinhole;
         let layout = Layout { width: camera.width, height: camera.height, masked: view.masked };
-        let index = match self.indexes.of((number, mip)) {
+        let index = match self.common.index((number, mip)) {
             Some(index) => index,
             None => {
                 let head = read(std::slice::from_ref(&(0..layout.index_len() as u64)))?;
                 let index = Arc::new(layout.index(&head[0]).map_err(damaged)?);
-                self.indexes.learn((number, mip), &index);
+                self.common.learn((number, mip), &index);
                 index
             }
         };
         let ranges = index.ranges(rect).ok_or_else(|| WindowError::Outside { name: name(), mip, rect })?;
         self.stats.bytes_used.fetch_add(index.bytes_of(rect), Ordering::Relaxed);
-        index.window(rect, &read(&ranges)?).map(Arc::new).map_err(damaged)
+        let mut tiles = self.common.tiles((number, mip), &ranges);
+        let missing: Vec<usize> = (0..tiles.len()).filter(|&i| tiles[i].is_none()).collect();
+        if !missing.is_empty() {
+            let wanted: Vec<Range<u64>> = missing.iter().map(|&i| ranges[i].clone()).collect();
+            missing.iter().zip(read(&wanted)?).for_each(|(&i, tile)| tiles[i] = Some(tile));
+        }
+        let tiles: Vec<Bytes> = tiles.into_iter().flatten().collect();
+        let pixels = index.window(rect, &tiles).map_err(damaged)?;
+        self.common.keep((number, mip), missing.into_iter().map(|i| (ranges[i].start, tiles[i].clone())));
+        Ok(Arc::new(pixels))
+    }
+
+    fn keep(&self, key: Key, pixels: &Arc<Pixels>) {
+        self.cache().windows.put(key, Arc::clone(pixels), size(pixels));
     }
 
     fn cache(&self) -> MutexGuard<'_, Cache> {
-        // A thread that panicked while it held the lock left at worst a window out of the cache.
-        self.cache.lock().unwrap_or_else(PoisonError::into_inner)
+        locked(&self.cache)
     }
 }
 
@@ -288,51 +328,18 @@ fn fetch(shared: &Shared, expected: &Mutex<Receiver<Key>>) {
         // What is wrong is said when the window is asked for.
         if let Ok(pixels) = shared.read(key) {
             shared.stats.expected.fetch_add(1, Ordering::Relaxed);
-            shared.cache().put(key, &pixels);
+            shared.keep(key, &pixels);
         }
     }
 }
 
 type Key = (u32, u8, Rect);
 
-/// Windows by key, the least recently used first to go.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 struct Cache {
-    windows: HashMap<Key, (u64, Arc<Pixels>)>,
-    by_age: BTreeMap<u64, Key>,
+    windows: Bounded<Key, Arc<Pixels>>,
     /// Those that are being fetched because they are expected.
     coming: HashSet<Key>,
-    clock: u64,
-    bytes: usize,
-    limit: usize,
-}
-
-impl Cache {
-    fn get(&mut self, key: Key) -> Option<Arc<Pixels>> {
-        let (used, pixels) = self.windows.get_mut(&key)?;
-        self.by_age.remove(used);
-        self.clock += 1;
-        *used = self.clock;
-        self.by_age.insert(self.clock, key);
-        Some(Arc::clone(pixels))
-    }
-
-    fn put(&mut self, key: Key, pixels: &Arc<Pixels>) {
-        let bytes = size(pixels);
-        if bytes > self.limit || self.windows.contains_key(&key) {
-            return;
-        }
-        while self.bytes + bytes > self.limit {
-            let Some((_, oldest)) = self.by_age.pop_first() else { break };
-            if let Some((_, gone)) = self.windows.remove(&oldest) {
-                self.bytes -= size(&gone);
-            }
-        }
-        self.clock += 1;
-        self.bytes += bytes;
-        self.by_age.insert(self.clock, key);
-        self.windows.insert(key, (self.clock, Arc::clone(pixels)));
-    }
 }
 
 /// Pixels and, roughly, what the cache needs to find them.

@@ -8,12 +8,13 @@
 
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicU32, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use blocks::{Plan, Task};
 use bytes::Bytes;
+use dataset::bounded::Bounded;
 use dataset::ingest::IngestError;
-use dataset::windows::{Indexes, WindowReader};
+use dataset::windows::{Common, WindowReader};
 use scene::frame::{self, About};
 use scene::{ArtefactId, BlockId, Capture, Exposures, Splats};
 use store::BlockingStore;
@@ -22,7 +23,6 @@ use train::Backend;
 use crate::block::{Block, Trained};
 use crate::cap::Cap;
 use crate::clock::Stopwatch;
-use crate::kept::Kept;
 use crate::memory::Memory;
 use crate::merged::{Finished, Judge, is_look};
 use crate::metrics::Metrics;
@@ -60,8 +60,8 @@ pub struct Shared {
     pub metrics: Metrics,
 }
 
-/// Of the bound on the cache results of tasks take one part of so many, where the store is far.
-const RESULTS_PART: usize = 4;
+/// Of the bound on the cache results of tasks take one part of so many where the store is far, and tiles of photos another.
+const FAR_PARTS: usize = 4;
 
 /// Trains blocks.
 pub struct BlockTrainer {
@@ -70,14 +70,18 @@ pub struct BlockTrainer {
     pub(crate) shared: Arc<Shared>,
     pub(crate) backend: Backend,
     pool: rayon::ThreadPool,
-    /// That of the task before. A city's has tens of megabytes, and the next task is mostly of the same job.
+    /// Those of the task before. A city's have megabytes, and the next task is mostly of the same job.
+    plan: Mutex<Option<(ArtefactId, Arc<Plan>)>>,
     capture: Mutex<Option<KnownCapture>>,
-    /// Results of tasks, where the store is far.
-    kept: Kept,
+    /// Results of tasks as they were read, where the store is far: the blocks around one block are mostly those around the next, and
+    /// the root is around all.
+    kept: Mutex<Bounded<ArtefactId, Bytes>>,
+    /// Bytes that results may take, and tiles as many.
+    far_bytes: usize,
 }
 
-/// A capture, and where the tiles of its mips lie.
-type KnownCapture = (ArtefactId, Arc<Capture>, Arc<Indexes>);
+/// A capture, and what its readers have in common.
+type KnownCapture = (ArtefactId, Arc<Capture>, Arc<Common>);
 
 impl BlockTrainer {
     /// A trainer over this store.
@@ -95,8 +99,10 @@ impl BlockTrainer {
             .build()
             .map_err(|error| format!("cannot start {} threads: {error}", options.threads))?;
         let near = !store.store().is_far();
-        let kept = Kept::new(if near { 0 } else { options.cache_bytes / RESULTS_PART });
-        Ok(Self { store, options, shared, backend, pool, capture: Mutex::default(), kept })
+        let far_bytes = if near { 0 } else { options.cache_bytes / FAR_PARTS };
+        let kept = Mutex::new(Bounded::new(far_bytes));
+        let (plan, capture) = (Mutex::default(), Mutex::default());
+        Ok(Self { store, options, shared, backend, pool, plan, capture, kept, far_bytes })
     }
 
     /// Does something on the trainer's threads.
@@ -113,16 +119,15 @@ impl Execute for BlockTrainer {
     ) -> Result<ArtefactId, ExecuteError> {
         let mut stopwatch = Stopwatch::start();
         let fetching = tracing::info_span!("fetch").entered();
-        let plan = self.store.get(order.plan)?;
-        let plan = Plan::from_frame(&plan).map_err(failed)?;
+        let plan = self.plan(order.plan)?;
         if plan.backend != self.backend.name() {
             let (planned, own) = (&plan.backend, self.backend.name());
             return Err(failed(format!("the plan is for the backend {planned}, this worker computes on {own}")));
         }
         let task = plan.tasks.get(order.task as usize).ok_or_else(|| failed("the plan has no such task"))?;
-        let (capture, indexes) = self.capture(plan.capture)?;
-        let windows = self.options.cache_bytes - self.kept.limit();
-        let reader = WindowReader::sharing(indexes, capture.clone(), self.store.clone(), windows);
+        let (capture, common) = self.capture(plan.capture)?;
+        let windows = self.options.cache_bytes - 2 * self.far_bytes;
+        let reader = WindowReader::sharing(common, capture.clone(), self.store.clone(), windows);
         let (results, given) = self.results(&plan, task, order, report)?;
         let memory = self.options.resume.then(|| Memory::of(order)).filter(|_| self.shared.cap.is_none());
         if let Some((artefact, splats)) = memory.as_ref().and_then(|memory| memory.result(&self.store)) {
@@ -191,19 +196,37 @@ impl Execute for BlockTrainer {
 }
 
 impl BlockTrainer {
-    fn capture(&self, id: ArtefactId) -> Result<(Arc<Capture>, Arc<Indexes>), ExecuteError> {
-        let mut kept = self.capture.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some((of, capture, indexes)) = &*kept
+    fn plan(&self, id: ArtefactId) -> Result<Arc<Plan>, ExecuteError> {
+        let mut kept = self.plan.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some((of, plan)) = &*kept
             && *of == id
         {
-            return Ok((capture.clone(), indexes.clone()));
+            return Ok(plan.clone());
+        }
+        // Not both at once.
+        *kept = None;
+        let plan = Arc::new(Plan::from_frame(&self.store.get(id)?).map_err(failed)?);
+        *kept = Some((id, plan.clone()));
+        Ok(plan)
+    }
+
+    fn capture(&self, id: ArtefactId) -> Result<(Arc<Capture>, Arc<Common>), ExecuteError> {
+        let mut kept = self.capture.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some((of, capture, common)) = &*kept
+            && *of == id
+        {
+            return Ok((capture.clone(), common.clone()));
         }
         // Not both at once.
         *kept = None;
         let capture = Arc::new(dataset::ingest::load_capture(&self.store, id).map_err(unread)?);
-        let indexes = Arc::<Indexes>::default();
-        *kept = Some((id, capture.clone(), indexes.clone()));
-        Ok((capture, indexes))
+        let common = Arc::new(Common::keeping(self.far_bytes));
+        *kept = Some((id, capture.clone(), common.clone()));
+        Ok((capture, common))
+    }
+
+    fn kept(&self) -> MutexGuard<'_, Bounded<ArtefactId, Bytes>> {
+        self.kept.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// The splats of the blocks that the task needs, and what else its parent hands down.
@@ -226,11 +249,11 @@ impl BlockTrainer {
         });
         let wanted: Vec<_> = wanted.collect::<Result<_, _>>()?;
         for some in wanted.chunks(AT_ONCE) {
-            let mut found: Vec<Option<Bytes>> = some.iter().map(|(.., id)| self.kept.get(*id)).collect();
+            let mut found: Vec<Option<Bytes>> = some.iter().map(|(.., id)| self.kept().get(id).cloned()).collect();
             let missing: Vec<usize> = (0..some.len()).filter(|&i| found[i].is_none()).collect();
             let ids: Vec<ArtefactId> = missing.iter().map(|&i| some[i].2).collect();
             for (i, bytes) in missing.into_iter().zip(self.store.get_all_or_discard(&ids)?) {
-                bytes.iter().for_each(|bytes| self.kept.put(some[i].2, bytes));
+                bytes.iter().for_each(|bytes| self.kept().put(some[i].2, bytes.clone(), bytes.len()));
                 found[i] = bytes;
             }
             for (&(block, index, id), found) in some.iter().zip(found) {

@@ -7,7 +7,7 @@ use store::Store;
 use super::*;
 use crate::lens::ideal_pinhole;
 use crate::photo::tests::{encoded, texture};
-use crate::windows::WindowReader;
+use crate::windows::{Common, WindowReader};
 
 const WIDTH: u32 = 150;
 const HEIGHT: u32 = 100;
@@ -166,6 +166,38 @@ fn windows_are_crops_of_the_mips_and_the_cache_keeps_its_bound() {
     let after = reader.stats();
     assert_eq!((after.hits - before.hits, after.misses - before.misses), (1, 1));
     assert!(after.bytes_read > before.bytes_read);
+}
+
+#[test]
+fn tiles_are_read_once_by_all_who_share_them_and_never_kept_damaged() {
+    let folder = tempfile::tempdir().unwrap();
+    let store = memory();
+    let mut capture = run(&source(folder.path(), 2), &store, options(1, 1)).unwrap().capture;
+    let mut bytes = store.get(capture.views[0].mips[0]).unwrap().to_vec();
+    let last = bytes.len() - 1;
+    bytes[last] ^= 1;
+    // Ranges are not checked against the artefact's name, tiles against their own checksum.
+    capture.views.push(View { mips: vec![store.put(bytes).unwrap()], ..capture.views[0].clone() });
+    let capture = Arc::new(capture);
+    let common = Arc::new(Common::keeping(1 << 20));
+    let reader = || WindowReader::sharing(Arc::clone(&common), Arc::clone(&capture), store.clone(), 1 << 20);
+    let whole = whole(&capture.views[0].camera);
+    let [corner, right] = [Rect { width: 70, height: 70, ..whole }, Rect { x: 64, width: 80, height: 64, ..whole }];
+    let first = reader();
+    first.window(0, 0, corner).unwrap();
+    let second = reader();
+    assert_eq!(*second.window(0, 0, corner).unwrap(), *first.window(0, 0, corner).unwrap());
+    assert_eq!(second.stats().bytes_read, 0);
+    // The tile that both have in common is not read again.
+    let alone = WindowReader::new(Arc::clone(&capture), store.clone(), 0);
+    assert_eq!(*second.window(0, 0, right).unwrap(), *alone.window(0, 0, right).unwrap());
+    let [shared, alone] = [second, alone].map(|reader| reader.stats().bytes_read);
+    assert!(0 < shared && shared < alone, "{shared} of {alone} bytes");
+    for _ in 0..2 {
+        let reader = reader();
+        assert!(reader.window(2, 0, whole).is_err());
+        assert!(reader.stats().bytes_read > 0, "what was damaged is looked at anew");
+    }
 }
 
 #[test]
