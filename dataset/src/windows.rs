@@ -162,6 +162,11 @@ impl WindowReader {
         Self { shared: Arc::new(Shared { capture, store, common, cache, arrived, stats }), fetchers: OnceLock::new() }
     }
 
+    /// Another reader of the same capture, over this store, that shares what was read of it.
+    pub fn beside(&self, store: BlockingStore, cache_bytes: usize) -> Self {
+        Self::sharing(Arc::clone(&self.shared.common), Arc::clone(&self.shared.capture), store, cache_bytes)
+    }
+
     /// The capture.
     pub fn capture(&self) -> &Arc<Capture> {
         &self.shared.capture

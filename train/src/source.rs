@@ -20,8 +20,9 @@ pub trait WindowSource: Sync {
 /// Windows ahead of which a source hears what will be asked for.
 pub(crate) const AHEAD: usize = 8;
 
-/// The pixels of some windows, one after the other; the source hears of those to come.
-pub(crate) fn each<'a>(
+/// The pixels of some windows (view, mip and rectangle), one after the other; the source hears of those to come. The errors are the
+/// source's.
+pub fn each<'a>(
     source: &'a dyn WindowSource,
     windows: impl Iterator<Item = (u32, u8, Rect)> + Clone + 'a,
 ) -> impl Iterator<Item = Result<Arc<Pixels>, String>> + 'a {

@@ -76,7 +76,7 @@ impl Block<'_> {
         };
         let counts = |p: Vec3| self.owns(task, p.as_dvec3());
         let budget = self.budget(&results);
-        let mut judge = Judge::new(plan, self.capture, &self.trainer.store);
+        let mut judge = Judge::new(plan, self.reader, &self.trainer.store);
         if judge.is_some() {
             finished.learn(self.order.plan, plan, &results);
         }

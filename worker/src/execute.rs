@@ -132,7 +132,7 @@ impl Execute for BlockTrainer {
         let memory = self.options.resume.then(|| Memory::of(order)).filter(|_| self.shared.cap.is_none());
         if let Some((artefact, splats)) = memory.as_ref().and_then(|memory| memory.result(&self.store)) {
             self.shared.resumed.fetch_add(1, Ordering::Relaxed);
-            let psnr = Judge::new(&plan, &capture, &self.store).and_then(|mut judge| {
+            let psnr = Judge::new(&plan, &reader, &self.store).and_then(|mut judge| {
                 let finished = &self.shared.finished;
                 finished.learn(order.plan, &plan, &results);
                 finished.insert(order.plan, &plan, task.block, &splats);

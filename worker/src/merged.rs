@@ -5,7 +5,7 @@
 
 use std::collections::BTreeMap;
 use std::convert::Infallible;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Mutex, PoisonError};
 
 use blocks::{Cut, Mode, Plan};
 use dataset::windows::WindowReader;
@@ -14,7 +14,7 @@ use render::cpu::Renderer;
 use scene::splats::sh_coefficients;
 use scene::{ArtefactId, BlockId, Capture, Splats, column};
 use store::BlockingStore;
-use train::metrics;
+use train::{metrics, source};
 
 /// Photos are compared at the finest mip of at most this many pixels, which bounds the memory that it takes.
 const PIXELS_LIMIT: u64 = 4 << 20;
@@ -114,17 +114,19 @@ pub(crate) struct Judge {
 }
 
 impl Judge {
-    /// `None` where no view is held out, or the merged model is too large. What it reads is not counted among what the store moved.
-    pub(crate) fn new(plan: &Plan, capture: &Arc<Capture>, store: &BlockingStore) -> Option<Self> {
+    /// `None` where no view is held out, or the merged model is too large. It reads beside `reader`, and what it reads is not counted
+    /// among what the store moved.
+    pub(crate) fn new(plan: &Plan, reader: &WindowReader, store: &BlockingStore) -> Option<Self> {
         if !is_measured(plan) {
             return None;
         }
-        let held_out = capture.views.iter().enumerate().filter(|(i, _)| Capture::is_test(*i, plan.settings.test_every));
+        let held_out =
+            reader.capture().views.iter().enumerate().filter(|(i, _)| Capture::is_test(*i, plan.settings.test_every));
         let mip = |camera: &scene::Camera| {
             (0..31).find(|&mip| camera.mip(mip).full().area() <= PIXELS_LIMIT).unwrap_or_default()
         };
         let views: Vec<_> = held_out.map(|(i, view)| (i as u32, mip(&view.camera))).collect();
-        let reader = WindowReader::new(capture.clone(), store.store().metered().blocking(), CACHE_BYTES);
+        let reader = reader.beside(store.store().metered().blocking(), CACHE_BYTES);
         let antialiased = plan.settings.antialiased;
         (!views.is_empty()).then(|| Self { reader, antialiased, views, renderer: Renderer::default() })
     }
@@ -133,9 +135,11 @@ impl Judge {
     pub(crate) fn psnr(&mut self, model: &Splats) -> Option<f64> {
         let options = Options { antialiased: self.antialiased, sh_degree: model.sh_degree(), ..Options::default() };
         let (mut sum, mut count) = (0.0, 0);
-        for &(index, mip) in &self.views {
-            let camera = self.reader.capture().views[index as usize].camera.mip(mip);
-            let photo = self.reader.window(index, mip, camera.full()).ok()?;
+        let capture = self.reader.capture();
+        let windows =
+            self.views.iter().map(|&(view, mip)| (view, mip, capture.views[view as usize].camera.mip(mip).full()));
+        for ((view, mip, _), photo) in windows.clone().zip(source::each(&self.reader, windows)) {
+            let (photo, camera) = (photo.ok()?, capture.views[view as usize].camera.mip(mip));
             let frame = self.renderer.forward(model, None, &camera, &options);
             let truth: Vec<f32> = photo.rgb.iter().map(|&value| f32::from(value) / 255.0).collect();
             let render: Vec<f32> = frame.colour.iter().map(|value| value.clamp(0.0, 1.0)).collect();

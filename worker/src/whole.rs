@@ -73,9 +73,9 @@ impl Whole<'_> {
         let mut clock = Stopwatch::start();
         let Self { plan, capture, .. } = self;
         let [task] = &plan.tasks[..] else { return Err(input("has several blocks; one is compared at a time")) };
-        let judge = Judge::new(plan, capture, &self.store);
-        let mut judge = judge.ok_or_else(|| input("holds out no view, so nothing can be measured"))?;
         let reader = WindowReader::new(capture.clone(), self.store.clone(), self.cache_bytes);
+        let judge = Judge::new(plan, &reader, &self.store);
+        let mut judge = judge.ok_or_else(|| input("holds out no view, so nothing can be measured"))?;
         let order = TaskOrder {
             job: 0,
             plan: ArtefactId([0; 32]),
