@@ -80,6 +80,7 @@ impl Photometric {
             .collect();
         let sums: Vec<[f64; 2]> = jobs
             .into_par_iter()
+            .with_max_len(1)
             .map(|(plane_at, first_row, partials)| {
                 let (x, y) = (&colour[plane(plane_at)], &photo.rgb[plane(plane_at)]);
                 let mut sums = [0.0; 2];
@@ -94,7 +95,7 @@ impl Photometric {
         let jobs: Vec<_> = (gradient.chunks_mut(area).enumerate())
             .flat_map(|(c, plane)| plane.chunks_mut(band).enumerate().map(move |(b, out)| (c * area, b * BAND, out)))
             .collect();
-        jobs.into_par_iter().for_each(|(plane_at, first_row, out)| {
+        jobs.into_par_iter().with_max_len(1).for_each(|(plane_at, first_row, out)| {
             let range = plane(plane_at);
             let (x, y) = (&colour[range.clone()], &photo.rgb[range.clone()]);
             let partials = [0, 1, 2].map(|k| &partials[k][range.clone()]);

@@ -107,7 +107,7 @@ impl Adam {
             }
         }
         let isa = self.isa;
-        work.par_iter_mut().for_each(|chunk| update(isa, chunk, &rates, correction));
+        work.par_iter_mut().with_max_len(1).for_each(|chunk| update(isa, chunk, &rates, correction));
     }
 
     /// Rows `rows` of the moments, in that order; `None` starts with zero moments. Follows a change of the splats.

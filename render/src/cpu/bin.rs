@@ -6,6 +6,7 @@
 
 use rayon::prelude::*;
 
+use super::deal::{Places, first_places, parts};
 use super::project::{Projected, at};
 use super::simd::{Isa, Lanes};
 use crate::kernel;
@@ -90,7 +91,7 @@ pub(crate) fn bin(isa: Isa, ranked: &[Projected], width: usize, height: usize, b
     bins.tiles_y = height.div_ceil(TILE);
     let tiles = bins.tiles_x * bins.tiles_y;
     let limit = (bins.tiles_x, bins.tiles_y);
-    let emissions: Vec<Emission> = (ranked.par_chunks(CHUNK).enumerate())
+    let emissions: Vec<Emission> = (ranked.par_chunks(CHUNK).enumerate().with_max_len(1))
         .map(|(chunk, records)| {
             let mut out = Emission::default();
             emit(isa, records, (chunk * CHUNK) as u32, limit, &mut out);
@@ -98,31 +99,65 @@ pub(crate) fn bin(isa: Isa, ranked: &[Projected], width: usize, height: usize, b
         })
         .collect();
 
+    let total = emissions.iter().map(|emission| emission.pairs.len()).sum();
+    let part = emissions.len().div_ceil(parts(total)).max(1);
+    let counted = emissions.par_chunks(part).map(|part| {
+        let mut counts = vec![0; tiles];
+        part.iter().flat_map(|emission| &emission.pairs).for_each(|(tile, _)| counts[*tile as usize] += 1);
+        counts
+    });
+    let mut next: Vec<Vec<u32>> = counted.collect();
     bins.start.clear();
-    bins.start.resize(tiles + 1, 0);
-    bins.emitted.clear();
-    bins.emitted.push(0);
-    let mut total = 0;
-    for emission in &emissions {
-        for &(tile, _) in &emission.pairs {
-            bins.start[tile as usize + 1] += 1;
-        }
-        for &count in &emission.counts {
-            total += count;
-            bins.emitted.push(total);
-        }
+    first_places(&mut next, tiles, |start| bins.start.push(start));
+
+    bins.pairs.resize(total, Pair::default());
+    bins.place.resize(total, 0);
+    bins.emitted.resize(ranked.len() + 1, 0);
+    bins.emitted[0] = 0;
+    let (mut first, mut place, mut emitted) = (0, &mut bins.place[..], &mut bins.emitted[1..]);
+    let mut deals = Vec::with_capacity(next.len());
+    for (part, next) in emissions.chunks(part).zip(next) {
+        let own: usize = part.iter().map(|emission| emission.pairs.len()).sum();
+        let records = part.iter().map(|emission| emission.counts.len()).sum();
+        deals.push(Deal {
+            part,
+            next,
+            first,
+            place: place.split_off_mut(..own).expect("as many places as pairs"),
+            emitted: emitted.split_off_mut(..records).expect("as many records as were emitted"),
+        });
+        first += own as u32;
     }
-    for t in 0..tiles {
-        bins.start[t + 1] += bins.start[t];
-    }
-    let mut next = bins.start.clone();
-    bins.pairs.resize(total as usize, Pair::default());
-    bins.place.clear();
-    for &(tile, pair) in emissions.iter().flat_map(|emission| &emission.pairs) {
-        let to = &mut next[tile as usize];
-        bins.pairs[*to as usize] = pair;
-        bins.place.push(*to);
-        *to += 1;
+    let pairs = Places::new(&mut bins.pairs);
+    deals.into_par_iter().for_each(|deal| deal.out(&pairs));
+}
+
+/// Pairs that one thread deals out to their tiles.
+struct Deal<'a> {
+    part: &'a [Emission],
+    /// Where the next pair of each tile goes.
+    next: Vec<u32>,
+    /// Emission number of the first pair.
+    first: u32,
+    place: &'a mut [u32],
+    emitted: &'a mut [u32],
+}
+
+impl Deal<'_> {
+    fn out(mut self, pairs: &Places<Pair>) {
+        let emitted = self.part.iter().flat_map(|emission| &emission.pairs);
+        for (&(tile, pair), place) in emitted.zip(self.place) {
+            let to = &mut self.next[tile as usize];
+            // Safety: the places of a tile and a part are counted, and no others'.
+            unsafe { pairs.put(*to as usize, pair) };
+            *place = *to;
+            *to += 1;
+        }
+        let counts = self.part.iter().flat_map(|emission| &emission.counts);
+        for (count, emitted) in counts.zip(self.emitted) {
+            self.first += count;
+            *emitted = self.first;
+        }
     }
 }
 

@@ -5,11 +5,13 @@
 //! splats ─project→ records ─sort→ order ─bin→ pairs per tile ─rasterize→ frame
 //! upstream ─rasterize_backward→ moments per pair ─reduce→ moments per splat ─project_backward→ gradients
 //! ```
-//! Every reduction runs in the order of the data, not of the threads, so results do not depend on their number.
+//! Every reduction runs in the order of the data, not of the threads, so results do not depend on their number. Threads take one chunk or band at
+//! a time (`with_max_len(1)`): left to itself, rayon hands out quarters of a picture, and whoever has the lighter one waits.
 
 mod bin;
 pub mod ceiling;
 mod contribute;
+mod deal;
 mod moments;
 mod project;
 mod project_backward;
@@ -145,8 +147,10 @@ impl Renderer {
         self.project(splats, context, &view, &options);
         done(Stage::Project);
         bin::sort_by_depth(&self.records, &self.seen, &mut self.order, &mut self.sort);
-        self.ranked.clear();
-        self.ranked.extend(self.order.iter().map(|&i| self.records[i as usize]));
+        self.ranked.resize(self.order.len(), Projected::default());
+        self.ranked.par_chunks_mut(CHUNK).zip(self.order.par_chunks(CHUNK)).for_each(|(ranked, order)| {
+            ranked.iter_mut().zip(order).for_each(|(ranked, &i)| *ranked = self.records[i as usize]);
+        });
         done(Stage::Sort);
         let (width, height) = (camera.pinhole.width as usize, camera.pinhole.height as usize);
         bin::bin(self.isa, &self.ranked, width, height, &mut self.bins);
@@ -229,11 +233,14 @@ impl Renderer {
         let (own_seen, context_seen) = self.seen.split_at_mut(first_context / simd::LANES);
         let isa = self.isa;
         let draw = |splats: &Splats, options: &Options, own: f32, records: &mut [Projected], seen: &mut [u16]| {
-            records.par_chunks_mut(CHUNK).zip(seen.par_chunks_mut(CHUNK / simd::LANES)).enumerate().for_each(
-                |(chunk, (records, seen))| {
+            records
+                .par_chunks_mut(CHUNK)
+                .zip(seen.par_chunks_mut(CHUNK / simd::LANES))
+                .enumerate()
+                .with_max_len(1)
+                .for_each(|(chunk, (records, seen))| {
                     project::project(isa, splats, chunk * CHUNK, view, options, own, records, seen);
-                },
-            );
+                });
         };
         draw(splats, options, 1.0, &mut own_records[..splats.len()], own_seen);
         if let Some(context) = context {
@@ -269,7 +276,7 @@ impl Renderer {
             })
             .collect();
         let (bins, ranked, isa) = (&self.bins, &self.ranked, self.isa);
-        bands.into_par_iter().zip(self.visited.par_chunks_mut(bins.tiles_x)).enumerate().for_each(
+        bands.into_par_iter().zip(self.visited.par_chunks_mut(bins.tiles_x)).enumerate().with_max_len(1).for_each(
             |(row, (mut band, visited))| {
                 for (column, visited) in visited.iter_mut().enumerate() {
                     let tile = row * bins.tiles_x + column;
@@ -301,7 +308,7 @@ impl Renderer {
         self.rank_splats();
         self.sums.resize(self.order.len(), Moments::default());
         let (bins, order, moments) = (&self.bins, &self.order, &self.moments);
-        self.sums.par_chunks_mut(CHUNK).enumerate().for_each(|(chunk, sums)| {
+        self.sums.par_chunks_mut(CHUNK).enumerate().with_max_len(1).for_each(|(chunk, sums)| {
             let first = chunk * CHUNK;
             for (rank, sum) in (first..).zip(sums).filter(|(rank, _)| (order[*rank] as usize) < count) {
                 let mut total = [0.0f32; 16];
@@ -350,7 +357,7 @@ impl Renderer {
             }
         }
         let (isa, seen, sums, rank) = (self.isa, &self.seen, &self.sums, &self.rank);
-        let poses: Vec<[f32; 6]> = (sinks.par_iter_mut().enumerate())
+        let poses: Vec<[f32; 6]> = (sinks.par_iter_mut().enumerate().with_max_len(1))
             .map(|(chunk, sink)| {
                 let first = chunk * CHUNK;
                 let rank = &rank[first..(first + CHUNK).min(n)];
@@ -389,7 +396,7 @@ impl Bins {
             bands.push(band);
             rest = after;
         }
-        bands.into_par_iter().enumerate().for_each(|(row, mut moments)| {
+        bands.into_par_iter().enumerate().with_max_len(1).for_each(|(row, mut moments)| {
             for column in 0..self.tiles_x {
                 let tile = row * self.tiles_x + column;
                 let pairs = &self.pairs[self.start[tile] as usize..self.start[tile + 1] as usize];
