@@ -46,6 +46,9 @@ pub struct Kernels {
     pub width: u32,
     /// Pixels.
     pub height: u32,
+    /// Views that a GPU drew side by side; pairs and times are a share of theirs, of one view. Null where one was drawn alone.
+    #[serde(default)]
+    pub views: Option<u32>,
     /// Pairs of splat and tile.
     pub pairs: u64,
     /// Blocks of 4×4 pixels that the CPU's rasterizer visited, each for one splat.

@@ -29,7 +29,7 @@ pub use draw::draw;
 pub use ground::{Ground, Square};
 pub use lint::{Finding, Severity, lint};
 pub use lod::{Cut, context_of, sweep_of};
-pub use plan::{Mode, Plan, PlanError, PlanSettings, Task, ViewUse};
+pub use plan::{MOST_VIEWS_PER_STEP, Mode, Plan, PlanError, PlanSettings, Task, ViewUse};
 pub use planner::plan;
 pub use price::Price;
 pub use seams::{Face, Seams};

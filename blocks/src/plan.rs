@@ -10,11 +10,14 @@ use crate::ground::{Ground, HALO_SCALE};
 use crate::lod::{Cut, training_order};
 
 /// The version of [`Plan`] that this program writes and reads.
-pub const VERSION: u32 = 4;
+pub const VERSION: u32 = 5;
 /// The frame that carries a plan.
 pub const PLAN: Kind = Kind(*b"plan", VERSION);
 /// The deepest level a plan may have: 65,536 blocks a side.
 pub const MAX_LEVELS: u8 = 16;
+
+/// The most [`PlanSettings::views_per_step`].
+pub const MOST_VIEWS_PER_STEP: u32 = 16;
 
 /// No image is wider or higher, in pixels.
 const MAX_SIDE: u32 = 1 << 24;
@@ -45,6 +48,8 @@ pub struct PlanSettings {
     /// Steps of full images of the whole scene; plans of all modes cost about this much. Trees of a scene too large for one block
     /// (100,000 splats) cost what these steps do on so much of it, so that cost grows with the scene and not with its square.
     pub steps: u32,
+    /// Windows that a task draws before splats move: more of them fill a large GPU.
+    pub views_per_step: u32,
     /// Splats of the merged model.
     pub budget: u32,
     /// What leaves may lose of their PSNR for fewer splats, dB; 0 prunes nothing.
@@ -72,6 +77,7 @@ impl Default for PlanSettings {
             levels: None,
             seed: 0,
             steps: 3000,
+            views_per_step: 1,
             budget: 200_000,
             tolerance_db: 0.0,
             residual: 0.0,
@@ -118,7 +124,7 @@ pub struct Task {
     pub drawn: u32,
     /// Frozen splats of the context that a window shows, mean over the windows; an estimate.
     pub context_drawn: u32,
-    /// Optimiser steps, one window each.
+    /// Steps, counted in windows.
     pub steps: u32,
     /// Metres per pixel that the block is to resolve.
     pub rho_metres: f64,
@@ -206,8 +212,10 @@ impl Plan {
         if self.version != VERSION {
             return bad(format!("of version {}, this program reads {VERSION}", self.version));
         }
-        if !self.ground.is_sane() || self.levels > MAX_LEVELS || self.settings.sh_degree > 3 {
-            return bad("with a ground, depth or SH degree out of range".into());
+        let PlanSettings { sh_degree, views_per_step, .. } = self.settings;
+        let is_step = (1..=MOST_VIEWS_PER_STEP).contains(&views_per_step);
+        if !self.ground.is_sane() || self.levels > MAX_LEVELS || sh_degree > 3 || !is_step {
+            return bad("with a ground, depth, SH degree or number of views per step out of range".into());
         }
         let sane = |rho: &f64| rho.is_finite() && *rho > 0.0;
         if self.rho_metres.len() != usize::from(self.levels) + 1 || !self.rho_metres.iter().all(sane) {

@@ -7,7 +7,7 @@ use scene::{ArtefactId, BlockId, Capture};
 use crate::allot::{BLOCK_SPLATS, Needs, set_means};
 use crate::ground::{Ground, quantile};
 use crate::lod::{context_of, finished_neighbours, training_order};
-use crate::plan::{MAX_LEVELS, Mode, Plan, PlanError, PlanSettings, Task, VERSION};
+use crate::plan::{MAX_LEVELS, MOST_VIEWS_PER_STEP, Mode, Plan, PlanError, PlanSettings, Task, VERSION};
 use crate::select::{Selection, Sightings, full_views, select_level, usable};
 use crate::shown::Shown;
 
@@ -118,6 +118,10 @@ fn check(settings: &PlanSettings) -> Result<(), PlanError> {
     }
     if settings.sh_degree > 3 {
         return bad("sh_degree", format!("{} is not supported", settings.sh_degree), "give 0 to 3");
+    }
+    if !(1..=MOST_VIEWS_PER_STEP).contains(&settings.views_per_step) {
+        let problem = format!("{} is out of range", settings.views_per_step);
+        return bad("--views-per-step", problem, "give 1 to 16");
     }
     match settings.levels {
         Some(levels) if levels > MAX_LEVELS => {

@@ -10,6 +10,7 @@ use std::path::PathBuf;
 use std::str::FromStr;
 
 use blocks::{Mode, PlanSettings};
+use clap::builder::TypedValueParser;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use scene::Capture;
 use serde::{Serialize, Serializer};
@@ -190,6 +191,10 @@ pub(crate) struct PlanOptions {
     /// each view, from 500
     #[arg(long, value_name = "N|auto", default_value_t)]
     pub(crate) steps: Auto<u32>,
+    /// Draw N windows, at most 16, before splats move, in steps √N times as long. Steps are counted in windows all the same: this
+    /// fills a large GPU where photos are small, and saves a CPU nothing
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = views_per_step())]
+    pub(crate) views_per_step: u32,
     /// Splats of the merged model before pruning; auto takes three for each sparse point, from 5,000 to 2,000,000
     #[arg(long, value_name = "N|auto", default_value_t)]
     pub(crate) budget: Auto<u32>,
@@ -238,6 +243,7 @@ impl PlanOptions {
             levels: self.levels.0,
             seed: self.seed,
             steps: self.steps.0.unwrap_or_else(steps),
+            views_per_step: self.views_per_step,
             budget: self.budget.0.unwrap_or_else(budget),
             tolerance_db: self.tolerance_db,
             residual: self.residual,
@@ -467,6 +473,10 @@ pub(crate) struct PruneCapture {
     /// Store of the photos; by default the model's own where it is there, else a temporary one
     #[arg(long, value_name = "URL")]
     pub(crate) store: Option<String>,
+}
+
+fn views_per_step() -> impl TypedValueParser<Value = u32> {
+    clap::value_parser!(u32).range(1..=i64::from(blocks::MOST_VIEWS_PER_STEP))
 }
 
 fn share(text: &str) -> Result<f64, String> {

@@ -1,4 +1,5 @@
-//! The variants of training that `plat bench ablate` compares: each takes away one of the recipe's accelerations.
+//! The variants of training that `plat bench ablate` compares: each takes away one of the recipe's
+//! accelerations, or adds what is off by default.
 //!
 //! To add one: a row here.
 
@@ -20,7 +21,7 @@ pub(crate) struct Variant {
 pub(crate) const DEFAULT: &str = "default";
 
 /// All of them.
-pub(crate) const VARIANTS: [Variant; 6] = [
+pub(crate) const VARIANTS: [Variant; 7] = [
     Variant { name: DEFAULT, about: "the recipe as it is", recipe: |recipe| recipe },
     Variant {
         name: "fine",
@@ -50,6 +51,11 @@ pub(crate) const VARIANTS: [Variant; 6] = [
         name: "all-growth",
         about: "growth to the budget, whatever it brings; without its early end (train/src/need.rs)",
         recipe: |recipe| Recipe { growth: Growth { worth_db: 0.0, ..recipe.growth }, ..recipe },
+    },
+    Variant {
+        name: "four-views",
+        about: "four windows a step of the optimiser, which fill a large GPU (--views-per-step; gsplat, Ye et al. 2025)",
+        recipe: |recipe| Recipe { views_per_step: 4, ..recipe },
     },
 ];
 

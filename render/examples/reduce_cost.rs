@@ -98,7 +98,7 @@ impl Timed {
             Ok::<(), GpuError>(())
         };
         time(0, &mut |encoder| {
-            renderer.forward(encoder, splats, None, &camera(), &Options::default())?;
+            renderer.forward(encoder, splats, None, &[camera()], &Options::default())?;
             renderer.backward(encoder, splats, planes)
         })?;
         time(1, &mut |encoder| renderer.add_up_pairs(encoder, planes, Reduction::InOrder))?;

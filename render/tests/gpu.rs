@@ -214,7 +214,7 @@ fn a_lost_device_gives_no_result() {
         gpu.device().destroy();
         let error = match moment {
             0 => renderer.draw(&there, None, &camera, &options(false)).map(|_| ()),
-            1 => renderer.read_frame().map(|_| ()),
+            1 => renderer.read_frame(0).map(|_| ()),
             2 => there.download().map(|_| ()),
             _ => GpuRenderer::new(gpu.clone()).and_then(|mut fresh| {
                 let there = GpuSplats::upload(&gpu, &splats, 0)?;
@@ -462,6 +462,69 @@ fn a_renderer_keeps_nothing_from_view_to_view() {
 }
 
 #[test]
+fn views_side_by_side_are_each_as_if_alone() {
+    for gpu in gpus() {
+        let sizes = [(250, 187), (17, 33), (64, 64), (3, 5)];
+        let cameras: Vec<Camera> = (sizes.iter().enumerate())
+            .map(|(n, &(width, height))| {
+                let mut camera = camera_of(width, height);
+                camera.camera_from_world.translation.x += 0.2 * n as f64;
+                camera
+            })
+            .collect();
+        let mut random = Random(23);
+        let own = mixture(&mut random, &cameras[0], Kind::Behind, 900);
+        let frozen = mixture(&mut random, &cameras[0], Kind::Common, 300);
+        let options = options(true);
+        let upstreams: Vec<Upstream> = cameras.iter().map(|camera| noise(camera, &options)).collect();
+        let mut renderer = GpuRenderer::new(gpu.clone()).expect("a renderer");
+        let alone: Vec<Drawn> = (cameras.iter().zip(&upstreams))
+            .map(|(camera, upstream)| on_gpu(&gpu, &mut renderer, &own, Some(&frozen), camera, &options, upstream))
+            .collect();
+
+        let [there, context] = [&own, &frozen].map(|splats| GpuSplats::upload(&gpu, splats, 0).expect("splats fit"));
+        let mut encoder = gpu.encoder();
+        renderer.forward(&mut encoder, &there, Some(&context), &cameras, &options).expect("encoded");
+        let mut first = 0;
+        for upstream in &upstreams {
+            let planes = [&upstream.colour[..], &upstream.transmittance, &upstream.depth].concat();
+            gpu.write(&mut encoder, renderer.upstream(), 4 * first, &planes);
+            first += planes.len() as u64;
+        }
+        let planes = UpstreamPlanes { transmittance: true, depth: true };
+        renderer.backward(&mut encoder, &there, planes).expect("backward");
+        gpu.submit(encoder).expect("submitted");
+        assert!(!renderer.recover().expect("a status"));
+        for (n, alone) in alone.iter().enumerate() {
+            assert!(renderer.read_frame(n).expect("a frame") == alone.frame, "{}: view {n} differs", gpu.name());
+        }
+        // Gradients are those of the views, added in their order.
+        let together = renderer.read_gradients(&there).expect("gradients");
+        let mut sums: Vec<Vec<f32>> = vec![vec![0.0; own.len()]; columns(&together).len()];
+        let mut seen_by = vec![0; own.len()];
+        for Drawn { gradients, .. } in &alone {
+            for (i, seen_by) in seen_by.iter_mut().enumerate() {
+                if gradients.seen[i / 16] >> (i % 16) & 1 == 1 {
+                    *seen_by += 1;
+                    sums.iter_mut().zip(columns(gradients)).for_each(|(sum, (_, column))| sum[i] += column[i]);
+                }
+            }
+        }
+        assert!((0..=4).all(|views| seen_by.iter().filter(|&&n| n == views).count() > 3), "{seen_by:?}");
+        for ((name, column), sum) in columns(&together).iter().zip(&sums) {
+            assert!(column == sum, "{}: gradients of {name} differ", gpu.name());
+        }
+        let mut encoder = gpu.encoder();
+        let mut forward = |cameras: &[Camera]| renderer.forward(&mut encoder, &there, None, cameras, &options);
+        for number in [0, 17] {
+            let error = forward(&vec![cameras[0]; number]).expect_err("too few or too many").to_string();
+            assert!(error.contains("1 to 16"), "{error}");
+        }
+        assert!(renderer.read_stages().is_err() && renderer.read_frame(4).is_err());
+    }
+}
+
+#[test]
 fn no_splats_show_the_background() {
     let Some(gpu) = gpu() else { return };
     let mut renderer = GpuRenderer::new(gpu.clone()).expect("a renderer");
@@ -556,7 +619,7 @@ fn too_many_pairs_draw_nothing_until_there_is_room() {
     let mut renderer = GpuRenderer::new(gpu.clone()).expect("a renderer");
     let forward = |renderer: &mut GpuRenderer, splats: &GpuSplats| {
         let mut encoder = gpu.encoder();
-        renderer.forward(&mut encoder, splats, None, &camera, &options).expect("encoded");
+        renderer.forward(&mut encoder, splats, None, &[camera], &options).expect("encoded");
         renderer.backward(&mut encoder, splats, UpstreamPlanes::default()).expect("encoded");
         gpu.submit(encoder).expect("submitted");
         renderer.status().expect("a status")
@@ -568,7 +631,7 @@ fn too_many_pairs_draw_nothing_until_there_is_room() {
     let status = forward(&mut renderer, &few);
     assert!(status.overflow == 1 && status.seen == 0 && status.pairs == 0);
     let area = 250 * 187;
-    let frame = renderer.read_frame().expect("a frame");
+    let frame = renderer.read_frame(0).expect("a frame");
     assert!((0..3 * area).all(|i| frame.colour[i] == options.background[i / area]));
     assert!(renderer.recover().expect("room"), "an overflow must be told");
     let status = forward(&mut renderer, &many);

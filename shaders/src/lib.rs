@@ -22,6 +22,8 @@ pub const DIGITS: u32 = 256;
 pub const TILE: u32 = 16;
 /// Sums that a pair of splat and tile hands to its splat; see `rasterize_backward.wgsl` for their order.
 pub const MOMENTS: u32 = 13;
+/// Views drawn side by side, at most.
+pub const MOST_VIEWS: usize = 16;
 /// Splats of one workgroup of `reduce`.
 pub const REDUCE_SPLATS: u32 = 16;
 
@@ -47,7 +49,7 @@ impl Stage {
     }
 }
 
-/// The view, the record of a projected splat, the renderer's status and its constants.
+/// The views, the record of a projected splat, the renderer's status and its constants.
 pub const VIEW: &str = include_str!("../wgsl/view.wgsl");
 /// A snippet for every adapter, and its twin for those with subgroups.
 macro_rules! snippet {
@@ -60,7 +62,7 @@ macro_rules! snippet {
 const SPLAT: &str = include_str!("../wgsl/splat.wgsl");
 /// Which tiles an ellipse touches.
 const TILES: &str = include_str!("../wgsl/tiles.wgsl");
-/// A splat's opacity at a pixel.
+/// Whose a tile is, and a splat's opacity at a pixel.
 const BLEND: &str = include_str!("../wgsl/blend.wgsl");
 
 /// Which thread of its workgroup a thread is.
@@ -130,7 +132,7 @@ pub const SUBGROUPS: &[Stage] = &[
     ),
 ];
 
-/// A camera in single precision with what the stages want of it, and the sizes of what it draws. Uniform.
+/// A camera in single precision with what the stages want of it, and where its share of the buffers begins.
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
 #[repr(C)]
 pub struct View {
@@ -138,8 +140,6 @@ pub struct View {
     pub rows: [[f32; 4]; 3],
     /// Optical centre in the world; the last entry is not used.
     pub centre: [f32; 4],
-    /// Colour behind everything; the last entry is not used.
-    pub background: [f32; 4],
     /// Focal lengths, pixels.
     pub focal: [f32; 2],
     /// Principal point, pixels.
@@ -152,9 +152,30 @@ pub struct View {
     pub pixels: [u32; 2],
     /// Width and height in tiles.
     pub tiles: [u32; 2],
-    /// Trainable splats.
+    /// Tiles of the views before this one.
+    pub first_tile: u32,
+    /// Pixels of the views before this one.
+    pub first_pixel: u32,
+    /// Not used.
+    pub padding: [u32; 2],
+}
+
+/// Views that are drawn side by side, and the sizes of what they draw. What a splat is in a view is an entry; those of a splat are
+/// neighbours, view after view. Uniform.
+#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
+#[repr(C)]
+pub struct Views {
+    /// Colour behind everything; the last entry is not used.
+    pub background: [f32; 4],
+    /// How many there are.
+    pub count: u32,
+    /// Tiles of all.
+    pub tiles: u32,
+    /// Pixels of all.
+    pub pixels: u32,
+    /// Entries of trainable splats.
     pub own: u32,
-    /// Trainable splats and context.
+    /// Entries of trainable splats and context.
     pub total: u32,
     /// Pairs of splat and tile for which there is room.
     pub pair_capacity: u32,
@@ -162,17 +183,15 @@ pub struct View {
     pub antialiased: u32,
     /// 1: depth and own are wanted.
     pub extras: u32,
-    /// Not used.
-    pub padding: u32,
-    /// Not used.
-    pub more_padding: [u32; 2],
+    /// Each; those past `count` mean nothing.
+    pub each: [View; MOST_VIEWS],
 }
 
 /// The splats that a dispatch works on. Uniform.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
 #[repr(C)]
 pub struct Set {
-    /// Place of the first among all splats of the view.
+    /// Place of the first among all splats.
     pub first: u32,
     /// Their number.
     pub count: u32,
@@ -206,28 +225,28 @@ pub struct Pass {
     pub padding: [u32; 2],
 }
 
-/// What the device knows of a view and the host only when it asks.
+/// What the device knows of the views and the host only when it asks.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Pod, Zeroable)]
 #[repr(C)]
 pub struct Status {
-    /// 1: a view had more pairs than there is room for. Stays until the host clears it; until then nothing is drawn, and
+    /// 1: views had more pairs than there is room for. Stays until the host clears it; until then nothing is drawn, and
     /// no gradient is made.
     pub overflow: u32,
     /// 1: the device counted a splat's tiles once so and once otherwise. Never seen; an error if it is.
     pub fault: u32,
-    /// Pairs of the last view that was drawn.
+    /// Pairs of the last views that were drawn.
     pub pairs: u32,
-    /// Most pairs of a view, drawn or not, since the host cleared it.
+    /// Most pairs of views, drawn or not, since the host cleared it.
     pub most_pairs: u32,
-    /// Splats of the last view, own and context.
+    /// Visible entries of the last views, own and context.
     pub visible: u32,
-    /// Trainable splats of the last view.
+    /// Those of trainable splats.
     pub seen: u32,
-    /// All splats and one: entries of the first scan.
+    /// All entries and one: what the first scan adds up.
     pub splat_slots: u32,
-    /// Visible splats and one: entries of the second scan.
+    /// Visible entries and one: what the second scan adds up.
     pub visible_slots: u32,
-    /// Entries of the histogram of visible splats.
+    /// Entries of the histogram of visible ones.
     pub visible_digits: u32,
     /// Entries of the histogram of pairs.
     pub pair_digits: u32,
@@ -235,9 +254,9 @@ pub struct Status {
 
 /// Places of the indirect dispatches in the renderer's `args` buffer, three words each.
 pub mod args {
-    /// A thread for each visible splat.
+    /// A thread for each visible entry.
     pub const VISIBLE: u64 = 0;
-    /// A workgroup of `radix` for each block of visible splats.
+    /// A workgroup of `radix` for each block of visible entries.
     pub const VISIBLE_SORT: u64 = 1;
     /// A workgroup of `scan` for each block of their histogram.
     pub const VISIBLE_DIGITS: u64 = 2;
@@ -249,7 +268,7 @@ pub mod args {
     pub const PAIR_SORT: u64 = 5;
     /// A workgroup of `scan` for each block of their histogram.
     pub const PAIR_DIGITS: u64 = 6;
-    /// A thread for each trainable splat that was seen.
+    /// A thread for each visible entry of a trainable splat.
     pub const SEEN: u64 = 7;
     /// A workgroup of `reduce` for each sixteen of them.
     pub const SEEN_REDUCE: u64 = 8;

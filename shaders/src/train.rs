@@ -2,7 +2,7 @@
 
 use bytemuck::{Pod, Zeroable};
 
-use crate::{Stage, VIEW};
+use crate::{MOST_VIEWS, Stage, VIEW};
 
 /// What training keeps on the device, and the constants of its stages.
 const BOOKS: &str = include_str!("../wgsl/books.wgsl");
@@ -30,21 +30,21 @@ pub struct Books {
     pub adam_steps: u32,
     /// Steps left out.
     pub skipped: u32,
-    /// Steps in `sum`.
+    /// Views in `sum`.
     pub count: u32,
     /// Mean absolute errors of the epoch under way.
     pub sum: f32,
-    /// Of the last step that is over.
+    /// Mean over the views of the last step that is over.
     pub loss: f32,
     /// 1: the step under way counts.
     pub good: u32,
-    /// What the gradient of L1 is scaled by.
-    pub l1_scale: f32,
-    /// What the gradient of SSIM is scaled by.
-    pub ssim_scale: f32,
+    /// Not used.
+    pub padding: u32,
+    /// Of each view of a step: what the gradients of L1 and of SSIM are scaled by.
+    pub scales: [[f32; 2]; MOST_VIEWS],
 }
 
-/// A photo beside a frame. Uniform.
+/// A photo beside a frame.
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
 #[repr(C)]
 pub struct Window {
@@ -56,14 +56,30 @@ pub struct Window {
     pub tiles_x: u32,
     /// Height in tiles.
     pub tiles_y: u32,
-    /// Weight of 1 - SSIM.
-    pub lambda: f32,
+    /// Tiles of the photos before this one.
+    pub first_tile: u32,
+    /// Pixels of the photos before this one.
+    pub first_pixel: u32,
+    /// Bytes of the photos before this one.
+    pub first_byte: u32,
     /// 1: the photo has a mask.
     pub masked: u32,
+}
+
+/// The photos of a step. Uniform.
+#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
+#[repr(C)]
+pub struct Windows {
+    /// How many there are.
+    pub count: u32,
+    /// Tiles of all.
+    pub tiles: u32,
+    /// Weight of 1 - SSIM.
+    pub lambda: f32,
     /// 1: a pixel counts by the share of it that the trainable splats explain.
     pub by_share: u32,
-    /// Not used.
-    pub padding: u32,
+    /// Each; those past `count` mean nothing.
+    pub each: [Window; MOST_VIEWS],
 }
 
 /// Step sizes of one step and the pull of the regularisers, for one bank of columns. Uniform.
@@ -96,8 +112,8 @@ pub struct Rates {
     pub columns: u32,
     /// Entries from a column to the next.
     pub stride: u32,
-    /// Pixels of the window.
-    pub pixels: f32,
+    /// Views of the step.
+    pub views: u32,
     /// Not used.
     pub padding: [u32; 2],
 }

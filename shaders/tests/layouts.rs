@@ -5,8 +5,8 @@ use std::mem::offset_of;
 
 use naga::valid::{Capabilities, ValidationFlags, Validator};
 use naga::{Module, TypeInner};
-use shaders::train::{self, Books, Rates, Window};
-use shaders::{Pass, Planes, RASTERIZE_BACKWARD_ATOMICS, STAGES, SUBGROUPS, Set, Stage, Status, View};
+use shaders::train::{self, Books, Rates, Window, Windows};
+use shaders::{Pass, Planes, RASTERIZE_BACKWARD_ATOMICS, STAGES, SUBGROUPS, Set, Stage, Status, View, Views};
 
 /// Name and byte offset of each member, and the size of the whole.
 type Layout = (Vec<(String, usize)>, usize);
@@ -19,17 +19,18 @@ macro_rules! layout {
 
 fn twins() -> BTreeMap<&'static str, Layout> {
     [
-        layout!(View: rows, centre, background, focal, principal, cone_min, cone_max, pixels, tiles, own, total,
-            pair_capacity, antialiased, extras, padding, more_padding),
+        layout!(View: rows, centre, focal, principal, cone_min, cone_max, pixels, tiles, first_tile, first_pixel, padding),
+        layout!(Views: background, count, tiles, pixels, own, total, pair_capacity, antialiased, extras, each),
         layout!(Set: first, count, stride, sh_degree),
         layout!(Planes: transmittance, depth, padding),
         layout!(Pass: slot, shift, padding),
         layout!(Status: overflow, fault, pairs, most_pairs, visible, seen, splat_slots, visible_slots, visible_digits,
             pair_digits),
-        layout!(Books: done, adam_steps, skipped, count, sum, loss, good, l1_scale, ssim_scale),
-        layout!(Window: width, height, tiles_x, tiles_y, lambda, masked, by_share, padding),
+        layout!(Books: done, adam_steps, skipped, count, sum, loss, good, padding, scales),
+        layout!(Window: width, height, tiles_x, tiles_y, first_tile, first_pixel, first_byte, masked),
+        layout!(Windows: count, tiles, lambda, by_share, each),
         layout!(Rates: mean, log_scale, quat, opacity, sh_dc, sh_rest, beta2, opacity_pull, needle_pull, log_scale_min,
-            log_scale_max, columns, stride, pixels, padding),
+            log_scale_max, columns, stride, views, padding),
     ]
     .into()
 }
@@ -125,6 +126,7 @@ fn constants_agree() {
         ("GROUP", shaders::GROUP),
         ("TILE", shaders::TILE),
         ("MOMENTS", shaders::MOMENTS),
+        ("MOST_VIEWS", shaders::MOST_VIEWS as u32),
         ("SCAN_BLOCK", shaders::SCAN_BLOCK),
         ("RADIX_BLOCK", shaders::RADIX_BLOCK),
         ("DIGITS", shaders::DIGITS),

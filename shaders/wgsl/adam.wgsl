@@ -1,5 +1,5 @@
-// Stage `adam`: a step of the splats that the view has seen; a thread a splat, a dispatch a bank of columns. A splat outside
-// the view keeps its parameters and its moments: its gradient is not zero, it is unknown.
+// Stage `adam`: a step of the splats that the step's views have seen; a thread a splat, a dispatch a bank of columns. A splat outside
+// of them keeps its parameters and its moments: its gradient is not zero, it is unknown.
 
 @group(0) @binding(0) var<uniform> rates: Rates;
 @group(0) @binding(1) var<storage, read> status: Status;
@@ -58,7 +58,12 @@ fn splat_of(group: vec3<u32>, groups: vec3<u32>, local: u32) -> u32 {
     if place >= status.seen || books.good == 0u {
         return NOBODY;
     }
-    return visible[place];
+    let i = visible[place] / rates.views;
+    // What other views saw of the same splat lies beside it: the first of them is its thread.
+    if place > 0u && visible[place - 1u] / rates.views == i {
+        return NOBODY;
+    }
+    return i;
 }
 
 // The first bank: mean, ln(scale), quaternion, opacity, constant colour.

@@ -1,4 +1,12 @@
-// A splat's opacity at a pixel, as both directions of the rasterizer compute it.
+// What both directions of the rasterizer compute: whose a tile is, and a splat's opacity at a pixel.
+
+fn view_of_tile(tile: u32) -> u32 {
+    var v = 0u;
+    while v + 1u < views.count && tile >= views.each[v + 1u].first_tile {
+        v++;
+    }
+    return v;
+}
 
 struct Touch {
     delta: vec2<f32>,

@@ -7,14 +7,15 @@ struct Books {
     adam_steps: u32,
     // Steps left out, as their loss was not finite.
     skipped: u32,
-    // Of the epoch under way: steps, and the sum of their mean absolute errors.
+    // Of the epoch under way: views, and the sum of their mean absolute errors.
     count: u32,
     sum: f32,
-    // Of the last step: the loss, whether it counts, and what gradients of L1 and of SSIM are scaled by.
+    // Of the last step: the mean loss of its views, and whether it counts.
     loss: f32,
     good: u32,
-    l1_scale: f32,
-    ssim_scale: f32,
+    padding: u32,
+    // Of each of its views: what gradients of L1 and of SSIM are scaled by.
+    scales: array<vec2<f32>, MOST_VIEWS>,
 }
 
 // A photo beside a frame.
@@ -24,13 +25,24 @@ struct Window {
     // Width and height in tiles.
     tiles_x: u32,
     tiles_y: u32,
-    // Weight of 1 - SSIM.
-    lambda: f32,
+    // Tiles, pixels and bytes of the photos before this one.
+    first_tile: u32,
+    first_pixel: u32,
+    first_byte: u32,
     // 1: the photo has a mask.
     masked: u32,
+}
+
+// The photos of a step.
+struct Windows {
+    count: u32,
+    // Of all.
+    tiles: u32,
+    // Weight of 1 - SSIM.
+    lambda: f32,
     // 1: a pixel counts by the share of it that the trainable splats explain.
     by_share: u32,
-    padding: u32,
+    each: array<Window, MOST_VIEWS>,
 }
 
 // Step sizes of one step and the pull of the regularisers, for one bank of columns.
@@ -50,8 +62,8 @@ struct Rates {
     columns: u32,
     // Entries from a column to the next.
     stride: u32,
-    // Pixels of the window, which undo the loss's mean.
-    pixels: f32,
+    // Views of the step.
+    views: u32,
     padding: vec2<u32>,
 }
 

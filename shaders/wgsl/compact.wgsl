@@ -1,6 +1,6 @@
-// Stage `compact`: the visible splats in the order of their indices, with their depths as keys to sort by.
+// Stage `compact`: the visible entries in their order, with their depths as keys to sort by.
 
-@group(0) @binding(0) var<uniform> view: View;
+@group(0) @binding(0) var<uniform> views: Views;
 @group(0) @binding(1) var<storage, read> seen: array<u32>;
 @group(0) @binding(2) var<storage, read> sums: array<u32>;
 @group(0) @binding(3) var<storage, read> records: array<Record>;
@@ -14,7 +14,7 @@ fn compact(
     @builtin(local_invocation_index) local: u32,
 ) {
     let i = linear(group, groups, local);
-    if i >= view.total || seen[i] == 0u {
+    if i >= views.total || seen[i] == 0u {
         return;
     }
     visible[sums[i]] = i;

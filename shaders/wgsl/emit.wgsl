@@ -1,6 +1,6 @@
-// Stage `emit`: the pairs of splat and tile, in the order of depth and then of tiles; a thread a visible splat.
+// Stage `emit`: the pairs of splat and tile, in the order of depth and then of tiles; a thread a visible entry.
 
-@group(0) @binding(0) var<uniform> view: View;
+@group(0) @binding(0) var<uniform> views: Views;
 @group(0) @binding(1) var<storage, read_write> status: Status;
 @group(0) @binding(2) var<storage, read> records: array<Record>;
 @group(0) @binding(3) var<storage, read> order: array<u32>;
@@ -26,14 +26,16 @@ fn emit(
     let end = sums[rank + 1u];
     first[i] = pair;
     let r = records[i];
-    let box = span(r, view.tiles);
+    let tiles = views.each[i % views.count].tiles;
+    let first_tile = views.each[i % views.count].first_tile;
+    let box = span(r, tiles);
     let e = ellipse(r);
     for (var y = box.first.y; y < box.end.y; y++) {
         for (var x = box.first.x; x < box.end.x; x++) {
             if touches(e, vec2<u32>(x, y)) {
                 if pair < end {
                     pair_splat[pair] = i;
-                    keys[pair] = y * view.tiles.x + x;
+                    keys[pair] = first_tile + y * tiles.x + x;
                     values[pair] = pair;
                 }
                 pair++;

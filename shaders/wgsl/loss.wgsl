@@ -1,20 +1,23 @@
-// Stage `loss`: (1 - lambda) L1 + lambda (1 - SSIM) of a frame against its photo, and the gradient of that. A workgroup is a
+// Stage `loss`: (1 - lambda) L1 + lambda (1 - SSIM) of each view of a step against its photo, and the gradient of that. A workgroup is a
 // tile of one colour plane; windows are smoothed along rows, then along columns, in workgroup memory.
 //
 //   loss_forward → SSIM's derivatives, sums of tiles → judge → loss, scales → loss_backward → upstream
 
-@group(0) @binding(0) var<uniform> window: Window;
-// Planes: red, green, blue, transmittance and, where pixels count by share, depth and own.
+@group(0) @binding(0) var<uniform> windows: Windows;
+// Of each view planes: red, green, blue, transmittance and, where pixels count by share, depth and own.
 @group(0) @binding(1) var<storage, read> frame: array<f32>;
-// Bytes: red, green and blue planes, then the mask where there is one.
+// Bytes of each: red, green and blue planes, then the mask where there is one.
 @group(0) @binding(2) var<storage, read> photo: array<u32>;
-// dSSIM/dmu, dSSIM/dE[x^2], dSSIM/dE[xy], each times the pixel's weight; three colour planes each.
+// Of each view dSSIM/dmu, dSSIM/dE[x^2], dSSIM/dE[xy], each times the pixel's weight; three colour planes each.
 @group(0) @binding(3) var<storage, read_write> partials: array<f32>;
-// Of each tile of each colour: sums of w |x - y|, of w SSIM and, of the first colour, of w.
+// Of each tile of each colour of each view: sums of w |x - y|, of w SSIM and, of the first colour, of w.
 @group(0) @binding(4) var<storage, read_write> sums: array<vec4<f32>>;
 @group(0) @binding(5) var<storage, read_write> books: Books;
 @group(0) @binding(6) var<storage, read_write> upstream: array<f32>;
 @group(0) @binding(7) var<storage, read> status: Status;
+
+// The one that this workgroup is at.
+var<private> window: Window;
 
 const C1: f32 = 0.0001;
 const C2: f32 = 0.0009;
@@ -27,7 +30,13 @@ var<workgroup> rows: array<array<f32, 416>, 5>;
 var<workgroup> totals: array<vec4<f32>, 256>;
 
 fn photo_byte(i: u32) -> u32 {
-    return byte_of(photo[i / 4u], i);
+    let at = window.first_byte + i;
+    return byte_of(photo[at / 4u], at);
+}
+
+// Pixel i of the frame's planes.
+fn drawn(i: u32) -> f32 {
+    return frame[planes_of(windows.by_share) * window.first_pixel + i];
 }
 
 // Of a colour plane, 0 to 1.
@@ -45,17 +54,18 @@ fn weight(pixel: u32) -> f32 {
     if is_hidden(pixel) {
         return 0.0;
     }
-    if window.by_share == 0u {
+    if windows.by_share == 0u {
         return 1.0;
     }
     let area = window.width * window.height;
-    let transmittance = frame[3u * area + pixel];
+    let transmittance = drawn(3u * area + pixel);
     let open = 0.5 * transmittance + 1e-4;
-    let share = (frame[5u * area + pixel] + open) / (1.0 - transmittance + open);
+    let share = (drawn(5u * area + pixel) + open) / (1.0 - transmittance + open);
     return share * share;
 }
 
 struct Place {
+    view: u32,
     colour: u32,
     // Of the tile's first pixel.
     x: u32,
@@ -63,10 +73,16 @@ struct Place {
 }
 
 fn place(group: vec3<u32>, groups: vec3<u32>) -> Place {
-    let tile = group.y * groups.x + group.x;
+    let n = group.y * groups.x + group.x;
+    var v = 0u;
+    while v + 1u < windows.count && n >= 3u * windows.each[v + 1u].first_tile {
+        v++;
+    }
+    window = windows.each[v];
+    let tile = n - 3u * window.first_tile;
     let tiles = window.tiles_x * window.tiles_y;
     let of_plane = tile % tiles;
-    return Place(tile / tiles, of_plane % window.tiles_x * TILE, of_plane / window.tiles_x * TILE);
+    return Place(v, tile / tiles, of_plane % window.tiles_x * TILE, of_plane / window.tiles_x * TILE);
 }
 
 // The pixel at entry k of a tile's surroundings, or one past all where that is outside the image.
@@ -95,7 +111,7 @@ fn loss_forward(
         var y = 0.0;
         // Hidden pixels are to SSIM what lies outside the image: zero in both.
         if i < area && !is_hidden(i) {
-            x = frame[at.colour * area + i];
+            x = drawn(at.colour * area + i);
             y = level(at.colour * area + i);
         }
         near_x[k] = x;
@@ -149,10 +165,11 @@ fn loss_forward(
         let i = py * window.width + px;
         let w = weight(i);
         let out = at.colour * area + i;
-        partials[out] = w * (2.0 * my * (a2 - a1) * i12 - 2.0 * mx * ssim * (i1 - i2));
-        partials[3u * area + out] = -w * (ssim * i2);
-        partials[6u * area + out] = w * (2.0 * a1 * i12);
-        let difference = frame[out] - level(out);
+        let to = 9u * window.first_pixel + out;
+        partials[to] = w * (2.0 * my * (a2 - a1) * i12 - 2.0 * mx * ssim * (i1 - i2));
+        partials[3u * area + to] = -w * (ssim * i2);
+        partials[6u * area + to] = w * (2.0 * a1 * i12);
+        let difference = drawn(out) - level(out);
         total = vec4<f32>(w * abs(difference), w * ssim, select(0.0, w, at.colour == 0u), 0.0);
     }
     total = in_order(total, local);
@@ -174,14 +191,31 @@ fn in_order(value: vec4<f32>, local: u32) -> vec4<f32> {
     return totals[0];
 }
 
-// One workgroup: the loss, and whether the step counts. Without room for the view's pairs the step is not over.
+// One workgroup: the loss, and whether the step counts. Without room for the views' pairs the step is not over.
 @compute @workgroup_size(256)
 fn judge(@builtin(local_invocation_index) local: u32) {
-    var total = vec4<f32>(0.0);
-    for (var k = local; k < 3u * window.tiles_x * window.tiles_y; k += GROUP) {
-        total += sums[k];
+    var loss = 0.0;
+    var l1 = 0.0;
+    for (var v = 0u; v < windows.count; v++) {
+        let here = windows.each[v];
+        var total = vec4<f32>(0.0);
+        for (var k = local; k < 3u * here.tiles_x * here.tiles_y; k += GROUP) {
+            total += sums[3u * here.first_tile + k];
+        }
+        total = in_order(total, local);
+        // Nothing counts: there is no loss either. Not so of NaN.
+        if !(is_finite(total.z) && total.z <= 0.0) {
+            let norm = 1.0 / (3.0 * total.z);
+            l1 += total.x * norm;
+            loss += (1.0 - windows.lambda) * (total.x * norm) + windows.lambda * (1.0 - total.y * norm);
+            if local == 0u {
+                books.scales[v] = vec2<f32>((1.0 - windows.lambda) * norm, -windows.lambda * norm);
+            }
+        } else if local == 0u {
+            books.scales[v] = vec2<f32>(0.0);
+        }
+        workgroupBarrier(); // the sum is taken before the next one begins
     }
-    total = in_order(total, local);
     if local != 0u {
         return;
     }
@@ -189,23 +223,12 @@ fn judge(@builtin(local_invocation_index) local: u32) {
     if status.overflow != 0u {
         return;
     }
-    var norm = 0.0;
-    var l1 = 0.0;
-    var loss = 0.0;
-    // Nothing counts: there is no loss either. Not so of NaN.
-    if !(is_finite(total.z) && total.z <= 0.0) {
-        norm = 1.0 / (3.0 * total.z);
-        l1 = total.x * norm;
-        loss = (1.0 - window.lambda) * l1 + window.lambda * (1.0 - total.y * norm);
-    }
     books.done++;
-    books.loss = loss;
-    books.l1_scale = (1.0 - window.lambda) * norm;
-    books.ssim_scale = -window.lambda * norm;
+    books.loss = loss / f32(windows.count);
     if is_finite(loss) {
         books.good = 1u;
         books.adam_steps++;
-        books.count++;
+        books.count += windows.count;
         books.sum += l1;
     } else {
         books.skipped++;
@@ -227,7 +250,7 @@ fn loss_backward(
     for (var k = local; k < SIDE * SIDE; k += GROUP) {
         let i = surrounding(at, k);
         let inside = i < area;
-        let source = plane + select(0u, i, inside);
+        let source = 9u * window.first_pixel + plane + select(0u, i, inside);
         near_x[k] = select(0.0, partials[source], inside);
         near_y[k] = select(0.0, partials[3u * area + source], inside);
         near_z[k] = select(0.0, partials[6u * area + source], inside);
@@ -253,7 +276,7 @@ fn loss_backward(
     }
     let i = py * window.width + px;
     if is_hidden(i) {
-        upstream[plane + i] = 0.0;
+        upstream[5u * window.first_pixel + plane + i] = 0.0;
         return;
     }
     let centre = local + REACH * TILE;
@@ -265,10 +288,11 @@ fn loss_backward(
         }
         means[q] = sum;
     }
-    let x = frame[plane + i];
+    let x = drawn(plane + i);
     let y = level(plane + i);
     let w = weight(i);
+    let scales = books.scales[at.view];
     let by_l1 = select(select(0.0, -w, x < y), w, y < x);
     let by_ssim = means[0] + 2.0 * x * means[1] + y * means[2];
-    upstream[plane + i] = fma(by_l1, books.l1_scale, by_ssim * books.ssim_scale);
+    upstream[5u * window.first_pixel + plane + i] = fma(by_l1, scales.x, by_ssim * scales.y);
 }

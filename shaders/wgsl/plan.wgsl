@@ -1,8 +1,8 @@
 // Stage `plan`: one thread decides, between the stages, how many workgroups the next ones take.
 
-@group(0) @binding(0) var<uniform> view: View;
+@group(0) @binding(0) var<uniform> views: Views;
 @group(0) @binding(1) var<storage, read_write> status: Status;
-// Exclusive sums of `seen` over all splats (plan_visible) or of the visible splats' tiles (plan_pairs).
+// Exclusive sums of `seen` over all entries (plan_visible) or of the visible ones' tiles (plan_pairs).
 @group(0) @binding(2) var<storage, read_write> sums: array<u32>;
 @group(0) @binding(3) var<storage, read_write> args: array<u32>;
 
@@ -28,8 +28,8 @@ fn plan(place: u32, count: u32, block: u32) {
 // Before the first scan.
 @compute @workgroup_size(1)
 fn plan_start() {
-    sums[view.total] = 0u;
-    status.splat_slots = view.total + 1u;
+    sums[views.total] = 0u;
+    status.splat_slots = views.total + 1u;
 }
 
 // After the first scan.
@@ -37,8 +37,8 @@ fn plan_start() {
 fn plan_visible() {
     // After an overflow nothing is visible until the host has made room.
     let drawn = status.overflow == 0u;
-    let visible = select(0u, sums[view.total], drawn);
-    let seen = select(0u, sums[view.own], drawn);
+    let visible = select(0u, sums[views.total], drawn);
+    let seen = select(0u, sums[views.own], drawn);
     status.visible = visible;
     status.seen = seen;
     status.visible_slots = visible + 1u;
@@ -59,7 +59,7 @@ fn plan_pairs() {
         pairs = sums[status.visible];
     }
     status.most_pairs = max(status.most_pairs, pairs);
-    if pairs > view.pair_capacity {
+    if pairs > views.pair_capacity {
         status.overflow = 1u;
         status.seen = 0u;
         pairs = 0u;

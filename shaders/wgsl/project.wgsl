@@ -1,4 +1,4 @@
-// Stage `project`: splats in the world become ellipses in the view; a thread a splat.
+// Stage `project`: splats in the world become ellipses in the view; a thread a splat in a view.
 
 @group(0) @binding(6) var<storage, read_write> records: array<Record>;
 @group(0) @binding(7) var<storage, read_write> seen: array<u32>;
@@ -12,13 +12,14 @@ fn project(
     @builtin(num_workgroups) groups: vec3<u32>,
     @builtin(local_invocation_index) local: u32,
 ) {
-    let i = linear(group, groups, local);
-    if i >= splats.count {
+    let entry = linear(group, groups, local);
+    if entry >= splats.count * views.count {
         return;
     }
-    let n = splats.first + i;
+    view = views.each[entry % views.count];
+    let n = splats.first * views.count + entry;
     var record: Record;
-    let drawn = project_splat(i, &record);
+    let drawn = project_splat(entry / views.count, &record);
     seen[n] = u32(drawn);
     sums[n] = u32(drawn);
     if drawn {
@@ -55,7 +56,7 @@ fn project_splat(i: u32, record: ptr<function, Record>) -> bool {
     let e = ewa(i, p);
     let inv_det = 1.0 / e.det1;
     var o = opacity(i);
-    if view.antialiased != 0u {
+    if views.antialiased != 0u {
         o *= sqrt(e.det0 * inv_det);
     }
     // The squared radius in sigmas at which alpha falls to 1/255.

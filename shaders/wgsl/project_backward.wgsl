@@ -1,5 +1,5 @@
-// Stage `project_backward`: from a splat's sums in the view to the gradient of its parameters; a thread a trainable splat
-// that was seen. The chain of `project` in reverse, recomputed from the parameters instead of stored.
+// Stage `project_backward`: from a splat's sums in the views that saw it to the gradient of its parameters; a thread a trainable
+// splat that was seen. The chain of `project` in reverse, recomputed from the parameters instead of stored.
 
 @group(0) @binding(6) var<storage, read> status: Status;
 @group(0) @binding(7) var<storage, read> visible: array<u32>;
@@ -9,11 +9,19 @@
 @group(0) @binding(10) var<storage, read_write> out_b: array<f32>;
 @group(0) @binding(11) var<storage, read_write> out_c: array<f32>;
 @group(0) @binding(12) var<storage, read_write> out_d: array<f32>;
-// Columns: length of the mean's gradient in pixels, the same summed without cancellation, sum of alpha T.
-@group(0) @binding(13) var<storage, read_write> statistics: array<f32>;
+// Of each entry: length of the mean's gradient in pixels, the same summed without cancellation, sum of alpha T, pixels of the view.
+@group(0) @binding(13) var<storage, read_write> statistics: array<vec4<f32>>;
+
+// Whether a view before has left its gradient already, so that this one's is added to that.
+var<private> again: bool;
 
 fn put(k: u32, i: u32, value: f32) {
-    out_a[k * splats.stride + i] = value;
+    let at = k * splats.stride + i;
+    var sum = value;
+    if again {
+        sum += out_a[at];
+    }
+    out_a[at] = sum;
 }
 
 fn put3(k: u32, i: u32, value: vec3<f32>) {
@@ -25,19 +33,28 @@ fn put3(k: u32, i: u32, value: vec3<f32>) {
 // One basis function of coefficient b: writes its gradient; returns what the colour changes by along it.
 fn put_coefficient(b: u32, i: u32, basis: f32, d_colour: vec3<f32>) -> f32 {
     let n = splats.stride;
-    let d = d_colour * basis;
+    var d = d_colour * basis;
     if b < 6u {
         let k = (3u * b - 3u) * n + i;
+        if again {
+            d += vec3<f32>(out_b[k], out_b[k + n], out_b[k + 2u * n]);
+        }
         out_b[k] = d.x;
         out_b[k + n] = d.y;
         out_b[k + 2u * n] = d.z;
     } else if b < 11u {
         let k = (3u * b - 18u) * n + i;
+        if again {
+            d += vec3<f32>(out_c[k], out_c[k + n], out_c[k + 2u * n]);
+        }
         out_c[k] = d.x;
         out_c[k + n] = d.y;
         out_c[k + 2u * n] = d.z;
     } else {
         let k = (3u * b - 33u) * n + i;
+        if again {
+            d += vec3<f32>(out_d[k], out_d[k + n], out_d[k + 2u * n]);
+        }
         out_d[k] = d.x;
         out_d[k + n] = d.y;
         out_d[k + 2u * n] = d.z;
@@ -51,11 +68,27 @@ fn project_backward(
     @builtin(num_workgroups) groups: vec3<u32>,
     @builtin(local_invocation_index) local: u32,
 ) {
-    let place = linear(group, groups, local);
-    if place >= status.seen {
+    let first = linear(group, groups, local);
+    if first >= status.seen {
         return;
     }
-    let i = visible[place];
+    let i = visible[first] / views.count;
+    if first > 0u && visible[first - 1u] / views.count == i {
+        return; // another thread's
+    }
+    for (var place = first; place < status.seen; place++) {
+        let entry = visible[place];
+        if entry / views.count != i {
+            break;
+        }
+        view = views.each[entry % views.count];
+        again = place > first;
+        go_back(i, place);
+    }
+}
+
+// A splat's gradient by one view.
+fn go_back(i: u32, place: u32) {
     let s = place * MOMENTS;
     let mean = column3(0u, i);
     let p = camera_point(mean);
@@ -69,9 +102,12 @@ fn project_backward(
         fma(conic.y, sums[s + 1u], conic.z * sums[s + 2u]),
     );
     let along = vec2<f32>(sums[s + 11u], sums[s + 12u]);
-    statistics[i] = sqrt(d_mean.x * d_mean.x + d_mean.y * d_mean.y);
-    statistics[splats.stride + i] = sqrt(along.x * along.x + along.y * along.y);
-    statistics[2u * splats.stride + i] = sums[s + 10u];
+    statistics[place] = vec4<f32>(
+        sqrt(d_mean.x * d_mean.x + d_mean.y * d_mean.y),
+        sqrt(along.x * along.x + along.y * along.y),
+        sums[s + 10u],
+        f32(view.pixels.x * view.pixels.y),
+    );
 
     // dcovariance' = -K G K with G the symmetric gradient of the conic K.
     let g = -0.5 * vec3<f32>(sums[s + 3u], sums[s + 4u], sums[s + 5u]);
@@ -85,7 +121,7 @@ fn project_backward(
 
     // Opacity: the sum of v is o_eff dL/do_eff, and o_eff = o sqrt(det0 / det1) in anti-aliased mode.
     put(10u, i, sums[s] * (1.0 - opacity(i)));
-    if view.antialiased != 0u {
+    if views.antialiased != 0u {
         let ratio = e.det0 * inv_det;
         let d_ratio = 0.5 * sums[s] / max(ratio, 1e-12);
         d_cov.x += d_ratio * (e.cov.z * inv_det - ratio * conic.x);

@@ -1,11 +1,11 @@
 // Stage `rasterize`: a workgroup draws a tile, a thread a pixel, front to back until every pixel is finished.
 
-@group(0) @binding(0) var<uniform> view: View;
+@group(0) @binding(0) var<uniform> views: Views;
 @group(0) @binding(1) var<storage, read> tile_ranges: array<vec2<u32>>;
 @group(0) @binding(2) var<storage, read> sorted: array<u32>;
 @group(0) @binding(3) var<storage, read> pair_splat: array<u32>;
 @group(0) @binding(4) var<storage, read> records: array<Record>;
-// Planes: red, green, blue, transmittance and, with extras, depth and own.
+// Of each view planes: red, green, blue, transmittance and, with extras, depth and own.
 @group(0) @binding(5) var<storage, read_write> frame: array<f32>;
 // For each pixel the end of what was blended there: one past its last pair, 0 if there was none.
 @group(0) @binding(6) var<storage, read_write> last: array<u32>;
@@ -27,12 +27,14 @@ fn rasterize(
 ) {
     // More workgroups than tiles: the last ones find no pair and no pixel.
     let tile = group.y * groups.x + group.x;
-    let exists = tile < view.tiles.x * view.tiles.y;
+    let exists = tile < views.tiles;
     var range = vec2<u32>(0u);
     if exists {
         range = tile_ranges[tile];
     }
-    let corner = vec2<u32>(tile % view.tiles.x, tile / view.tiles.x) * TILE;
+    let view = views.each[view_of_tile(tile)];
+    let of_view = tile - view.first_tile;
+    let corner = vec2<u32>(of_view % view.tiles.x, of_view / view.tiles.x) * TILE;
     let at = corner + vec2<u32>(local % TILE, local / TILE);
     let inside = exists && all(at < view.pixels);
     let pixel = vec2<f32>(at) + 0.5;
@@ -65,7 +67,7 @@ fn rasterize(
             places[local] = record.place;
             reaches[local] = record.reach.xy;
             looks[local] = record.look;
-            owns[local] = f32(i < view.own);
+            owns[local] = f32(i < views.own);
         }
         workgroupBarrier();
         for (var k = 0u; k < count && !finished; k++) {
@@ -90,16 +92,17 @@ fn rasterize(
 
     if inside {
         let area = view.pixels.x * view.pixels.y;
-        let to = at.y * view.pixels.x + at.x;
-        colour = fma(vec3<f32>(transmittance), view.background.xyz, colour);
+        let here = at.y * view.pixels.x + at.x;
+        let to = planes_of(views.extras) * view.first_pixel + here;
+        colour = fma(vec3<f32>(transmittance), views.background.xyz, colour);
         frame[to] = colour.x;
         frame[area + to] = colour.y;
         frame[2u * area + to] = colour.z;
         frame[3u * area + to] = transmittance;
-        if view.extras != 0u {
+        if views.extras != 0u {
             frame[4u * area + to] = depth;
             frame[5u * area + to] = own;
         }
-        last[to] = end;
+        last[view.first_pixel + here] = end;
     }
 }

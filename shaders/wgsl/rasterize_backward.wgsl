@@ -6,14 +6,14 @@
 // column, so that most moments need only the sums of v, v dy and v dy^2; 32 such parts are added in a fixed order
 // (`add_up_parts`). No atomics on floats: the same bits every time.
 
-@group(0) @binding(0) var<uniform> view: View;
+@group(0) @binding(0) var<uniform> views: Views;
 @group(0) @binding(1) var<storage, read> tile_ranges: array<vec2<u32>>;
 @group(0) @binding(2) var<storage, read> sorted: array<u32>;
 @group(0) @binding(3) var<storage, read> pair_splat: array<u32>;
 @group(0) @binding(4) var<storage, read> records: array<Record>;
 @group(0) @binding(5) var<storage, read> frame: array<f32>;
 @group(0) @binding(6) var<storage, read> last: array<u32>;
-// Planes: dL/d red, green, blue and, where `planes` says so, transmittance and depth.
+// Of each view planes: dL/d red, green, blue and, where `planes` says so, transmittance and depth; room for all five.
 @group(0) @binding(7) var<storage, read> upstream: array<f32>;
 @group(0) @binding(8) var<uniform> planes: Planes;
 const PAIRS: u32 = 8u; // at a time
@@ -43,15 +43,19 @@ fn rasterize_backward(
 ) {
     let local = place_of(thread);
     let tile = group.y * groups.x + group.x;
-    let exists = tile < view.tiles.x * view.tiles.y;
+    let exists = tile < views.tiles;
     var range = vec2<u32>(0u);
     if exists {
         range = tile_ranges[tile];
     }
-    let corner = vec2<u32>(tile % view.tiles.x, tile / view.tiles.x) * TILE;
+    let view = views.each[view_of_tile(tile)];
+    let of_view = tile - view.first_tile;
+    let corner = vec2<u32>(of_view % view.tiles.x, of_view / view.tiles.x) * TILE;
     let at = corner + vec2<u32>(local % TILE, local / TILE);
     let area = view.pixels.x * view.pixels.y;
-    let here = at.y * view.pixels.x + at.x;
+    let pixel_of_view = at.y * view.pixels.x + at.x;
+    let here = planes_of(views.extras) * view.first_pixel + pixel_of_view;
+    let there = 5u * view.first_pixel + pixel_of_view;
 
     // Of this thread's pixel: the upstream gradient, the end of what was blended, and what lies behind the splats seen so
     // far, weighted by the gradient; at first all of it.
@@ -59,17 +63,17 @@ fn rasterize_backward(
     var end = 0u;
     var behind = 0.0;
     if exists && all(at < view.pixels) {
-        gradient = vec4<f32>(upstream[here], upstream[area + here], upstream[2u * area + here], 0.0);
+        gradient = vec4<f32>(upstream[there], upstream[area + there], upstream[2u * area + there], 0.0);
         let colour = vec3<f32>(frame[here], frame[area + here], frame[2u * area + here]);
         behind = fma(colour.x, gradient.x, fma(colour.y, gradient.y, colour.z * gradient.z));
         if planes.transmittance != 0u {
-            behind = fma(frame[3u * area + here], upstream[3u * area + here], behind);
+            behind = fma(frame[3u * area + here], upstream[3u * area + there], behind);
         }
         if planes.depth != 0u {
-            gradient.w = upstream[4u * area + here];
+            gradient.w = upstream[4u * area + there];
             behind = fma(frame[4u * area + here], gradient.w, behind);
         }
-        end = last[here];
+        end = last[view.first_pixel + pixel_of_view];
     }
     wanted[local] = gradient;
     if local == 0u {
@@ -95,7 +99,7 @@ fn rasterize_backward(
             reaches[local] = record.reach.xy;
             looks[local] = record.look;
             pairs[local] = owner_of(pair, i);
-            owns[local] = u32(i < view.own);
+            owns[local] = u32(i < views.own);
         }
         if local == 0u {
             atomicStore(&blended, 0u);

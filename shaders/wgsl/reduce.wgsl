@@ -1,5 +1,5 @@
-// Stage `reduce`: adds up the pairs of each trainable splat that was seen, in the order of its tiles. Sixteen threads are
-// a splat, one a moment.
+// Stage `reduce`: adds up the pairs of each trainable splat in each view that saw it, in the order of its tiles. Sixteen threads
+// are such an entry, one a moment.
 
 @group(0) @binding(0) var<storage, read> status: Status;
 @group(0) @binding(1) var<storage, read> visible: array<u32>;

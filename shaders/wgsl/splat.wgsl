@@ -5,8 +5,11 @@
 @group(0) @binding(1) var<storage, read> bank_b: array<f32>;
 @group(0) @binding(2) var<storage, read> bank_c: array<f32>;
 @group(0) @binding(3) var<storage, read> bank_d: array<f32>;
-@group(0) @binding(4) var<uniform> view: View;
+@group(0) @binding(4) var<uniform> views: Views;
 @group(0) @binding(5) var<uniform> splats: Set;
+
+// The view that this thread is at.
+var<private> view: View;
 
 // Column k of the first bank.
 fn column(k: u32, i: u32) -> f32 {

@@ -1,8 +1,10 @@
-// What all stages share: constants (those of `render`, which a test there compares), the view and its status.
+// What all stages share: constants (those of `render`, which a test there compares), the views and their status.
 
 const GROUP: u32 = 256u;
 const TILE: u32 = 16u;
 const MOMENTS: u32 = 13u;
+// Views drawn side by side, at most.
+const MOST_VIEWS: u32 = 16u;
 
 const NEAR_METRES: f32 = 0.01;
 const BLUR: f32 = 0.3;
@@ -13,23 +15,37 @@ const SH_C0: f32 = 0.28209479;
 const LOG2_E: f32 = 1.4426950;
 const LN_2: f32 = 0.6931472;
 
+// A camera and its window.
 struct View {
     rows: array<vec4<f32>, 3>,
     centre: vec4<f32>,
-    background: vec4<f32>,
     focal: vec2<f32>,
     principal: vec2<f32>,
     cone_min: vec2<f32>,
     cone_max: vec2<f32>,
     pixels: vec2<u32>,
     tiles: vec2<u32>,
+    // Tiles and pixels of the views before this one.
+    first_tile: u32,
+    first_pixel: u32,
+    padding: vec2<u32>,
+}
+
+// Views drawn side by side. What a splat is in a view is an entry: entry i of `count` views is splat i / count in view i % count,
+// so that those of a splat are neighbours.
+struct Views {
+    background: vec4<f32>,
+    count: u32,
+    // Tiles and pixels of all.
+    tiles: u32,
+    pixels: u32,
+    // Entries of the trainable splats; of these and the context.
     own: u32,
     total: u32,
     pair_capacity: u32,
     antialiased: u32,
     extras: u32,
-    padding: u32,
-    more_padding: vec2<u32>,
+    each: array<View, MOST_VIEWS>,
 }
 
 struct Set {
@@ -72,6 +88,11 @@ struct Record {
 // The number of a thread in a dispatch of one or two dimensions of workgroups.
 fn linear(group: vec3<u32>, groups: vec3<u32>, local: u32) -> u32 {
     return (group.y * groups.x + group.x) * GROUP + local;
+}
+
+// Planes of a frame.
+fn planes_of(extras: u32) -> u32 {
+    return select(4u, 6u, extras != 0u);
 }
 
 // By bits: compilers may take comparisons for granted that only NaN fails.

@@ -22,6 +22,6 @@ pub mod source;
 pub mod trainer;
 
 pub use checkpoint::State;
-pub use side::Backend;
+pub use side::{Backend, MOST_VIEWS_PER_STEP};
 pub use source::WindowSource;
 pub use trainer::{Flow, Job, Progress, Recipe, TrainError, TrainView, train, train_on};

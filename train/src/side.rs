@@ -19,6 +19,9 @@ use scene::{Camera, Exposure, Pixels, Splats};
 use crate::optimiser::Rates;
 use crate::{State, TrainError};
 
+/// Views that a step of the optimiser may take.
+pub const MOST_VIEWS_PER_STEP: u32 = 16;
+
 /// What computes.
 #[derive(Debug, Clone, Default)]
 pub enum Backend {
@@ -61,21 +64,28 @@ impl Backend {
     }
 }
 
-/// One step of training.
+/// One step of training: splats move along the sum of what its looks say.
 #[derive(Debug, Clone)]
 pub(crate) struct Step {
+    /// One to [`MOST_VIEWS_PER_STEP`], of different views.
+    pub(crate) looks: Vec<Look>,
+    pub(crate) options: Options,
+    pub(crate) rates: Rates,
+    /// Step of exposures, where they are trained.
+    pub(crate) exposure_rate: f32,
+}
+
+/// A window of a view, to be drawn beside its photo.
+#[derive(Debug, Clone)]
+pub(crate) struct Look {
     /// Index of the view in the capture.
     pub(crate) view: u32,
     /// What it shows.
     pub(crate) photo: Arc<Pixels>,
     /// Of the window that the photo is.
     pub(crate) camera: Camera,
-    pub(crate) options: Options,
-    pub(crate) rates: Rates,
     /// Of the view, where exposures are given, not trained.
     pub(crate) exposure: Option<Exposure>,
-    /// Step of exposures, where they are trained.
-    pub(crate) exposure_rate: f32,
 }
 
 /// What of the state is meant; each holds the one before it.
@@ -89,7 +99,7 @@ pub(crate) enum Part {
     All,
 }
 
-/// Carries out steps. A step whose loss is not finite changes nothing but its count.
+/// Carries out steps. A step with a loss that is not finite changes nothing but its count.
 pub(crate) trait Side {
     /// Begins a step; it may end after this returns.
     fn step(&mut self, now: &mut State, step: Step) -> Result<(), TrainError>;

@@ -1,6 +1,7 @@
 //! The training loop of one block.
 //!
-//! A step draws one window of one view, compares it with the photo, and moves the splats that were seen. Coarse mips come
+//! A step draws one window of a view, compares it with the photo, and moves the splats that were seen; or it does so with a few views
+//! at once, which fill a large device. Steps are counted in windows. Coarse mips come
 //! first, growth follows a schedule towards the budget, step sizes decay to the end. What lies outside the block is drawn from
 //! a frozen context, and a pixel counts by the share of it that the block's own splats explain.
 
@@ -14,11 +15,11 @@ use crate::exposure::ExposureTraining;
 use crate::growth::{self, Evidence, Growth};
 use crate::need::{self, Need};
 use crate::optimiser::{Adam, Rates};
-use crate::side::{Backend, Part, Side, Step};
+use crate::side::{Backend, Look, MOST_VIEWS_PER_STEP, Part, Side, Step};
 use crate::source::AHEAD;
 use crate::{State, WindowSource, random};
 
-/// How a block is trained. Shares are of the number of steps; rates are per step of Adam.
+/// How a block is trained. Shares are of the number of steps; rates are per step of Adam on one window.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Recipe {
     /// Weight of 1 - SSIM in the loss.
@@ -53,6 +54,10 @@ pub struct Recipe {
     /// Finer pixels are looked at once the error is this many times what coarse photos lack (see [`crate::need`]); with 0 only
     /// after those shares.
     pub closer_at: f32,
+    /// Windows that are drawn before splats move, at most [`MOST_VIEWS_PER_STEP`]: on n of them their steps are √n times as long,
+    /// as the noise of a sum is √n times smaller beside it (so gsplat; Granziol et al. 2022). What it saves is a device's idling,
+    /// where one window has too few tiles for it; arithmetic it saves none, so that a CPU has nothing from it.
+    pub views_per_step: u32,
     /// Opacity of the first splats.
     pub initial_opacity: f32,
     /// When and how splats are added and removed.
@@ -76,6 +81,7 @@ impl Default for Recipe {
             sh_from: [0.1, 0.2, 0.3],
             coarse: vec![0.2, 0.5],
             closer_at: 2.0,
+            views_per_step: 1,
             initial_opacity: 0.1,
             growth: Growth::default(),
         }
@@ -166,7 +172,7 @@ pub struct Job<'a> {
     pub keeps: &'a (dyn Fn(Vec3) -> bool + Sync),
     /// Number of counted splats wanted at the end.
     pub budget: usize,
-    /// Number of steps.
+    /// Number of steps, in windows.
     pub steps: u32,
     /// Opacity compensated for the pixel's blur.
     pub antialiased: bool,
@@ -189,17 +195,19 @@ pub struct Job<'a> {
 /// Where training stands. What its methods say is brought from where the training happens when they are asked, which changes
 /// nothing in its course. They say nothing where that fails, and then training ends with the error.
 pub struct Progress<'a> {
-    /// Steps done.
+    /// Steps done, in windows.
     pub step: u32,
     /// Steps in all.
     pub steps: u32,
+    /// Windows of the last step.
+    pub views: u32,
     now: &'a mut State,
     side: &'a mut dyn Side,
     failed: &'a mut Option<TrainError>,
 }
 
 impl Progress<'_> {
-    /// Loss of the last window.
+    /// Mean loss of the last step's windows.
     pub fn loss(&mut self) -> Option<f64> {
         self.fetched(Part::Tally).map(|now| now.loss)
     }
@@ -326,12 +334,19 @@ pub fn train_on(
             return Err(TrainError::Empty(step));
         }
         let progress = step as f32 / steps as f32;
-        let view = &views[turns.of(step)];
+        // Every view once per epoch: a step ends with it.
+        let left = (views.len() as u32 - step % views.len() as u32).min(steps - step);
+        let count = recipe.views_per_step.clamp(1, MOST_VIEWS_PER_STEP).min(left);
         let coarser = (recipe.coarse.len() as u8).saturating_sub(now.need.stage);
         let window = |view: &TrainView| (0..=coarser).rev().find_map(|c| view.at(c)).expect("at(0) always is");
-        let (mip, rect, camera) = window(view);
-        let photo = job.source.window(view.view, mip, rect).map_err(TrainError::Source)?;
-        while told < steps.min(step + 1 + AHEAD as u32) {
+        let look = |view: &TrainView| -> Result<Look, TrainError> {
+            let (mip, rect, camera) = window(view);
+            let photo = job.source.window(view.view, mip, rect).map_err(TrainError::Source)?;
+            let exposure = job.exposures.and_then(|exposures| exposures.of(view.view).copied());
+            Ok(Look { view: view.view, photo, camera, exposure })
+        };
+        let looks = (step..step + count).map(|step| look(&views[turns.of(step)])).collect::<Result<Vec<_>, _>>()?;
+        while told < steps.min(step + count + (AHEAD as u32).max(count)) {
             let next = &views[turns_ahead.of(told)];
             let (mip, rect, _) = window(next);
             job.source.expect(next.view, mip, rect);
@@ -347,18 +362,15 @@ pub fn train_on(
         };
         let visits = (steps as f32 / views.len() as f32).max(1.0);
         let drawn = Step {
-            view: view.view,
-            photo,
-            camera,
+            looks,
             options,
-            rates: rates(recipe, progress, log_scale_bounds),
-            exposure: job.exposures.and_then(|exposures| exposures.of(view.view).copied()),
+            rates: rates(recipe, progress, (count as f32).sqrt(), log_scale_bounds),
             exposure_rate: between(recipe.exposure, progress) / visits,
         };
         side.step(&mut now, drawn)?;
 
         let growth = &recipe.growth;
-        now.step = step + 1;
+        now.step = step + count;
         let epoch = views.len() as u32;
         let mut error = None;
         if now.step.is_multiple_of(epoch) {
@@ -381,7 +393,11 @@ pub fn train_on(
             now.step = until;
         }
         let every = growth.interval(steps);
-        if now.step.is_multiple_of(every) && progress >= growth.from && now.step <= until + every && now.step < steps {
+        if (0..count).any(|n| (now.step - n).is_multiple_of(every))
+            && progress >= growth.from
+            && now.step <= until + every
+            && now.step < steps
+        {
             let target = growth.target(now.step, steps, now.start_count, budget);
             side.fetch(&mut now, Part::All)?;
             let (grown, rows, _) = growth::refine(&now.splats, &mut now.evidence, growth, target, counts, keeps);
@@ -391,7 +407,7 @@ pub fn train_on(
         }
         let mut failed = None;
         let (step, now, side) = (now.step, &mut now, &mut *side);
-        let flow = report(Progress { step, steps, now, side, failed: &mut failed });
+        let flow = report(Progress { step, steps, views: count, now, side, failed: &mut failed });
         if let Some(error) = failed {
             return Err(error);
         }
@@ -435,9 +451,9 @@ fn between([first, last]: [f32; 2], progress: f32) -> f32 {
     first * (last / first).powf(progress)
 }
 
-/// Step sizes at a share of the way.
-fn rates(recipe: &Recipe, progress: f32, log_scale_bounds: [f32; 2]) -> Rates {
-    let at = |bounds| between(bounds, progress);
+/// Step sizes at a share of the way, so many times as long.
+fn rates(recipe: &Recipe, progress: f32, longer: f32, log_scale_bounds: [f32; 2]) -> Rates {
+    let at = |bounds| longer * between(bounds, progress);
     Rates {
         mean: at(recipe.mean),
         log_scale: at(recipe.log_scale),

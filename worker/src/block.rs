@@ -143,10 +143,10 @@ impl Block<'_> {
         let mut overrun = None;
         let every = report_every(&self.trainer.backend);
         // Is a step to be reported, and the merged model measured for it?
-        let due = |step: u32, last: bool| -> Option<bool> {
-            let evaluate =
-                (last && is_look(plan, self.order.task)) || (eval_every > 0 && step.is_multiple_of(eval_every));
-            (evaluate || last || step.is_multiple_of(every)).then_some(evaluate)
+        let due = |step: u32, views: u32, last: bool| -> Option<bool> {
+            let passed = |every: u32| (0..views).any(|n| step.saturating_sub(n).is_multiple_of(every));
+            let evaluate = (last && is_look(plan, self.order.task)) || (eval_every > 0 && passed(eval_every));
+            (evaluate || last || passed(every)).then_some(evaluate)
         };
         // Reports a step, measured where splats are given; whether to go on.
         let mut tell = |step: u32, loss: f64, count: usize, splats: Option<&Splats>, last: bool| -> bool {
@@ -189,7 +189,7 @@ impl Block<'_> {
             }
             late = !last && over();
             let (step, last) = (now.step, late || now.step == steps);
-            if let Some(evaluate) = due(step, last) {
+            if let Some(evaluate) = due(step, now.views, last) {
                 // Where there is no telling, training ends with why.
                 loss = now.loss().unwrap_or(f64::NAN);
                 diverged = now.skipped().is_some_and(|skipped| has_diverged(skipped, step));
@@ -222,7 +222,7 @@ impl Block<'_> {
                 late = over();
                 // Once more at the end, with what pruning chose.
                 let (step, healing) = (trained + now.step.min(now.steps - 1), &mut now.healing);
-                let due = due(step, false);
+                let due = due(step, healing.views, false);
                 if due.is_some() || healing.step == healing.steps {
                     loss = healing.loss().unwrap_or(f64::NAN);
                 }
@@ -238,7 +238,7 @@ impl Block<'_> {
             end = Some(steps);
         }
         if let Some(end) = end {
-            let evaluate = due(end, true) == Some(true);
+            let evaluate = due(end, 1, true) == Some(true);
             tell(end, loss, splats.len(), evaluate.then_some(&splats), true);
         }
         if let Some(taken) = overrun {
@@ -386,9 +386,12 @@ fn has_diverged(skipped: u32, step: u32) -> bool {
     skipped > FEW && skipped > step / 20
 }
 
+const _: () = assert!(blocks::MOST_VIEWS_PER_STEP == train::MOST_VIEWS_PER_STEP);
+
 /// The recipe of a block's level: a child starts from splats that fit already, one mip coarser.
 pub(crate) fn recipe_of(settings: &PlanSettings, task: &Task) -> Recipe {
     let from_points = task.parent.is_none();
     let recipe = if from_points { Recipe::default() } else { Recipe::refinement() };
+    let recipe = Recipe { views_per_step: settings.views_per_step, ..recipe };
     if settings.residual > 0.0 { recipe } else { recipe.unmeasured(from_points) }
 }

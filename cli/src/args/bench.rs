@@ -263,6 +263,9 @@ pub(crate) struct KernelsArgs {
     /// Size of the picture
     #[arg(long, value_name = "WxH", default_value = "270x480")]
     pub(crate) size: Size,
+    /// Views that a GPU draws side by side; times are then of one of them
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = super::views_per_step(), conflicts_with = "from_stage")]
+    pub(crate) views: u32,
     /// Threads
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=1024))]
     pub(crate) threads: u32,

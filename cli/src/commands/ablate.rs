@@ -58,6 +58,7 @@ pub(crate) fn run(args: &AblateArgs, output: &Output) -> Result<(), Failure> {
         blocks: Blocks::Tree,
         levels: Auto(Some(0)),
         steps: args.steps,
+        views_per_step: 1,
         budget: args.budget,
         tolerance_db: 0.0,
         residual: RESIDUAL,

@@ -124,6 +124,7 @@ pub(crate) fn settings(args: &DemoArgs) -> (Settings, TrainArgs) {
             blocks: Blocks::Tree,
             levels: Auto(Some(1)),
             steps: Auto(Some(steps)),
+            views_per_step: 1,
             budget: Auto(Some(budget)),
             tolerance_db: 0.1,
             residual: 0.4,

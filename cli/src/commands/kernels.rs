@@ -37,6 +37,9 @@ pub(crate) fn run(args: &KernelsArgs, output: &Output) -> Result<(), Failure> {
         (Backend::Gpu, _) | (_, Some(_)) => Some(open_gpu()?),
         _ => None,
     };
+    if gpu.is_none() && args.views > 1 {
+        return Err(Failure::Input("--views: only a GPU draws views side by side: give --backend gpu".into()));
+    }
     let scene = scene(args)?;
     let pool = rayon::ThreadPoolBuilder::new().num_threads(args.threads as usize).build();
     let pool = pool.map_err(|error| Failure::Work(format!("cannot start {} threads: {error}", args.threads)))?;
@@ -59,10 +62,11 @@ pub(crate) fn run(args: &KernelsArgs, output: &Output) -> Result<(), Failure> {
 fn text(timed: &Kernels) -> String {
     let class = timed.adapter_class.as_ref().map_or(String::new(), |class| format!(" ({class})"));
     let mut text = format!(
-        "{} splats, {}×{}, {} pairs, {}{class} on {} thread{}: forward {:.2} ms CPU, backward {:.2} ms CPU ({:.2} and {:.2} ms wall)\n",
+        "{} splats, {}×{}, {}{} pairs, {}{class} on {} thread{}: forward {:.2} ms CPU, backward {:.2} ms CPU ({:.2} and {:.2} ms wall)\n",
         timed.splats,
         timed.width,
         timed.height,
+        timed.views.map_or(String::new(), |views| format!("{views} views side by side, each "),),
         timed.pairs,
         timed.backend,
         timed.threads,

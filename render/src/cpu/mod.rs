@@ -195,6 +195,11 @@ impl Renderer {
         &mut self.gradients
     }
 
+    /// The last gradients.
+    pub fn gradients(&self) -> &Gradients {
+        &self.gradients
+    }
+
     /// Pairs of splat and tile in the last view: what the rasterizer's time is proportional to.
     pub fn pairs(&self) -> usize {
         self.bins.pairs.len()

@@ -1,17 +1,21 @@
 //! What a [`GpuRenderer`] shows of its buffers, what it reads back, and how it makes room.
 
+use std::slice;
+
+use bytemuck::Zeroable;
+
 use super::*;
 use crate::Stages;
 
 impl GpuRenderer {
-    /// Planes of `width · height` floats one after the other: red, green, blue, transmittance and, with
+    /// Of each view planes of `width · height` floats one after the other: red, green, blue, transmittance and, with
     /// [`Options::extras`], depth and own; as in [`Frame`].
     pub fn frame(&self) -> &wgpu::Buffer {
         &self.frame
     }
 
-    /// Where the gradient of a loss goes before [`backward`](Self::backward): planes as in [`crate::Upstream`], three of
-    /// colour, transmittance, depth. There is room for all once `forward` was called.
+    /// Where the gradient of a loss goes before [`backward`](Self::backward): of each view planes as in [`crate::Upstream`], three of
+    /// colour, transmittance, depth, with room for all. It is there once `forward` was called.
     pub fn upstream(&self) -> &wgpu::Buffer {
         &self.upstream
     }
@@ -21,18 +25,19 @@ impl GpuRenderer {
         &self.gradients
     }
 
-    /// Three columns of floats with the stride of the splats: `screen`, `screen_abs` and `weight` of [`Gradients`]. Only rows
-    /// of splats that were seen mean anything.
+    /// Of each visible entry of trainable splats four floats: `screen`, `screen_abs` and `weight` of [`Gradients`] in its view, and the
+    /// view's pixels.
     pub fn statistics(&self) -> &wgpu::Buffer {
         &self.statistics
     }
 
-    /// Indices of the visible splats, ascending; the first [`Status::seen`] are the trainable ones.
+    /// The visible entries, ascending; the first [`Status::seen`] are those of trainable splats. Entry `i` of `n` views is splat `i / n`
+    /// in view `i % n`.
     pub fn visible(&self) -> &wgpu::Buffer {
         &self.of_splats.visible
     }
 
-    /// A word for each splat, own first, then context: 1 where it was drawn.
+    /// A word for each entry, own first, then context: 1 where it was drawn.
     pub fn seen(&self) -> &wgpu::Buffer {
         &self.of_splats.seen
     }
@@ -59,8 +64,8 @@ impl GpuRenderer {
         Ok(status)
     }
 
-    /// Waits, and makes room if a view had too many pairs. True: that view and all that followed it were not drawn and
-    /// must be done again.
+    /// Waits, and makes room if views had too many pairs. True: they and all that followed them were not drawn and must be
+    /// done again.
     ///
     /// # Errors
     /// What went wrong until then, or where there is no room.
@@ -87,52 +92,61 @@ impl GpuRenderer {
     ) -> Result<Frame, GpuError> {
         loop {
             let mut encoder = self.gpu.encoder();
-            self.forward(&mut encoder, splats, context, camera, options)?;
+            self.forward(&mut encoder, splats, context, slice::from_ref(camera), options)?;
             self.gpu.submit(encoder)?;
             if !self.recover()? {
-                return self.read_frame();
+                return self.read_frame(0);
             }
         }
     }
 
-    /// The last frame, once it is drawn.
+    /// The frame of one of the last views, once it is drawn.
     ///
     /// # Errors
-    /// What went wrong until then, or without a frame.
-    pub fn read_frame(&self) -> Result<Frame, GpuError> {
-        let Some(Drawn { view, .. }) = self.drawn else {
-            return Err(GpuError::Failed("there is no frame before the first forward pass".into()));
+    /// What went wrong until then, or without such a view.
+    pub fn read_frame(&self, view: usize) -> Result<Frame, GpuError> {
+        let drawn = self.drawn.filter(|drawn| view < drawn.views.count as usize);
+        let Some(Drawn { views, .. }) = drawn else {
+            return Err(GpuError::Failed("there is no frame of a view that was not drawn".into()));
         };
+        let view = views.each[view];
         let area = (view.pixels[0] * view.pixels[1]) as usize;
-        let extra = if view.extras != 0 { area } else { 0 };
+        let (planes, extra) = if views.extras != 0 { (6, area) } else { (4, 0) };
+        let first = planes * view.first_pixel as usize;
         Ok(Frame {
             width: view.pixels[0] as usize,
             height: view.pixels[1] as usize,
-            colour: self.gpu.read(&self.frame, 0, 3 * area)?,
-            transmittance: self.gpu.read(&self.frame, 3 * area, area)?,
-            depth: self.gpu.read(&self.frame, 4 * area, extra)?,
-            own: self.gpu.read(&self.frame, 5 * area, extra)?,
+            colour: self.gpu.read(&self.frame, first, 3 * area)?,
+            transmittance: self.gpu.read(&self.frame, first + 3 * area, area)?,
+            depth: self.gpu.read(&self.frame, first + 4 * area, extra)?,
+            own: self.gpu.read(&self.frame, first + 5 * area, extra)?,
         })
+    }
+
+    /// The last view, and the side of its sorted pairs, where there was one alone: stages are compared view by view.
+    pub(super) fn only_view(&self, what: &str) -> Result<(Views, usize), GpuError> {
+        match self.drawn {
+            Some(Drawn { views, side, .. }) if views.count == 1 => Ok((views, side)),
+            _ => Err(GpuError::Failed(format!("there are no {what} but of one view alone, after its forward pass"))),
+        }
     }
 
     /// What the stages before `rasterize` came to in the last view, once it is drawn.
     ///
     /// # Errors
-    /// What went wrong until then, or without a view.
+    /// What went wrong until then, or unless it was one view.
     pub fn read_stages(&self) -> Result<Stages, GpuError> {
-        let Some(Drawn { view, side, .. }) = self.drawn else {
-            return Err(GpuError::Failed("there are no stages before the first forward pass".into()));
-        };
+        let (views, side) = self.only_view("stages")?;
         let (gpu, status) = (&*self.gpu, self.status()?);
         let (visible, pairs) = (status.visible as usize, status.pairs as usize);
         // An even number of passes: the order by depth lies where it began.
         let order: Vec<u32> = gpu.read(&self.of_splats.sides.values[0], 0, visible)?;
-        let records: Vec<[f32; 12]> = gpu.read(&self.of_splats.records, 0, view.total as usize)?;
-        let mut rank = vec![0; view.total as usize];
+        let records: Vec<[f32; 12]> = gpu.read(&self.of_splats.records, 0, views.total as usize)?;
+        let mut rank = vec![0; views.total as usize];
         order.iter().enumerate().for_each(|(n, &i)| rank[i as usize] = n as u32);
         let sorted: Vec<u32> = gpu.read(&self.of_pairs.sides.values[side], 0, pairs)?;
         let splats: Vec<u32> = gpu.read(&self.of_pairs.splat, 0, pairs)?;
-        let ranges: Vec<[u32; 2]> = gpu.read(&self.tile_ranges, 0, (view.tiles[0] * view.tiles[1]) as usize)?;
+        let ranges: Vec<[u32; 2]> = gpu.read(&self.tile_ranges, 0, views.tiles as usize)?;
         let mut start = vec![0];
         for [from, to] in ranges {
             start.push(start[start.len() - 1] + (to - from));
@@ -150,46 +164,86 @@ impl GpuRenderer {
         })
     }
 
-    /// The last gradients as the CPU has them: zero where a splat was not seen. The pose's are always zero.
+    /// The last gradients as the CPU has them, summed over the views: zero where no view saw a splat. The pose's are always zero.
     ///
     /// # Errors
-    /// What went wrong until then.
+    /// What went wrong until then, or without a view.
     pub fn read_gradients(&self, splats: &GpuSplats) -> Result<Gradients, GpuError> {
-        let (n, stride) = (splats.len(), self.gradients.stride());
-        let seen: Vec<u32> = self.gpu.read(&self.of_splats.seen, 0, n)?;
-        let masked = |mut column: Vec<f32>| {
-            column.iter_mut().zip(&seen).filter(|(_, seen)| **seen == 0).for_each(|(value, _)| *value = 0.0);
-            column
+        let Some(Drawn { views, .. }) = self.drawn else {
+            return Err(GpuError::Failed("there are no gradients before the first forward pass".into()));
         };
-        let statistic = |k: usize| self.gpu.read(&self.statistics, k * stride, n).map(masked);
+        let (n, seen) = (splats.len(), self.status()?.seen as usize);
+        let entries: Vec<u32> = self.gpu.read(&self.of_splats.visible, 0, seen)?;
+        let statistics: Vec<[f32; 4]> = self.gpu.read(&self.statistics, 0, seen)?;
         let mut bits = vec![0u16; n.div_ceil(16)];
-        for (i, &seen) in seen.iter().enumerate() {
-            bits[i / 16] |= (seen as u16) << (i % 16);
+        let mut sums = [(); 3].map(|()| vec![0.0; n]);
+        for (entry, statistics) in entries.iter().zip(statistics) {
+            let i = (entry / views.count) as usize;
+            bits[i / 16] |= 1 << (i % 16);
+            sums.iter_mut().zip(statistics).for_each(|(sums, value)| sums[i] += value);
         }
-        Ok(Gradients {
-            columns: self.gradients.read(&self.gpu, n)?.into_iter().map(masked).collect(),
-            seen: bits,
-            screen: statistic(0)?,
-            screen_abs: statistic(1)?,
-            weight: statistic(2)?,
-            pose: [0.0; 6],
-        })
+        let mut columns = self.gradients.read(&self.gpu, n)?;
+        for column in &mut columns {
+            let unseen = column.iter_mut().enumerate().filter(|(i, _)| bits[i / 16] >> (i % 16) & 1 == 0);
+            unseen.for_each(|(_, value)| *value = 0.0);
+        }
+        let [screen, screen_abs, weight] = sums;
+        Ok(Gradients { columns, seen: bits, screen, screen_abs, weight, pose: [0.0; 6] })
     }
 
-    pub(super) fn view_of(&self, camera: &Camera, options: &Options, own: usize, others: usize) -> View {
+    /// Cameras side by side, over so many trainable splats and others.
+    pub(super) fn views_of(
+        &self,
+        cameras: &[Camera],
+        options: &Options,
+        own: usize,
+        others: usize,
+    ) -> Result<Views, GpuError> {
+        let count = cameras.len();
+        if count == 0 || count > MOST_VIEWS {
+            return Err(GpuError::Failed(format!("{count} views cannot be drawn side by side, 1 to {MOST_VIEWS} can")));
+        }
+        let entries = |splats: usize| {
+            let bytes = 4 * count as u64 * splats as u64;
+            let fits = u32::try_from(count * splats).ok().filter(|_| bytes <= self.gpu.room());
+            fits.ok_or(GpuError::TooLarge { what: "visible".into(), bytes, most: self.gpu.room() })
+        };
+        let area = |camera: &Camera| u64::from(camera.pinhole.width) * u64::from(camera.pinhole.height);
+        // Five planes of gradients; also, pixels and tiles are then numbers of 32 bits.
+        let (bytes, most) = (20 * cameras.iter().map(area).sum::<u64>(), self.gpu.room());
+        if bytes > most {
+            return Err(GpuError::TooLarge { what: "upstream".into(), bytes, most });
+        }
+        let mut views = Views {
+            background: [options.background[0], options.background[1], options.background[2], 0.0],
+            count: count as u32,
+            own: entries(own)?,
+            total: entries(own + others)?,
+            pair_capacity: self.pair_capacity as u32,
+            antialiased: options.antialiased.into(),
+            extras: options.extras.into(),
+            ..Views::zeroed()
+        };
+        for (place, camera) in views.each.iter_mut().zip(cameras) {
+            *place = View { first_tile: views.tiles, first_pixel: views.pixels, ..Self::view_of(camera) };
+            views.tiles += place.tiles[0] * place.tiles[1];
+            views.pixels += place.pixels[0] * place.pixels[1];
+        }
+        Ok(views)
+    }
+
+    fn view_of(camera: &Camera) -> View {
         let k = &camera.pinhole;
         let rows = camera.rotation().transpose().to_cols_array_2d();
         let translation = camera.camera_from_world.translation.to_array();
         let guard = |length: u32, focal: f64| 0.15 * f64::from(length) / focal;
         let (gx, gy) = (guard(k.width, k.fx), guard(k.height, k.fy));
         let centre = camera.centre().as_vec3();
-        let background = options.background;
         View {
             rows: std::array::from_fn(|r| {
                 [rows[r][0] as f32, rows[r][1] as f32, rows[r][2] as f32, translation[r] as f32]
             }),
             centre: [centre.x, centre.y, centre.z, 0.0],
-            background: [background[0], background[1], background[2], 0.0],
             focal: [k.fx as f32, k.fy as f32],
             principal: [k.cx as f32, k.cy as f32],
             cone_min: [(-k.cx / k.fx - gx) as f32, (-k.cy / k.fy - gy) as f32],
@@ -199,13 +253,9 @@ impl GpuRenderer {
             ],
             pixels: [k.width, k.height],
             tiles: [k.width.div_ceil(TILE), k.height.div_ceil(TILE)],
-            own: own as u32,
-            total: (own + others) as u32,
-            pair_capacity: self.pair_capacity as u32,
-            antialiased: options.antialiased.into(),
-            extras: options.extras.into(),
-            padding: 0,
-            more_padding: [0; 2],
+            first_tile: 0,
+            first_pixel: 0,
+            padding: [0; 2],
         }
     }
 
@@ -215,11 +265,11 @@ impl GpuRenderer {
         (pairs + pairs / 2).next_multiple_of(1 << 16).min(bound).max(pairs)
     }
 
-    /// Makes room for a view. Buffers only grow.
-    pub(super) fn fit(&mut self, view: &View, splats: &GpuSplats) -> Result<(), GpuError> {
+    /// Makes room for views. Buffers only grow.
+    pub(super) fn fit(&mut self, views: &Views, splats: &GpuSplats) -> Result<(), GpuError> {
         let gpu = &*self.gpu;
         let (stride, sh_degree) = (splats.columns().stride(), splats.sh_degree());
-        let sizes = Sizes::of(view, stride);
+        let sizes = Sizes::of(views);
         let of = &mut self.of_splats;
         of.records.fit(gpu, sizes.records)?;
         of.sums.fit(gpu, sizes.scanned)?;

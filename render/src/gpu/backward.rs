@@ -13,7 +13,7 @@ pub enum Reduction {
 }
 
 impl GpuRenderer {
-    /// Gradients of the trainable splats of the last [`forward`](Self::forward), whose splats must be passed again
+    /// Gradients of the trainable splats of the last [`forward`](Self::forward), summed over its views, whose splats must be passed again
     /// unchanged, from what lies in [`upstream`](Self::upstream). The pose has none here.
     ///
     /// # Errors
@@ -39,7 +39,7 @@ impl GpuRenderer {
             (1, b),
             (2, c),
             (3, d),
-            (4, &self.view),
+            (4, &self.views),
             (5, &set),
             (6, status),
             (7, visible),
@@ -54,7 +54,7 @@ impl GpuRenderer {
         Ok(())
     }
 
-    /// The stages of [`backward`](Self::backward) before `project_backward`: sums of each splat over the pixels of the last view.
+    /// The stages of [`backward`](Self::backward) before `project_backward`: sums of each splat over the pixels of each of the last views.
     ///
     /// # Errors
     /// Without a forward pass before; and as `forward`.
@@ -64,10 +64,10 @@ impl GpuRenderer {
         planes: UpstreamPlanes,
         how: Reduction,
     ) -> Result<(), GpuError> {
-        let Some(Drawn { view, side, .. }) = self.drawn else {
+        let Some(Drawn { views, side, .. }) = self.drawn else {
             return Err(GpuError::Failed("there is nothing to go back from before the first forward pass".into()));
         };
-        if planes.depth && view.extras == 0 {
+        if planes.depth && views.extras == 0 {
             return Err(GpuError::Failed("a gradient of depth needs a forward pass with extras".into()));
         }
         let gpu = &*self.gpu;
@@ -88,7 +88,7 @@ impl GpuRenderer {
         });
         let sums_go_to = if by_atomics.is_some() { &self.sums } else { &pairs.moments };
         let bindings = [
-            (0, &self.view),
+            (0, &self.views),
             (1, &*self.tile_ranges),
             (2, &*pairs.sides.values[side]),
             (3, &*pairs.splat),
@@ -100,7 +100,7 @@ impl GpuRenderer {
             (9, &**sums_go_to),
         ];
         let kernel = by_atomics.as_ref().unwrap_or(&kernels.rasterize_backward);
-        kernel.run(gpu, pass, &bindings, view.tiles[0] * view.tiles[1]);
+        kernel.run(gpu, pass, &bindings, views.tiles);
         if how == Reduction::InOrder {
             let bindings: [(u32, &wgpu::Buffer); 6] =
                 [(0, status), (1, visible), (2, first), (3, tile_counts), (4, &pairs.moments), (5, &self.sums)];
@@ -109,13 +109,13 @@ impl GpuRenderer {
         Ok(())
     }
 
-    /// What [`add_up_pairs`](Self::add_up_pairs) came to, by splat: the moments of `rasterize_backward.wgsl`, zeros where it was not
+    /// What [`add_up_pairs`](Self::add_up_pairs) came to, by splat and then by view: the moments of `rasterize_backward.wgsl`, zeros where it was not
     /// seen.
     ///
     /// # Errors
     /// What went wrong until then, or without a forward pass.
     pub fn read_sums(&self, how: Reduction) -> Result<Vec<[f32; MOMENTS as usize]>, GpuError> {
-        let own = self.drawn.map_or(0, |drawn| drawn.view.own as usize);
+        let own = self.drawn.map_or(0, |drawn| drawn.views.own as usize);
         match how {
             Reduction::ByAtomics => self.gpu.read(&self.sums, 0, own),
             Reduction::InOrder => {

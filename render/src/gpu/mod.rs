@@ -1,12 +1,16 @@
 //! The GPU backend: wgpu over Vulkan, Metal or DirectX 12; the stages are the WGSL of the crate `shaders`.
 //!
-//! Data flow of a view, one buffer a stage, no read-back between:
+//! Data flow of a view, or of several of one size or another side by side, one buffer a stage, no read-back between:
 //! ```text
 //! splats ─project→ records ─compact→ visible ─sort by depth→ order ─emit→ pairs ─sort by tile→ ranges ─rasterize→ frame
 //! upstream ─rasterize_backward→ moments per pair ─reduce→ sums per splat ─project_backward→ gradients
 //! ```
+//! Views side by side are one dispatch a stage: what a splat is in a view is an entry, those of a splat are neighbours, and the tiles
+//! of a view follow those of the one before. Their entries are sorted together, which leaves each tile the order that it would have
+//! alone: each view is drawn to the bit as if there were no other.
+//!
 //! How many splats are visible and how many pairs they make only the device knows: stage `plan` writes the sizes of the
-//! dispatches that follow. Pairs have room for so many; a view with more sets a flag that stays, and nothing is drawn or
+//! dispatches that follow. Pairs have room for so many; views with more set a flag that stays, and nothing is drawn or
 //! trained until the host has seen it and made room ([`GpuRenderer::recover`]).
 //!
 //! No float is ever added atomically: the same adapter gives the same bits.
@@ -27,7 +31,7 @@ mod watch;
 use std::sync::Arc;
 
 use scene::Camera;
-use shaders::{GROUP, MOMENTS, SCAN_BLOCK, Set, Status, TILE, View, args, slot};
+use shaders::{GROUP, MOMENTS, MOST_VIEWS, SCAN_BLOCK, Set, Status, TILE, View, Views, args, slot};
 
 pub use backward::Reduction;
 pub use device::Gpu;
@@ -61,7 +65,7 @@ pub struct GpuRenderer {
     gpu: Arc<Gpu>,
     kernels: Kernels,
     sorter: Sorter,
-    view: wgpu::Buffer,
+    views: wgpu::Buffer,
     status: Buffer,
     args: Buffer,
     of_splats: OfSplats,
@@ -80,13 +84,13 @@ pub struct GpuRenderer {
 /// What the last `forward` drew.
 #[derive(Debug, Clone, Copy)]
 struct Drawn {
-    view: View,
+    views: Views,
     set: Set,
     /// Side of the sorted pairs.
     side: usize,
 }
 
-/// Buffers with an entry for each splat, own and context.
+/// Buffers with an entry for each splat, own and context, in each view.
 #[derive(Debug)]
 struct OfSplats {
     records: Growing,
@@ -157,7 +161,7 @@ impl GpuRenderer {
         Ok(Self {
             kernels,
             sorter: Sorter::new(g)?,
-            view: g.constants("view", size_of::<View>()),
+            views: g.constants("views", size_of::<Views>()),
             status: g.buffer("status", size_of::<Status>() as u64)?,
             args: g.buffer("args", 12 * args::COUNT)?,
             of_splats,
@@ -180,33 +184,34 @@ impl GpuRenderer {
         self.gpu.name().to_string()
     }
 
-    /// Draws the trainable splats and, with them, a frozen context, into [`frame`](Self::frame).
+    /// Draws the trainable splats and, with them, a frozen context, into [`frame`](Self::frame): as many views side by side as there are
+    /// cameras, one to [`MOST_VIEWS`].
     ///
     /// # Errors
-    /// Where buffers do not fit. What fails later is told by whoever submits or waits.
+    /// Without a camera or with too many; where buffers do not fit. What fails later is told by whoever submits or waits.
     pub fn forward(
         &mut self,
         encoder: &mut wgpu::CommandEncoder,
         splats: &GpuSplats,
         context: Option<&GpuSplats>,
-        camera: &Camera,
+        cameras: &[Camera],
         options: &Options,
     ) -> Result<(), GpuError> {
         let others = context.map_or(0, GpuSplats::len);
-        let view = self.view_of(camera, options, splats.len(), others);
+        let views = self.views_of(cameras, options, splats.len(), others)?;
         let sh_degree = options.sh_degree.min(splats.sh_degree());
         let set = set_of(splats, 0, sh_degree);
         self.drawn = None;
-        self.fit(&view, splats)?;
+        self.fit(&views, splats)?;
         let gpu = &*self.gpu;
-        gpu.write(encoder, &self.view, 0, &[view]);
-        let tiles = (view.tiles[0] * view.tiles[1]) as usize;
-        encoder.clear_buffer(&self.tile_ranges, 0, Some(8 * tiles as u64));
+        gpu.write(encoder, &self.views, 0, &[views]);
+        let tiles = views.tiles;
+        encoder.clear_buffer(&self.tile_ranges, 0, Some(8 * u64::from(tiles)));
 
         let pass = &mut encoder.begin_compute_pass(&wgpu::ComputePassDescriptor::default());
         let (kernels, status, args) = (&self.kernels, &*self.status, &*self.args);
         let OfSplats { records, seen, sums, tiles: tile_counts, first, visible, sides } = &self.of_splats;
-        let plan: [(u32, &wgpu::Buffer); 4] = [(0, &self.view), (1, status), (2, sums), (3, args)];
+        let plan: [(u32, &wgpu::Buffer); 4] = [(0, &self.views), (1, status), (2, sums), (3, args)];
         kernels.plan_start.run(gpu, pass, &plan[..3], 1);
         // The context is finished: it is drawn in full, whatever degree the trainable splats have reached.
         let frozen = context.map(|context| (context, set_of(context, splats.len(), context.sh_degree())));
@@ -218,7 +223,7 @@ impl GpuRenderer {
                 (1, b),
                 (2, c),
                 (3, d),
-                (4, &self.view),
+                (4, &self.views),
                 (5, &uniform),
                 (6, records),
                 (7, seen),
@@ -226,14 +231,14 @@ impl GpuRenderer {
                 (9, tile_counts),
             ];
             if set.count > 0 {
-                kernels.project.run(gpu, pass, &bindings, set.count.div_ceil(GROUP));
+                kernels.project.run(gpu, pass, &bindings, (set.count * views.count).div_ceil(GROUP));
             }
         }
-        let groups = Groups::Direct((view.total + 1).div_ceil(SCAN_BLOCK));
+        let groups = Groups::Direct((views.total + 1).div_ceil(SCAN_BLOCK));
         self.sorter.scan(gpu, pass, sums, status, slot::SPLAT_SLOTS, groups);
         kernels.plan_visible.run(gpu, pass, &plan, 1);
-        let bindings = [(0, &self.view), (1, seen), (2, sums), (3, records), (4, visible), (5, &*sides.keys[0])];
-        kernels.compact.run(gpu, pass, &bindings, view.total.div_ceil(GROUP));
+        let bindings = [(0, &self.views), (1, seen), (2, sums), (3, records), (4, visible), (5, &*sides.keys[0])];
+        kernels.compact.run(gpu, pass, &bindings, views.total.div_ceil(GROUP));
 
         let side = self.sorter.sort(gpu, pass, sides, Some(visible), 32, (status, args), Sorted::Splats);
         let order = &*sides.values[side];
@@ -245,7 +250,7 @@ impl GpuRenderer {
 
         let pairs = &self.of_pairs;
         let bindings = [
-            (0, &self.view),
+            (0, &self.views),
             (1, status),
             (2, records),
             (3, order),
@@ -256,12 +261,12 @@ impl GpuRenderer {
             (8, &*pairs.sides.values[0]),
         ];
         kernels.emit.run_indirect(gpu, pass, &bindings, args, args::VISIBLE);
-        let bits = 32 - (tiles as u32).saturating_sub(1).leading_zeros();
+        let bits = 32 - tiles.saturating_sub(1).leading_zeros();
         let side = self.sorter.sort(gpu, pass, &pairs.sides, None, bits, (status, args), Sorted::Pairs);
         let bindings = [(0, status), (1, &*pairs.sides.keys[side]), (2, &*self.tile_ranges)];
         kernels.ranges.run_indirect(gpu, pass, &bindings, args, args::PAIRS);
         let bindings = [
-            (0, &self.view),
+            (0, &self.views),
             (1, &*self.tile_ranges),
             (2, &*pairs.sides.values[side]),
             (3, &*pairs.splat),
@@ -269,8 +274,8 @@ impl GpuRenderer {
             (5, &*self.frame),
             (6, &*self.last),
         ];
-        kernels.rasterize.run(gpu, pass, &bindings, tiles as u32);
-        self.drawn = Some(Drawn { view, set, side });
+        kernels.rasterize.run(gpu, pass, &bindings, tiles);
+        self.drawn = Some(Drawn { views, set, side });
         Ok(())
     }
 }

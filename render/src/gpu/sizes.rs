@@ -1,18 +1,18 @@
-//! How large the buffers of a view are.
+//! How large the buffers of views are.
 
-use shaders::{DIGITS, MOMENTS, RADIX_BLOCK, REDUCE_SPLATS, SCAN_BLOCK, View};
+use shaders::{DIGITS, MOMENTS, RADIX_BLOCK, REDUCE_SPLATS, SCAN_BLOCK, Views};
 
 /// Bytes of a record in `view.wgsl`.
 const RECORD: u64 = 48;
 
-/// Bytes of each buffer that drawing a view and going back from it takes, beside the splats and their gradients.
+/// Bytes of each buffer that drawing views and going back from them takes, beside the splats and their gradients.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Sizes {
-    /// Of all splats.
+    /// Of all entries.
     pub(super) records: u64,
-    /// Sums over all splats, one more than there are.
+    /// Sums over all entries, one more than there are.
     pub(super) scanned: u64,
-    /// A word for each of all splats.
+    /// A word for each of all entries.
     pub(super) splat_words: u64,
     /// A word for each pair.
     pub(super) pair_words: u64,
@@ -30,17 +30,15 @@ pub(super) struct Sizes {
     pub(super) frame: u64,
     /// Planes of its gradient.
     pub(super) upstream: u64,
-    /// Moments of each trainable splat.
+    /// Moments of each trainable splat's entries.
     pub(super) sums: u64,
-    /// Three columns of them.
+    /// Four words of each.
     pub(super) statistics: u64,
 }
 
 impl Sizes {
-    /// For columns of this stride.
-    pub(super) fn of(view: &View, stride: usize) -> Self {
-        let [total, own, pairs] = [view.total, view.own, view.pair_capacity].map(u64::from);
-        let area = u64::from(view.pixels[0]) * u64::from(view.pixels[1]);
+    pub(super) fn of(views: &Views) -> Self {
+        let [total, own, pairs, area] = [views.total, views.own, views.pair_capacity, views.pixels].map(u64::from);
         let digits = digits(total.max(pairs));
         Self {
             records: RECORD * total.max(1),
@@ -50,12 +48,12 @@ impl Sizes {
             moments: 4 * u64::from(MOMENTS) * pairs,
             histogram: 4 * digits,
             block_sums: block_sums(digits.max(total + 1)),
-            ranges: 8 * u64::from(view.tiles[0]) * u64::from(view.tiles[1]),
+            ranges: 8 * u64::from(views.tiles),
             last: 4 * area,
-            frame: 4 * area * if view.extras != 0 { 6 } else { 4 },
+            frame: 4 * area * if views.extras != 0 { 6 } else { 4 },
             upstream: 4 * area * 5,
             sums: 4 * u64::from(MOMENTS) * own.next_multiple_of(REDUCE_SPLATS.into()),
-            statistics: 12 * stride as u64,
+            statistics: 16 * own,
         }
     }
 }
@@ -82,17 +80,18 @@ mod tests {
 
     /// All buffers of a training of so many splats of SH degree 3 that all are in a view of 1920×1080.
     fn bytes(splats: u32, pairs: u32) -> Vec<u64> {
-        let view = View {
-            pixels: [1920, 1080],
-            tiles: [120, 68],
+        let views = Views {
+            count: 1,
+            pixels: 1920 * 1080,
+            tiles: 120 * 68,
             own: splats,
             total: splats,
             pair_capacity: pairs,
             extras: 1,
-            ..View::zeroed()
+            ..Views::zeroed()
         };
         let stride = stride_of(splats as usize);
-        let s = Sizes::of(&view, stride);
+        let s = Sizes::of(&views);
         let words = [s.splat_words; 8].into_iter().chain([s.pair_words; 5]);
         let others =
             [s.records, s.scanned, s.moments, s.histogram, s.block_sums, s.ranges, s.last, s.frame, s.upstream];

@@ -1,24 +1,25 @@
 //! Steps on a GPU: splats, moments and evidence live there and run ahead of the host, which reads them when it has to decide.
 //!
 //! ```text
-//! photo ─┐
-//! splats ┴forward→ frame ─loss_forward→ sums ─judge→ books ─loss_backward→ upstream ─backward→ gradients ─evidence, adam→ splats
+//! photos ┐
+//! splats ┴forward→ frames ─loss_forward→ sums ─judge→ books ─loss_backward→ upstream ─backward→ gradients ─evidence, adam→ splats
 //! ```
 //! Nothing is read back for a step. Whether its loss is finite the device judges, and the books there say how many steps are
-//! over: where a view had more pairs than there was room for, it and all that followed changed nothing, and the host, once it
+//! over: where a step's views had more pairs than there was room for, it and all that followed changed nothing, and the host, once it
 //! sees that, makes room and begins them again. So a result depends neither on that room nor on when the host looks.
 
 use std::collections::VecDeque;
 use std::iter;
 use std::sync::Arc;
 
+use bytemuck::Zeroable;
 use render::cpu::Isa;
 use render::gpu::{Buffer, Columns, Gpu, GpuError, GpuRenderer, GpuSplats, Growing, Kernel, UpstreamPlanes};
-use scene::{Splats, column};
-use shaders::train::{ADAM, Books, EVIDENCE, LOSS, Rates, Window};
-use shaders::{TILE, args};
+use scene::{Camera, Splats, column};
+use shaders::train::{ADAM, Books, EVIDENCE, LOSS, Rates, Window, Windows};
+use shaders::{MOST_VIEWS, TILE, args};
 
-use super::{Part, Side, Step};
+use super::{Look, MOST_VIEWS_PER_STEP, Part, Side, Step};
 use crate::growth::Evidence;
 use crate::need::Tally;
 use crate::optimiser::Adam;
@@ -26,8 +27,9 @@ use crate::{State, TrainError};
 
 /// Steps that the device may be behind: the next photo is read meanwhile.
 const IN_FLIGHT: usize = 2;
-/// Steps between two looks at the books: their photos are kept until then, in case they must be done again.
+/// Photos between two looks at the books: they are kept until then, in case their steps must be done again.
 const LOOK_EVERY: usize = 32;
+const _: () = assert!(MOST_VIEWS_PER_STEP as usize == MOST_VIEWS);
 
 /// First column of each bank of [`Columns`], and the end.
 const BANKS: [usize; 5] = [0, column::SH + 3, column::SH + 18, column::SH + 33, column::SH + 48];
@@ -46,7 +48,7 @@ pub(crate) struct GpuSide {
     evidence: Growing,
     views: Growing,
     books: Buffer,
-    /// Photo and mask, a byte a value.
+    /// Photos, each with its mask, a byte a value.
     photo: Growing,
     /// SSIM's derivatives.
     partials: Growing,
@@ -143,42 +145,32 @@ impl GpuSide {
     /// Hands a step to the device.
     fn submit(&mut self, step: &Step) -> Result<(), GpuError> {
         let gpu = Arc::clone(&self.gpu);
-        let Step { photo, camera, options, rates, .. } = step;
-        let (width, height) = (photo.width, photo.height);
-        let (tiles_x, tiles_y) = (width.div_ceil(TILE), height.div_ceil(TILE));
-        let (area, tiles) = (photo.area(), 3 * tiles_x * tiles_y);
-        let mut bytes = [&photo.rgb[..], photo.mask.as_deref().unwrap_or_default()].concat();
-        bytes.resize(bytes.len().next_multiple_of(4), 0);
+        let Step { looks, options, rates, .. } = step;
+        let (windows, bytes) = self.windows(looks, options.extras);
+        let area: usize = looks.iter().map(|look| look.photo.area()).sum();
+        let tiles = 3 * windows.tiles;
         self.photo.fit(&gpu, bytes.len() as u64)?;
         self.partials.fit(&gpu, 4 * 9 * area as u64)?;
         self.sums.fit(&gpu, 16 * u64::from(tiles))?;
 
         let mut encoder = gpu.encoder();
         gpu.write(&mut encoder, &self.photo, 0, &bytes);
-        self.renderer.forward(&mut encoder, &self.splats, self.context.as_ref(), camera, options)?;
-        let window = gpu.uniform(&Window {
-            width,
-            height,
-            tiles_x,
-            tiles_y,
-            lambda: self.lambda,
-            masked: photo.mask.is_some().into(),
-            by_share: options.extras.into(),
-            padding: 0,
-        });
+        let cameras: Vec<Camera> = looks.iter().map(|look| look.camera).collect();
+        self.renderer.forward(&mut encoder, &self.splats, self.context.as_ref(), &cameras, options)?;
+        let windows = gpu.uniform(&windows);
         {
             let pass = &mut encoder.begin_compute_pass(&wgpu::ComputePassDescriptor::default());
             let Kernels { loss_forward, judge, loss_backward, .. } = &self.kernels;
             let (frame, status) = (self.renderer.frame(), self.renderer.status_buffer());
-            let bindings = [(0, &window), (1, frame), (2, &*self.photo), (3, &*self.partials), (4, &*self.sums)];
+            let bindings = [(0, &windows), (1, frame), (2, &*self.photo), (3, &*self.partials), (4, &*self.sums)];
             loss_forward.run(&gpu, pass, &bindings, tiles);
-            judge.run(&gpu, pass, &[(0, &window), (4, &self.sums), (5, &self.books), (7, status)], 1);
+            judge.run(&gpu, pass, &[(0, &windows), (4, &self.sums), (5, &self.books), (7, status)], 1);
             let upstream = self.renderer.upstream();
             let bindings = [bindings[0], bindings[1], bindings[2], bindings[3], (5, &self.books), (6, upstream)];
             loss_backward.run(&gpu, pass, &bindings, tiles);
         }
         self.renderer.backward(&mut encoder, &self.splats, UpstreamPlanes::default())?;
-        self.move_splats(&mut encoder, options.sh_degree, rates, area);
+        self.move_splats(&mut encoder, options.sh_degree, rates, looks.len());
         self.in_flight.push_back(gpu.submit(encoder)?);
         match self.in_flight.len() > IN_FLIGHT {
             true => self.in_flight.pop_front().map_or(Ok(()), |index| gpu.wait_for(index)),
@@ -186,13 +178,39 @@ impl GpuSide {
         }
     }
 
-    /// Evidence, and a step of Adam, from the gradients.
+    /// Where each photo lies beside its frame, and the bytes of all.
+    fn windows(&self, looks: &[Look], by_share: bool) -> (Windows, Vec<u8>) {
+        let (mut bytes, mut first_pixel) = (Vec::new(), 0);
+        let mut windows =
+            Windows { count: looks.len() as u32, lambda: self.lambda, by_share: by_share.into(), ..Windows::zeroed() };
+        for (window, Look { photo, .. }) in windows.each.iter_mut().zip(looks) {
+            let (width, height) = (photo.width, photo.height);
+            *window = Window {
+                width,
+                height,
+                tiles_x: width.div_ceil(TILE),
+                tiles_y: height.div_ceil(TILE),
+                first_tile: windows.tiles,
+                first_pixel,
+                first_byte: bytes.len() as u32,
+                masked: photo.mask.is_some().into(),
+            };
+            windows.tiles += window.tiles_x * window.tiles_y;
+            first_pixel += photo.area() as u32;
+            bytes.extend_from_slice(&photo.rgb);
+            bytes.extend_from_slice(photo.mask.as_deref().unwrap_or_default());
+            bytes.resize(bytes.len().next_multiple_of(4), 0);
+        }
+        (windows, bytes)
+    }
+
+    /// Evidence, and a step of Adam, from the gradients of so many views.
     fn move_splats(
         &self,
         encoder: &mut wgpu::CommandEncoder,
         sh_degree: u8,
         rates: &crate::optimiser::Rates,
-        area: usize,
+        views: usize,
     ) {
         let Self { gpu, renderer, kernels, .. } = self;
         let used = column::SH + 3 * scene::splats::sh_coefficients(sh_degree.min(self.splats.sh_degree()));
@@ -205,13 +223,14 @@ impl GpuSide {
                 sh_dc: rates.sh_dc,
                 sh_rest: rates.sh_rest,
                 beta2: rates.beta2,
-                opacity_pull: rates.opacity_pull,
-                needle_pull: rates.needle_pull,
+                // Each view's loss holds the means over the splats that it sees.
+                opacity_pull: views as f32 * rates.opacity_pull,
+                needle_pull: views as f32 * rates.needle_pull,
                 log_scale_min: rates.log_scale_bounds[0],
                 log_scale_max: rates.log_scale_bounds[1],
                 columns: columns as u32,
                 stride: self.splats.columns().stride() as u32,
-                pixels: area as f32,
+                views: views as u32,
                 padding: [0; 2],
             })
         };
@@ -259,7 +278,7 @@ impl GpuSide {
 
 impl Side for GpuSide {
     fn step(&mut self, _: &mut State, step: Step) -> Result<(), TrainError> {
-        if self.begun.len() >= LOOK_EVERY {
+        if self.begun.iter().map(|step| step.looks.len()).sum::<usize>() >= LOOK_EVERY {
             self.settle()?;
         }
         self.submit(&step)?;

@@ -69,6 +69,7 @@ pub(super) fn time(args: &KernelsArgs, Scene { splats, options, cameras }: &Scen
         splats: splats.len() as u64,
         width: args.size.width,
         height: args.size.height,
+        views: None,
         pairs: renderer.pairs() as u64,
         visits: Some(renderer.visits()),
         ceiling_gflops: Some(ceiling_gflops),

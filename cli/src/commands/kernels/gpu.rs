@@ -22,8 +22,10 @@ pub(super) fn time(gpu: &Arc<Gpu>, args: &KernelsArgs, scene: &Scene) -> Result<
     let mut millis: [Vec<f64>; 4] = Default::default();
     let mut stages: Vec<(Stage, Vec<f64>)> = Vec::new();
     for pass in 0..WARM_UP + args.passes as usize {
-        let camera = &scene.cameras[pass % scene.cameras.len()];
-        let of_pass = bench.pass(camera).map_err(failed)?;
+        let first = pass * args.views as usize;
+        let cameras: Vec<Camera> =
+            (first..first + args.views as usize).map(|n| scene.cameras[n % scene.cameras.len()]).collect();
+        let of_pass = bench.pass(&cameras).map_err(failed)?;
         if pass >= WARM_UP {
             millis.iter_mut().zip(of_pass.millis).for_each(|(all, value)| all.push(value));
             for (stage, value) in of_pass.stages {
@@ -35,7 +37,7 @@ pub(super) fn time(gpu: &Arc<Gpu>, args: &KernelsArgs, scene: &Scene) -> Result<
         }
     }
     let [forward_cpu_millis, backward_cpu_millis, forward_wall_millis, backward_wall_millis] = millis.map(median);
-    let pairs = u64::from(bench.renderer.status().map_err(failed)?.pairs);
+    let pairs = u64::from(bench.renderer.status().map_err(failed)?.pairs) / u64::from(args.views);
     let at = |(stage, all): (Stage, Vec<f64>)| {
         let device_millis = median(all);
         let gbytes = bytes(stage, &scene.splats, pairs as f64).map(|bytes| bytes / (1e6 * device_millis.max(1e-9)));
@@ -58,6 +60,7 @@ pub(super) fn time(gpu: &Arc<Gpu>, args: &KernelsArgs, scene: &Scene) -> Result<
         splats: scene.splats.len() as u64,
         width: args.size.width,
         height: args.size.height,
+        views: (args.views > 1).then_some(args.views),
         pairs,
         visits: None,
         ceiling_gflops: None,
@@ -85,7 +88,7 @@ struct Bench<'a> {
 /// Milliseconds of each stage, in their order.
 type Stages = Vec<(Stage, f64)>;
 
-/// What a view took, milliseconds.
+/// What a view took, one of several at once or alone, milliseconds.
 struct Pass {
     /// Forward and backward: CPU, then wall.
     millis: [f64; 4],
@@ -105,25 +108,33 @@ impl<'a> Bench<'a> {
         Ok(Self { gpu, renderer, splats, scene, has_clock: gpu.has_clock() })
     }
 
-    fn pass(&mut self, camera: &Camera) -> Result<Pass, GpuError> {
+    fn pass(&mut self, cameras: &[Camera]) -> Result<Pass, GpuError> {
         // Makes room, so that what is timed is drawn.
-        self.renderer.draw(&self.splats, None, camera, &self.scene.options)?;
-        let area = camera.pinhole.width as usize * camera.pinhole.height as usize;
+        loop {
+            self.once(Direction::Forward, cameras)?;
+            if !self.renderer.recover()? {
+                break;
+            }
+        }
+        let area: usize =
+            cameras.iter().map(|camera| camera.pinhole.width as usize * camera.pinhole.height as usize).sum();
         let mut encoder = self.gpu.encoder();
-        self.gpu.write(&mut encoder, self.renderer.upstream(), 0, &vec![1e-3f32; 3 * area]);
+        self.gpu.write(&mut encoder, self.renderer.upstream(), 0, &vec![1e-3f32; 5 * area]);
         self.gpu.submit(encoder)?;
         self.gpu.wait()?;
-        let (forward, mut stages) = self.timed(Direction::Forward, camera)?;
-        let (backward, of_backward) = self.timed(Direction::Backward, camera)?;
+        let (forward, mut stages) = self.timed(Direction::Forward, cameras)?;
+        let (backward, of_backward) = self.timed(Direction::Backward, cameras)?;
         stages.extend(of_backward);
-        Ok(Pass { millis: [forward[0], backward[0], forward[1], backward[1]], stages })
+        let of_view = |millis: f64| millis / cameras.len() as f64;
+        stages.iter_mut().for_each(|(_, millis)| *millis = of_view(*millis));
+        Ok(Pass { millis: [forward[0], backward[0], forward[1], backward[1]].map(of_view), stages })
     }
 
     /// CPU and wall milliseconds of all of it, and those of each stage.
-    fn timed(&mut self, direction: Direction, camera: &Camera) -> Result<([f64; 2], Stages), GpuError> {
-        let all = self.once(direction, camera)?;
+    fn timed(&mut self, direction: Direction, cameras: &[Camera]) -> Result<([f64; 2], Stages), GpuError> {
+        let all = self.once(direction, cameras)?;
         self.gpu.watch(usize::MAX);
-        self.once(direction, camera)?;
+        self.once(direction, cameras)?;
         let dispatched = self.gpu.watched()?;
         // The place of each stage's last dispatch.
         let mut ends: Vec<(Stage, usize)> = Vec::new();
@@ -135,12 +146,12 @@ impl<'a> Bench<'a> {
         }
         let (mut stages, mut before) = (Vec::new(), 0.0);
         if !self.has_clock {
-            before = self.up_to(direction, camera, 0)?;
+            before = self.up_to(direction, cameras, 0)?;
         }
         for (stage, last) in ends {
             let ended = match dispatched[last].ended_nanos.filter(|_| self.has_clock) {
                 Some(nanos) => 1e-6 * nanos,
-                None => self.up_to(direction, camera, last + 1)?,
+                None => self.up_to(direction, cameras, last + 1)?,
             };
             // By the wall, noise may be more than a short stage takes.
             stages.push((stage, (ended - before).max(0.0)));
@@ -148,25 +159,25 @@ impl<'a> Bench<'a> {
         }
         if !self.has_clock {
             // The backward pass goes on from a whole view.
-            self.once(Direction::Forward, camera)?;
+            self.once(Direction::Forward, cameras)?;
         }
         Ok((all, stages))
     }
 
     /// Wall milliseconds of so many dispatches.
-    fn up_to(&mut self, direction: Direction, camera: &Camera, most: usize) -> Result<f64, GpuError> {
+    fn up_to(&mut self, direction: Direction, cameras: &[Camera], most: usize) -> Result<f64, GpuError> {
         self.gpu.watch(most);
-        let [_, wall] = self.once(direction, camera)?;
+        let [_, wall] = self.once(direction, cameras)?;
         self.gpu.watched().map(|_| wall)
     }
 
     /// CPU and wall milliseconds, from the first command to the end.
-    fn once(&mut self, direction: Direction, camera: &Camera) -> Result<[f64; 2], GpuError> {
+    fn once(&mut self, direction: Direction, cameras: &[Camera]) -> Result<[f64; 2], GpuError> {
         let clock = Stopwatch::start();
         let mut encoder = self.gpu.encoder();
         match direction {
             Direction::Forward => {
-                self.renderer.forward(&mut encoder, &self.splats, None, camera, &self.scene.options)?;
+                self.renderer.forward(&mut encoder, &self.splats, None, cameras, &self.scene.options)?;
             }
             Direction::Backward => self.renderer.backward(&mut encoder, &self.splats, UpstreamPlanes::default())?,
         }
@@ -201,12 +212,12 @@ mod tests {
         let usual = bench.renderer.draw(&bench.splats, None, &camera, &scene.options).unwrap();
         for has_clock in [gpu.has_clock(), false] {
             bench.has_clock = has_clock;
-            let pass = bench.pass(&camera).unwrap();
+            let pass = bench.pass(&[camera; 3]).unwrap();
             let stages: Vec<Stage> = pass.stages.iter().map(|(stage, _)| *stage).collect();
             assert_eq!(stages, Stage::ALL);
             assert!(pass.stages.iter().map(|(_, millis)| millis).sum::<f64>() > 0.0, "{:?}", pass.stages);
             assert!(pass.millis.iter().all(|&millis| millis > 0.0));
-            assert!(bench.renderer.read_frame().unwrap() == usual, "timing leaves half a picture");
+            assert!((0..3).all(|n| bench.renderer.read_frame(n).unwrap() == usual), "timing leaves half a picture");
         }
     }
 }

@@ -40,18 +40,21 @@ fn cloud(key: u64, count: u64, sh_degree: u8) -> Splats {
     splats
 }
 
-/// A photo of noise, of a size that is no multiple of a tile; masked on the right where asked.
-fn step(masked: bool, extras: bool, key: u64) -> Step {
-    let (width, height) = (75u32, 53u32);
+/// A photo of noise; masked on the right where asked.
+fn look(masked: bool, key: u64, [width, height]: [u32; 2], translation: DVec3) -> Look {
     let area = (width * height) as usize;
     let rgb = (0..3 * area).map(|i| bits(key, i as u64) as u8).collect();
-    let mask = masked.then(|| (0..area).map(|i| if i % 75 > 50 { 0 } else { 255 }).collect());
+    let mask = masked.then(|| (0..area).map(|i| if i % width as usize > 50 { 0 } else { 255 }).collect());
     let pinhole = Pinhole { width, height, fx: 70.0, fy: 72.0, cx: 37.0, cy: 27.0 };
-    let camera_from_world = Rigid { rotation: DQuat::IDENTITY, translation: DVec3::ZERO };
+    let camera_from_world = Rigid { rotation: DQuat::IDENTITY, translation };
+    let photo = Arc::new(Pixels { width, height, rgb, mask });
+    Look { view: 0, photo, camera: Camera { pinhole, camera_from_world }, exposure: None }
+}
+
+/// One look of a size that is no multiple of a tile.
+fn step(masked: bool, extras: bool, key: u64) -> Step {
     Step {
-        view: 0,
-        photo: Arc::new(Pixels { width, height, rgb, mask }),
-        camera: Camera { pinhole, camera_from_world },
+        looks: vec![look(masked, key, [75, 53], DVec3::ZERO)],
         options: Options { extras, sh_degree: 3, ..Options::default() },
         rates: optimiser::Rates {
             mean: 0.03,
@@ -65,7 +68,6 @@ fn step(masked: bool, extras: bool, key: u64) -> Step {
             needle_pull: 0.01,
             log_scale_bounds: [-5.0, -1.0],
         },
-        exposure: None,
         exposure_rate: 0.0,
     }
 }
@@ -108,17 +110,17 @@ fn stages_agree_with_the_cpus() {
         // The second step has moments to go on from.
         for key in [1, 2] {
             let step = step(masked, extras, key);
+            let photo = &step.looks[0].photo;
             side.fetch(&mut now, Part::All).unwrap();
             let mut expected = now.clone();
             side.step(&mut now, step.clone()).unwrap();
             side.fetch(&mut now, Part::All).unwrap();
 
-            let frame = side.renderer.read_frame().unwrap();
+            let frame = side.renderer.read_frame(0).unwrap();
             let mut weights = Vec::new();
-            super::super::cpu::pixel_weights(&frame, &step.photo, &mut weights);
+            super::super::cpu::pixel_weights(&frame, photo, &mut weights);
             let mut upstream = Vec::new();
-            let value =
-                Photometric::new(Isa::detect(), 0.2).evaluate(&frame.colour, &step.photo, &weights, &mut upstream);
+            let value = Photometric::new(Isa::detect(), 0.2).evaluate(&frame.colour, photo, &weights, &mut upstream);
             let found: Vec<f32> = gpu.read(side.renderer.upstream(), 0, upstream.len()).unwrap();
             let loss_off = (now.loss - value.total).abs() / value.total;
             let l1_off = (now.need.tally.sum - expected.need.tally.sum - value.l1).abs() / value.l1;
@@ -126,7 +128,7 @@ fn stages_agree_with_the_cpus() {
 
             let gradients = side.renderer.read_gradients(&side.splats).unwrap();
             expected.adam.step(&mut expected.splats, &gradients, 3, &step.rates);
-            expected.evidence.add(&gradients, step.photo.area() as f32);
+            expected.evidence.add(&gradients, photo.area() as f32);
             let by_column = |found: &[Vec<f32>], expected: &[Vec<f32>]| {
                 found.iter().zip(expected).map(|(a, b)| off(a, b)).fold(0.0, f32::max)
             };
@@ -148,6 +150,70 @@ fn stages_agree_with_the_cpus() {
             assert!(loss_off < 1e-6 && l1_off < 1e-6 && upstream_off < 1e-5, "the loss");
             assert!(splats_off < 2e-6 && moments_off < 2e-6 && evidence_off < 1e-6, "Adam or the evidence");
         }
+    }
+}
+
+/// Of looks of several sizes, one of them masked, before a context: as on the CPU, which takes one after the other.
+#[test]
+fn a_step_of_several_looks_is_the_cpus() {
+    let Some(gpu) = gpu() else { return };
+    let context = cloud(7, 60, 3);
+    let begin = state(cloud(3, 300, 2));
+    let looks: Vec<Look> = [[75, 53], [16, 16], [33, 90], [64, 48]]
+        .into_iter()
+        .zip(1..)
+        .map(|(size, key)| look(key == 3, key, size, DVec3::new(0.3 * key as f64, 0.0, 0.5)))
+        .collect();
+    let one = |looks: &[Look]| {
+        let mut step = step(false, true, 1);
+        // So that what pulls is more than rounding.
+        (step.rates.opacity_pull, step.rates.needle_pull) = (30.0, 30.0);
+        Step { looks: looks.to_vec(), ..step }
+    };
+    let run = |side: &mut dyn Side, looks: &[Look]| {
+        let mut now = begin.clone();
+        side.step(&mut now, one(looks)).unwrap();
+        side.fetch(&mut now, Part::All).unwrap();
+        now
+    };
+    let cpu = run(&mut super::super::cpu::CpuSide::new(0.2, Some(&context)), &looks);
+    let gpu_side = || GpuSide::new(&gpu, &begin, 0.2, Some(&context)).unwrap();
+    let there = run(&mut gpu_side(), &looks);
+    assert!(words(&there) == words(&run(&mut gpu_side(), &looks)), "the same bits");
+
+    let by_column = |found: &[Vec<f32>], expected: &[Vec<f32>]| {
+        found.iter().zip(expected).map(|(a, b)| off(a, b)).fold(0.0, f32::max)
+    };
+    let moments_off = |a: &State, b: &State| {
+        let ((steps, first, second), (others, other_first, other_second)) = (a.adam.parts(), b.adam.parts());
+        assert_eq!((steps, others), (1, 1));
+        by_column(first, other_first).max(by_column(second, other_second))
+    };
+    let loss_off = (there.loss - cpu.loss).abs() / cpu.loss;
+    let (tally, of_cpu) = (there.need.tally, cpu.need.tally);
+    let l1_off = (tally.sum - of_cpu.sum).abs() / of_cpu.sum;
+    let evidence_off =
+        off(&there.evidence.error, &cpu.evidence.error).max(off(&there.evidence.weight, &cpu.evidence.weight));
+    let off_by = moments_off(&there, &cpu);
+    println!("loss {loss_off:.1e}, L1 {l1_off:.1e}, moments {off_by:.1e}, evidence {evidence_off:.1e}");
+    assert_eq!((tally.count, of_cpu.count), (4, 4));
+    assert_eq!(there.evidence.views, cpu.evidence.views);
+    assert!((0..=4).filter(|n| cpu.evidence.views.contains(n)).count() >= 4, "{:?}", cpu.evidence.views);
+    assert!(loss_off < 1e-5 && l1_off < 1e-5 && evidence_off < 1e-4 && off_by < 1e-4);
+    // Every look counts, for the splats as for the books.
+    for n in 0..looks.len() {
+        let mut fewer = looks.clone();
+        fewer.remove(n);
+        let without = run(&mut gpu_side(), &fewer);
+        assert!(moments_off(&without, &there) > 1e-2 && without.loss != there.loss, "look {n} is lost");
+    }
+    // One that is no number spoils the step for all.
+    let mut gpu_without = GpuSide::new(&gpu, &begin, f32::NAN, Some(&context)).unwrap();
+    let mut cpu_without = super::super::cpu::CpuSide::new(f32::NAN, Some(&context));
+    for side in [&mut gpu_without as &mut dyn Side, &mut cpu_without] {
+        let left_out = run(side, &looks);
+        assert_eq!((left_out.skipped, left_out.need.tally.count, left_out.adam.parts().0), (1, 0, 0));
+        assert!(left_out.splats == begin.splats && left_out.evidence.views.iter().all(|&views| views == 0));
     }
 }
 
