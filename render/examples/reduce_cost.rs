@@ -1,4 +1,4 @@
-//! What a fixed order of the backward's sums costs against float atomics, and what subgroups save:
+//! What a fixed order of the backward's sums costs against float atomics, and what subgroups and half precision save:
 //!
 //! ```sh
 //! cargo run --release -p render --example reduce_cost -- [ROUNDS] [SPLATS]...
@@ -14,7 +14,7 @@ use std::time::Instant;
 
 use glam::{DQuat, DVec3, Vec3};
 use render::Options;
-use render::gpu::{Gpu, GpuError, GpuOptions, GpuRenderer, GpuSplats, Reduction, UpstreamPlanes};
+use render::gpu::{Gpu, GpuError, GpuOptions, GpuRenderer, GpuSplats, Path, Reduction, UpstreamPlanes};
 use scene::{Camera, Pinhole, Rigid, Splat, Splats};
 
 const WIDTH: u32 = 480;
@@ -27,8 +27,12 @@ fn main() -> Result<(), Box<dyn Error>> {
     let counts = if numbers.len() > 1 { &numbers[1..] } else { &[12_000, 48_000] };
     let options = GpuOptions::from_env()?;
     let mut gpus = vec![Gpu::open_with(&options)?];
-    if gpus[0].has_subgroups() {
-        gpus.push(Gpu::open_with(&GpuOptions { portable: true, ..options })?);
+    for path in [Path::Portable, Path::Half] {
+        match Gpu::open_with(&GpuOptions { path, ..options.clone() }) {
+            Ok(gpu) if gpu.path() != gpus[0].path() => gpus.push(gpu),
+            Ok(_) | Err(GpuError::NoHalf(_)) => {}
+            Err(error) => return Err(error.into()),
+        }
     }
     for &count in counts {
         let splats = random_splats(count);
@@ -49,16 +53,18 @@ fn main() -> Result<(), Box<dyn Error>> {
                 );
             }
         }
-        if let [fast, portable] = sides.as_mut_slice() {
+        let (usual, others) = sides.split_at_mut(1);
+        for other in others {
+            let [name, usual_name] = [other.gpu.name(), usual[0].gpu.name()];
             let compare = |clock: &str, [a_step, a, _]: [f64; 3], [b_step, b, _]: [f64; 3]| {
                 println!(
-                    "{count} splats, {clock}: subgroups take {:.3} of the portable sums, {:.3} of the whole",
+                    "{count} splats, {clock}: {name} takes {:.3} of the sums of {usual_name}, {:.3} of the whole",
                     a / b,
                     a_step / b_step
                 );
             };
-            compare("wall", fast.wall_millis(), portable.wall_millis());
-            compare("CPU", fast.cpu_millis(), portable.cpu_millis());
+            compare("wall", other.wall_millis(), usual[0].wall_millis());
+            compare("CPU", other.cpu_millis(), usual[0].cpu_millis());
         }
     }
     Ok(())

@@ -12,7 +12,7 @@ use std::sync::{Arc, OnceLock};
 use reference::mixture::{KINDS, Kind, SIZES, Tally, camera_of, mixture};
 use reference::{Random, Scene, tensors};
 use render::cpu::{Isa, Renderer};
-use render::gpu::{Gpu, GpuError, GpuOptions, GpuRenderer, GpuSplats, Reduction, UpstreamPlanes};
+use render::gpu::{Gpu, GpuError, GpuOptions, GpuRenderer, GpuSplats, Path, Reduction, UpstreamPlanes};
 use render::{Frame, Gradients, Options, Stages, Upstream};
 use scene::{Camera, Splats};
 
@@ -35,7 +35,7 @@ fn gpus() -> Vec<Arc<Gpu>> {
     static PORTABLE: OnceLock<Option<Arc<Gpu>>> = OnceLock::new();
     let Some(fast) = gpu() else { return Vec::new() };
     let open = || {
-        let options = GpuOptions { portable: true, ..GpuOptions::from_env().expect("a sound environment") };
+        let options = GpuOptions { path: Path::Portable, ..GpuOptions::from_env().expect("a sound environment") };
         fast.has_subgroups().then(|| Gpu::open_with(&options).expect("it opened once"))
     };
     let portable = PORTABLE.get_or_init(open).clone();
@@ -143,6 +143,41 @@ fn every_path_draws_the_same_bits_and_adds_up_the_same_sums() {
         // Needles magnify what their sums differ by, as they do among the CPU's instruction sets.
         assert!(error > 0.0, "{kind:?}: the same bits: did both run the same stages?");
         assert!(error < if kind == Kind::Needle { NEEDLES } else { 1e-4 }, "{kind:?}: {error} of {column}");
+    }
+}
+
+/// What half precision may change: sums of gradients, from their fourth digit on, and nothing before.
+#[test]
+fn half_precision_draws_the_same_bits_and_adds_up_to_three_digits() {
+    let Some(fast) = gpu() else { return };
+    let options = GpuOptions { path: Path::Half, ..GpuOptions::from_env().expect("a sound environment") };
+    let half = match Gpu::open_with(&options) {
+        Ok(half) => half,
+        Err(error @ GpuError::NoHalf(_)) => return println!("skipped: {error}"),
+        Err(error) => panic!("{error}"),
+    };
+    assert!(half.path() == Path::Half && half.name().ends_with("-subgroups-half"), "{}", half.name());
+    for kind in [Kind::Common, Kind::Close, Kind::Opaque, Kind::Huge] {
+        let camera = camera_of(400, 300);
+        let mut random = Random(31);
+        let splats = mixture(&mut random, &camera, kind, 1000);
+        let context = mixture(&mut random, &camera, Kind::Common, 200);
+        let options = self::options(true);
+        // As of a mean over the pixels, which is what losses are.
+        let mut upstream = noise(&camera, &options);
+        for plane in [&mut upstream.colour, &mut upstream.transmittance, &mut upstream.depth] {
+            plane.iter_mut().for_each(|value| *value /= 120_000.0);
+        }
+        let draw = |gpu: &Arc<Gpu>| {
+            let mut renderer = GpuRenderer::new(gpu.clone()).expect("a renderer");
+            on_gpu(gpu, &mut renderer, &splats, Some(&context), &camera, &options, &upstream)
+        };
+        let [a, b] = [draw(&half), draw(&fast)];
+        assert!(a.frame == b.frame && a.gradients.seen == b.gradients.seen, "{kind:?}: pictures differ");
+        assert!(bits(&a) == bits(&draw(&half)), "{kind:?}: two runs differ");
+        let (error, column) = worst(&a.gradients, &b.gradients);
+        println!("{kind:?}: gradients off by {error:.1e} ({column})");
+        assert!(error > 0.0 && error < 1e-3, "{kind:?}: {error} of {column}");
     }
 }
 

@@ -1,7 +1,8 @@
 //! The stages of the GPU backend as WGSL text, and the layouts that they share with Rust.
 //!
 //! A [`Stage`] is one file of `wgsl/` with the snippets that it uses before it; several entry points may share a file. Where
-//! subgroups do something faster, a snippet has a twin for them: [`SUBGROUPS`] are the stages with those in its place.
+//! subgroups do something faster, a snippet has a twin for them: [`SUBGROUPS`] are the stages with those in its place, [`HALF`] those
+//! with half precision too.
 //! A test parses every stage with naga and compares every structure with its Rust twin.
 //!
 //! Architecture invariant: text and layouts only; nothing here knows a device.
@@ -73,6 +74,8 @@ const SUMS: [&str; 2] = snippet!("sums");
 const DIGITS_OF: [&str; 2] = snippet!("digits");
 /// Sums over the pixels of a tile.
 const PARTS: [&str; 2] = snippet!("parts");
+/// Where what pixels say of a pair waits for those who add it up, in single precision or in half.
+const TOUCHES: [&str; 2] = [include_str!("../wgsl/touches.wgsl"), include_str!("../wgsl/touches_half.wgsl")];
 /// Where the sums of a pair go: to itself.
 const IN_ORDER: &str = include_str!("../wgsl/in_order.wgsl");
 /// Where the sums of a pair go: to its splat, by atomics.
@@ -100,7 +103,7 @@ stages! {
     EMIT "emit" [VIEW, TILES] ["emit"];
     RANGES "ranges" [VIEW] ["ranges"];
     RASTERIZE "rasterize" [VIEW, BLEND] ["rasterize"];
-    RASTERIZE_BACKWARD "rasterize_backward" [VIEW, BLEND, THREADS[0], PARTS[0], IN_ORDER] ["rasterize_backward"];
+    RASTERIZE_BACKWARD "rasterize_backward" [VIEW, BLEND, THREADS[0], TOUCHES[0], PARTS[0], IN_ORDER] ["rasterize_backward"];
     REDUCE "reduce" [VIEW] ["reduce"];
     PROJECT_BACKWARD "project_backward" [VIEW, SPLAT] ["project_backward"];
 }
@@ -112,7 +115,7 @@ const BACKWARD_TEXT: &str = include_str!("../wgsl/rasterize_backward.wgsl");
 /// As [`RASTERIZE_BACKWARD`], but a pair's sums are added to its splat's by atomics: what fixed order is measured against.
 pub const RASTERIZE_BACKWARD_ATOMICS: Stage = Stage::new(
     "rasterize_backward_atomics",
-    &[VIEW, BLEND, THREADS[0], PARTS[0], BY_ATOMICS, BACKWARD_TEXT],
+    &[VIEW, BLEND, THREADS[0], TOUCHES[0], PARTS[0], BY_ATOMICS, BACKWARD_TEXT],
     RASTERIZE_BACKWARD.entries,
 );
 
@@ -122,15 +125,23 @@ pub const SUBGROUPS: &[Stage] = &[
     Stage::new(RADIX.name, &[THREADS[1], DIGITS_OF[1], RADIX_TEXT], RADIX.entries),
     Stage::new(
         RASTERIZE_BACKWARD.name,
-        &[VIEW, BLEND, THREADS[1], PARTS[1], IN_ORDER, BACKWARD_TEXT],
+        &[VIEW, BLEND, THREADS[1], TOUCHES[0], PARTS[1], IN_ORDER, BACKWARD_TEXT],
         RASTERIZE_BACKWARD.entries,
     ),
     Stage::new(
         RASTERIZE_BACKWARD_ATOMICS.name,
-        &[VIEW, BLEND, THREADS[1], PARTS[1], BY_ATOMICS, BACKWARD_TEXT],
+        &[VIEW, BLEND, THREADS[1], TOUCHES[0], PARTS[1], BY_ATOMICS, BACKWARD_TEXT],
         RASTERIZE_BACKWARD_ATOMICS.entries,
     ),
 ];
+
+/// What takes the place of those of [`SUBGROUPS`] of the same names where half precision is asked for. Pictures have the same bits, sums
+/// of gradients fewer right ones.
+pub const HALF: &[Stage] = &[Stage::new(
+    RASTERIZE_BACKWARD.name,
+    &[VIEW, BLEND, THREADS[1], TOUCHES[1], PARTS[1], IN_ORDER, BACKWARD_TEXT],
+    RASTERIZE_BACKWARD.entries,
+)];
 
 /// A camera in single precision with what the stages want of it, and where its share of the buffers begins.
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]

@@ -6,7 +6,7 @@ use std::mem::offset_of;
 use naga::valid::{Capabilities, ValidationFlags, Validator};
 use naga::{Module, TypeInner};
 use shaders::train::{self, Books, Rates, Window, Windows};
-use shaders::{Pass, Planes, RASTERIZE_BACKWARD_ATOMICS, STAGES, SUBGROUPS, Set, Stage, Status, View, Views};
+use shaders::{HALF, Pass, Planes, RASTERIZE_BACKWARD_ATOMICS, STAGES, SUBGROUPS, Set, Stage, Status, View, Views};
 
 /// Name and byte offset of each member, and the size of the whole.
 type Layout = (Vec<(String, usize)>, usize);
@@ -48,10 +48,14 @@ fn structures(module: &Module) -> BTreeMap<String, Layout> {
         .collect()
 }
 
+/// What the stages of [`HALF`] need.
+const FOR_HALF: Capabilities = Capabilities::SUBGROUP.union(Capabilities::SHADER_FLOAT16_IN_FLOAT32);
+
 /// Every stage, and what an adapter must have for it.
 fn stages() -> impl Iterator<Item = (&'static Stage, Capabilities)> {
     let plain = STAGES.iter().chain(train::STAGES).chain([&RASTERIZE_BACKWARD_ATOMICS]);
-    plain.map(|s| (s, Capabilities::empty())).chain(SUBGROUPS.iter().map(|s| (s, Capabilities::SUBGROUP)))
+    let faster = SUBGROUPS.iter().map(|s| (s, Capabilities::SUBGROUP)).chain(HALF.iter().map(|s| (s, FOR_HALF)));
+    plain.map(|s| (s, Capabilities::empty())).chain(faster)
 }
 
 fn parse(name: &str, source: &str, needs: Capabilities) -> Result<Module, String> {
@@ -87,7 +91,7 @@ fn stages_are_valid_and_agree_with_their_twins() {
 
 #[test]
 fn subgroups_take_the_place_of_portable_stages() {
-    for stage in SUBGROUPS {
+    for stage in SUBGROUPS.iter().chain(HALF) {
         let mut portable = stages().filter(|(other, needs)| other.name == stage.name && needs.is_empty());
         let (portable, _) = portable.next().unwrap_or_else(|| panic!("{} is for subgroups only", stage.name));
         assert_eq!(portable.entries, stage.entries);
@@ -99,12 +103,7 @@ fn subgroups_take_the_place_of_portable_stages() {
             all.sort();
             all
         };
-        assert_eq!(
-            bindings(portable, Capabilities::empty()),
-            bindings(stage, Capabilities::SUBGROUP),
-            "{}",
-            stage.name
-        );
+        assert_eq!(bindings(portable, Capabilities::empty()), bindings(stage, FOR_HALF), "{}", stage.name);
         assert!(parse(stage.name, &stage.source(), Capabilities::empty()).is_err(), "{} uses none", stage.name);
     }
 }

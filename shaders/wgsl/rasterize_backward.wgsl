@@ -28,8 +28,6 @@ var<workgroup> pairs: array<u32, PAIRS>;
 var<workgroup> owns: array<u32, PAIRS>;
 // dL/d colour and depth of each pixel.
 var<workgroup> wanted: array<vec4<f32>, 256>;
-// v of pair k and pixel p at 256 k + p, w 2048 later; then the parts of the moments.
-var<workgroup> shared_: array<f32, 4096>;
 // Bit k: some pixel blended pair k.
 var<workgroup> blended: atomic<u32>;
 var<workgroup> end_of_tile: atomic<u32>;
@@ -126,8 +124,7 @@ fn rasterize_backward(
                     mine |= 1u << k;
                 }
             }
-            shared_[256u * k + local] = v;
-            shared_[2048u + 256u * k + local] = w;
+            put_touch(256u * k + local, v, w, f32(area));
         }
         if mine != 0u {
             atomicOr(&blended, mine);
@@ -140,7 +137,7 @@ fn rasterize_backward(
         let any = ((atomicLoad(&blended) >> k) & 1u) != 0u;
         let dx = f32(corner.x + part % TILE) + 0.5 - places[k].x;
         if k < count && any && owns[k] != 0u {
-            sums = add_up(k, part, dx, f32(corner.y + part / TILE) + 0.5 - places[k].y);
+            sums = add_up(k, part, f32(area), dx, f32(corner.y + part / TILE) + 0.5 - places[k].y);
         }
         add_up_parts(moments_of(sums, dx), count, thread);
     }
@@ -183,7 +180,7 @@ struct Sums {
 }
 
 // The sums over the eight pixels of a part: column part % 16, every second row from part / 16; dx and dy of the first.
-fn add_up(k: u32, part: u32, dx: f32, dy: f32) -> Sums {
+fn add_up(k: u32, part: u32, pixels: f32, dx: f32, dy: f32) -> Sums {
     let a = places[k].z;
     let b = places[k].w;
     let c = reaches[k].x;
@@ -194,8 +191,9 @@ fn add_up(k: u32, part: u32, dx: f32, dy: f32) -> Sums {
     var sums = Sums(0.0, 0.0, 0.0, vec4<f32>(0.0), 0.0, vec2<f32>(0.0));
     for (var n = 0u; n < PIXELS; n++) {
         let p = part + PARTS * n;
-        let v = shared_[256u * k + p];
-        let w = shared_[2048u + 256u * k + p];
+        let vw = touch_at(256u * k + p, pixels);
+        let v = vw.x;
+        let w = vw.y;
         let y = dy + f32(2u * n);
         let vy = v * y;
         sums.v += v;

@@ -4,7 +4,7 @@
 
 mod ring;
 
-use render::gpu::{Gpu, GpuOptions};
+use render::gpu::{Gpu, GpuError, GpuOptions, Path};
 use ring::*;
 use scene::{Exposures, Splats};
 use train::{Backend, Flow, Recipe, State, TrainError};
@@ -55,6 +55,28 @@ fn a_gpu_trains_as_well_as_the_cpu() {
         assert!((cpu_db - gpu_db).abs() < 0.1, "{cpu_db} dB on the CPU, {gpu_db} on the GPU");
         assert!(gpu.len().abs_diff(cpu.len()) <= 3 && all_finite(&gpu));
     }
+}
+
+#[test]
+fn half_precision_trains_as_well() {
+    let Some(full) = gpu() else { return };
+    let options = GpuOptions { path: Path::Half, ..GpuOptions::from_env().expect("a sound environment") };
+    let half = match Gpu::open_with(&options) {
+        Ok(half) => Backend::Gpu(half),
+        Err(error @ GpuError::NoHalf(_)) => return println!("skipped: {error}"),
+        Err(error) => panic!("{error}"),
+    };
+    let truth = cloud(1, 200, 0.8);
+    let photos = photos(&truth);
+    let run = |backend: &Backend| {
+        let setup = Setup::new(perturbed(&truth), &photos);
+        Setup { backend: backend.clone(), budget: 300, steps: 100, ..setup }.run()
+    };
+    let [full, half] = [run(&full), run(&half)];
+    let [full_db, half_db] = [&full, &half].map(|splats| psnr(splats, &photos, |_| true));
+    println!("{full_db:.3} dB in single precision, {half_db:.3} in half");
+    assert!(bits(&full) != bits(&half), "is it half precision?");
+    assert!((full_db - half_db).abs() < 0.1, "{full_db} and {half_db} dB");
 }
 
 #[test]

@@ -10,7 +10,7 @@ use std::sync::{Arc, Mutex};
 use super::error::{Faults, GpuError, one_line};
 use super::kernel::Kernels;
 use super::memory::Meter;
-use super::options::GpuOptions;
+use super::options::{GpuOptions, Path};
 use super::watch::{CLOCK, Watch};
 
 /// Storage bindings of the stage that has most (`project_backward`).
@@ -25,7 +25,7 @@ pub struct Gpu {
     queue: wgpu::Queue,
     name: String,
     class: &'static str,
-    subgroups: bool,
+    path: Path,
     faults: Arc<Faults>,
     meter: Arc<Meter>,
     /// Bytes handed to [`Gpu::upload`] that may still wait on the host.
@@ -82,7 +82,16 @@ impl Gpu {
                 return Err(GpuError::TooSmall { adapter: info.name, what, has: has.into(), needs: needs.into() });
             }
         }
-        let subgroups = !options.portable && has_subgroups(adapter.features(), &info);
+        let subgroups = options.path != Path::Portable && has_subgroups(adapter.features(), &info);
+        // Halves are packed, which nearly all can, and quickly those that compute with them.
+        let half = adapter.features().contains(wgpu::Features::SHADER_F16)
+            && adapter.get_downlevel_capabilities().flags.contains(wgpu::DownlevelFlags::SHADER_F16_IN_F32);
+        let path = match (options.path, subgroups) {
+            (Path::Half, true) if half => Path::Half,
+            (Path::Half, _) => return Err(GpuError::NoHalf(info.name)),
+            (_, true) => Path::Fast,
+            (_, false) => Path::Portable,
+        };
         let descriptor = wgpu::DeviceDescriptor {
             label: Some("plat"),
             required_features: adapter.features() & CLOCK
@@ -98,9 +107,9 @@ impl Gpu {
         device.on_uncaptured_error(Arc::new(move |error: wgpu::Error| of_errors.caught(&error)));
         device.set_device_lost_callback(move |_, message| of_loss.lost(&message));
         Ok(Self {
-            name: name(&info, subgroups),
+            name: name(&info, path),
             class: class(info.device_type),
-            subgroups,
+            path,
             faults,
             meter: Meter::new(options.memory_bytes),
             staged: AtomicU64::new(0),
@@ -129,7 +138,12 @@ impl Gpu {
 
     /// True where [`shaders::SUBGROUPS`] run.
     pub fn has_subgroups(&self) -> bool {
-        self.subgroups
+        self.path != Path::Portable
+    }
+
+    /// Which stages run.
+    pub fn path(&self) -> Path {
+        self.path
     }
 
     /// The device, for what the helpers here do not do.
@@ -229,10 +243,14 @@ fn class(kind: wgpu::DeviceType) -> &'static str {
     }
 }
 
-fn name(info: &wgpu::AdapterInfo, subgroups: bool) -> String {
+fn name(info: &wgpu::AdapterInfo, path: Path) -> String {
     let model = info.name.split('(').next().unwrap_or_default();
     let words = model.split(|c: char| !c.is_ascii_alphanumeric()).filter(|word| !word.is_empty());
     let mut words: Vec<String> = words.map(str::to_ascii_lowercase).collect();
-    words.extend(subgroups.then(|| "subgroups".into()));
+    words.extend(match path {
+        Path::Portable => None,
+        Path::Fast => Some("subgroups".into()),
+        Path::Half => Some("subgroups-half".into()),
+    });
     format!("gpu-{}-{}", info.backend.to_str(), words.join("-"))
 }

@@ -21,6 +21,9 @@ pub enum GpuError {
         /// What it may say.
         wanted: &'static str,
     },
+    /// Half precision was asked for, and an adapter of this name has none, or no subgroups of one size.
+    #[error("the GPU {0} has no half precision, or no subgroups of one size: set PLAT_GPU_PATH to fast, or leave it")]
+    NoHalf(String),
     /// The adapter cannot run the stages.
     #[error("the GPU {adapter} has {what} {has} where {needs} are needed: use --backend cpu")]
     TooSmall {

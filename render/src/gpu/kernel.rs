@@ -7,6 +7,7 @@ use shaders::Stage;
 
 use super::device::Gpu;
 use super::error::GpuError;
+use super::options::Path;
 
 /// Workgroups in a row before a dispatch gets a second dimension.
 const GROUPS_IN_A_ROW: u32 = 1 << 15;
@@ -24,8 +25,13 @@ impl Gpu {
         if let Some(kernel) = kernels.get(&(stage.name, entry)) {
             return Ok(kernel.clone());
         }
-        let faster = shaders::SUBGROUPS.iter().find(|faster| faster.name == stage.name);
-        let kernel = self.compile(faster.filter(|_| self.has_subgroups()).unwrap_or(stage), entry)?;
+        let twins = match self.path() {
+            Path::Portable => [&[][..], &[]],
+            Path::Fast => [&[], shaders::SUBGROUPS],
+            Path::Half => [shaders::HALF, shaders::SUBGROUPS],
+        };
+        let faster = twins.into_iter().flatten().find(|faster| faster.name == stage.name);
+        let kernel = self.compile(faster.unwrap_or(stage), entry)?;
         kernels.insert((stage.name, entry), kernel.clone());
         Ok(kernel)
     }

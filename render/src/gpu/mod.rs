@@ -38,7 +38,7 @@ pub use device::Gpu;
 pub use error::GpuError;
 pub use kernel::Kernel;
 pub use memory::{Buffer, Growing};
-pub use options::GpuOptions;
+pub use options::{GpuOptions, Path};
 pub use splats::{Columns, GpuSplats};
 pub use watch::Dispatched;
 
@@ -288,7 +288,10 @@ mod tests {
     /// require one.
     pub(super) fn gpu(portable: bool) -> Option<Arc<Gpu>> {
         let required = std::env::var("PLAT_GPU").is_ok_and(|value| value == "required");
-        let options = GpuOptions { portable, ..GpuOptions::from_env().expect("a sound environment") };
+        let options = GpuOptions {
+            path: if portable { Path::Portable } else { Path::Fast },
+            ..GpuOptions::from_env().expect("a sound environment")
+        };
         match Gpu::open_with(&options) {
             Ok(gpu) => Some(gpu),
             Err(e) if required => panic!("PLAT_GPU=required, but {e}"),

@@ -2,20 +2,33 @@
 
 use super::error::GpuError;
 
-/// How a device is opened. None of it changes what is computed, but for `portable`, which the backend's name shows.
+/// How a device is opened. None of it changes what is computed, but for the path, which the backend's name shows.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct GpuOptions {
     /// A part of the adapter's name, in any case; `None`: the most powerful one.
     pub adapter: Option<String>,
     /// Most bytes that buffers may take together; `None`: what the driver gives.
     pub memory_bytes: Option<u64>,
-    /// The stages that every adapter runs, though this one may have faster ones.
-    pub portable: bool,
+    /// Which stages run.
+    pub path: Path,
+}
+
+/// Which stages run: those of one path have the same bits, those of another others.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub enum Path {
+    /// Those that every adapter runs.
+    Portable,
+    /// Where an adapter has subgroups of one size, those; else the portable ones.
+    #[default]
+    Fast,
+    /// Those with subgroups, and gradients that wait in workgroup memory in half precision: less of it to write and to read, for
+    /// sums that are right to three digits. An adapter without either is refused.
+    Half,
 }
 
 impl GpuOptions {
-    /// From `PLAT_GPU_ADAPTER`, `PLAT_GPU_MEMORY` (a number of bytes, KiB, MiB or GiB) and `PLAT_GPU_PATH` (`fast` or `portable`).
-    /// What is not set, or empty, is the default.
+    /// From `PLAT_GPU_ADAPTER`, `PLAT_GPU_MEMORY` (a number of bytes, KiB, MiB or GiB) and `PLAT_GPU_PATH` (`fast`,
+    /// `portable` or `half`). What is not set, or empty, is the default.
     ///
     /// # Errors
     /// A value that means nothing.
@@ -35,12 +48,13 @@ impl GpuOptions {
             },
             None => None,
         };
-        let portable = match path.as_deref() {
-            None | Some("fast") => false,
-            Some("portable") => true,
-            Some(other) => return wrong("PLAT_GPU_PATH", other.into(), "fast or portable"),
+        let path = match path.as_deref() {
+            None | Some("fast") => Path::Fast,
+            Some("portable") => Path::Portable,
+            Some("half") => Path::Half,
+            Some(other) => return wrong("PLAT_GPU_PATH", other.into(), "fast, portable or half"),
         };
-        Ok(Self { adapter, memory_bytes, portable })
+        Ok(Self { adapter, memory_bytes, path })
     }
 }
 
@@ -67,12 +81,13 @@ mod tests {
             GpuOptions::parse(Some("lava".into()), memory.map(Into::into), path.map(Into::into))
         };
         let plain = of(None, None).expect("nothing is wrong with nothing");
-        assert_eq!(plain, GpuOptions { adapter: Some("lava".into()), memory_bytes: None, portable: false });
+        assert_eq!(plain, GpuOptions { adapter: Some("lava".into()), memory_bytes: None, path: Path::Fast });
         for (text, bytes) in [("1500", 1500), ("0", 0), ("512 KiB", 512 << 10), ("3MiB", 3 << 20), ("20GiB", 20 << 30)]
         {
             assert_eq!(of(Some(text), Some("fast")).map(|o| o.memory_bytes), Ok(Some(bytes)), "{text}");
         }
-        assert_eq!(of(None, Some("portable")).map(|o| o.portable), Ok(true));
+        assert_eq!(of(None, Some("portable")).map(|o| o.path), Ok(Path::Portable));
+        assert_eq!(of(None, Some("half")).map(|o| o.path), Ok(Path::Half));
         for (memory, path) in [
             (Some("GiB"), None),
             (Some("-1"), None),
