@@ -346,6 +346,8 @@ pub fn train_on(
             Ok(Look { view: view.view, photo, camera, exposure })
         };
         let looks = (step..step + count).map(|step| look(&views[turns.of(step)])).collect::<Result<Vec<_>, _>>()?;
+        // Growth that ends early skips steps, whose windows nobody asks for.
+        told = told.max(step + count);
         while told < steps.min(step + count + (AHEAD as u32).max(count)) {
             let next = &views[turns_ahead.of(told)];
             let (mip, rect, _) = window(next);

@@ -2,12 +2,14 @@
 
 mod ring;
 
+use std::sync::{Arc, Mutex};
+
 use glam::Vec3;
 use render::Options;
 use render::cpu::Renderer;
 use ring::*;
-use scene::{Exposure, Exposures, Pixels, Splat, Splats, column};
-use train::{Backend, Flow, Job, Recipe, State, TrainError, TrainView, metrics, random, train};
+use scene::{Exposure, Exposures, Pixels, Rect, Splat, Splats, column};
+use train::{Backend, Flow, Job, Recipe, State, TrainError, TrainView, WindowSource, metrics, random, train};
 
 #[test]
 fn perturbed_points_are_fitted_beyond_30_db() {
@@ -381,4 +383,59 @@ fn a_report_can_stop_and_errors_say_why() {
         backend: &Backend::Cpu,
     };
     assert_eq!(train(job, &mut |_| Flow::Continue), Err(TrainError::NoViews));
+}
+
+/// Photos that note which views were announced and which asked for.
+struct Heard<'a>(&'a Photos, Mutex<[Vec<u32>; 2]>);
+
+impl WindowSource for Heard<'_> {
+    fn window(&self, view: u32, mip: u8, rect: Rect) -> Result<Arc<Pixels>, String> {
+        self.1.lock().unwrap()[1].push(view);
+        self.0.window(view, mip, rect)
+    }
+
+    fn expect(&self, view: u32, _: u8, _: Rect) {
+        self.1.lock().unwrap()[0].push(view);
+    }
+}
+
+/// However a training goes, hardly a window is announced that nobody asks for: each of them may be a download.
+#[test]
+fn what_is_announced_is_asked_for() {
+    let truth = cloud(1, 60, 0.8);
+    let (photos, views) = (photos(&truth), views());
+    for (views_per_step, worth_db) in [(1, 0.0), (1, 1e6), (5, 0.0), (5, 1e6)] {
+        let source = Heard(&photos, Mutex::default());
+        let mut recipe = Recipe { views_per_step, coarse: Vec::new(), ..Recipe::default() };
+        recipe.growth.worth_db = worth_db;
+        let mut steps = 0;
+        let job = Job {
+            initial: perturbed(&truth),
+            context: None,
+            views: &views,
+            counts: &|_| true,
+            keeps: &|_| true,
+            budget: 600,
+            steps: 600,
+            antialiased: false,
+            seed: 5,
+            size_bounds_metres: [1e-3, 2.0],
+            exposures: None,
+            trains_exposures: false,
+            recipe: &recipe,
+            source: &source,
+            backend: &Backend::Cpu,
+        };
+        let trained = train(job, &mut |now| {
+            steps += now.views as usize;
+            Flow::Continue
+        });
+        trained.expect("training goes well");
+        let [told, asked] = source.1.into_inner().unwrap();
+        println!("{views_per_step} a step, growth worth {worth_db} dB: {} told, {} asked for", told.len(), asked.len());
+        assert_eq!(asked.len(), steps);
+        assert_eq!(steps < 600, worth_db > 0.0, "growth that never pays ends early");
+        // Those first asked for are not told; those told when growth ended are not asked for.
+        assert!(told.len().abs_diff(asked.len()) <= 16 && told.len() + 16 > asked.len());
+    }
 }
