@@ -52,5 +52,8 @@ docker run --rm --network none --read-only --tmpfs /tmp:mode=1777 --volume /out 
 # Images of the profile `observability` come from a registry that CI cannot reach: what is checked is how they are put together.
 docker compose --profile observability config --quiet
 step "chaos"
+# The containers' users are not root, for whom a file system may keep a part of itself.
+free=$(df --output=avail --block-size=1M "$(docker info --format '{{.DockerRootDir}}')" | tail -1)
+((free >= 1000)) || { echo "$free MB of disk are left for others than root, and the cluster's store takes up to 1000: make room"; exit 1; }
 python3 infra/chaos/run.py --capture "$capture" "$@"
 step "done"

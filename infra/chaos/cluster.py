@@ -21,7 +21,10 @@ class Trouble(Exception):
 
 def run(*words, check=True, env=None, data=None, timeout=180):
     """A command's standard output, as bytes."""
-    done = subprocess.run(words, input=data, capture_output=True, env=env, timeout=timeout)
+    try:
+        done = subprocess.run(words, input=data, capture_output=True, env=env, timeout=timeout)
+    except subprocess.TimeoutExpired:
+        raise Trouble(f"{' '.join(words)}: no end after {timeout} s") from None
     if check and done.returncode != 0:
         raise Trouble(f"{' '.join(words)}: {done.returncode}: {done.stderr.decode(errors='replace')[-2000:]}")
     return done.stdout
@@ -84,7 +87,7 @@ class Cluster:
                     words_there = ["exec", container, "plat", "--config", "/cluster/plat.toml", *words, "--json", "--quiet"]
                     try:
                         return json.loads(docker(*words_there, timeout=20))
-                    except (Trouble, ValueError, subprocess.TimeoutExpired) as error:
+                    except (Trouble, ValueError) as error:
                         last = error
             if time.monotonic() > until:
                 raise Trouble(f"no answer to plat {' '.join(words)}: {last}")
@@ -116,7 +119,8 @@ class Cluster:
         return found[0] if found else None
 
     def logs(self):
-        return self.compose("logs", "--no-color", "--tail", "40", "coordinator", "standby", "worker", check=False).decode(errors="replace")
+        services = ["store", "bucket", "certificates", "coordinator", "standby", "worker"]
+        return self.compose("logs", "--no-color", "--tail", "40", *services, check=False).decode(errors="replace")
 
     def rados(self, *words, **options):
         store = self.containers("store")[0]

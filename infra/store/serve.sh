@@ -30,12 +30,17 @@ make_disk() {
 trap 'kill $(jobs -p) 2>/dev/null; wait' TERM INT EXIT
 ceph-mon --foreground --id a &
 ceph-osd --foreground --id 0 &
-until timeout 20 radosgw-admin user info --uid plat >/dev/null 2>&1 \
-    || timeout 60 radosgw-admin user create --uid plat --display-name plat --access-key "$STORE_KEY" --secret "$STORE_SECRET" >/dev/null; do
-    # A part that could not start is not waited for.
-    [[ $(jobs -pr | wc -l) == 2 ]] || exit 1
-    sleep 1
-done
+ready() {
+    until timeout 20 radosgw-admin user info --uid plat >/dev/null 2>&1 \
+        || timeout 60 radosgw-admin user create --uid plat --display-name plat --access-key "$STORE_KEY" --secret "$STORE_SECRET" >/dev/null; do
+        sleep 1
+    done
+}
+ready &
+ready=$!
+# A part that ends is not waited for, nor what waits for it.
+wait -n -p ended || true
+[[ $ended == "$ready" ]] || { echo "serve.sh: a part of the store ended; what it said is above" >&2; exit 1; }
 radosgw --foreground --name client.admin &
 # A signal ends the wait, too, and the trap does the rest.
 wait -n
