@@ -1,4 +1,7 @@
-//! The floors of the building: a crate may depend only on crates below it. Read from cargo's own metadata.
+//! Imports run one way. Between crates: a crate may depend only on crates of lower floors, read from cargo's metadata. Inside a
+//! crate: the files' imports form no ring, read from the sources.
+
+mod modules;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
@@ -150,4 +153,30 @@ fn what_must_be_absent_is_absent() {
             assert!(!reached.contains(*name), "{member} depends on {name}, directly or through others");
         }
     }
+}
+
+/// The first ring of each crate is named, with the imports that make it one.
+#[test]
+fn imports_inside_a_crate_form_no_ring() {
+    let metadata = metadata();
+    let mut lines = Vec::new();
+    let mut files = 0;
+    for package in metadata.workspace_packages() {
+        let src = package.manifest_path.parent().expect("a manifest lies in a folder").join("src");
+        if !src.exists() {
+            continue;
+        }
+        let graph = modules::graph(src.as_std_path());
+        files += graph.len();
+        for ring in modules::rings(&graph) {
+            let name = |module: &modules::Module| if module.is_empty() { "lib".to_owned() } else { module.join("::") };
+            lines.push(format!("{}: a ring of imports between {}", package.name, ring.iter().map(name).collect::<Vec<_>>().join(", ")));
+            for from in &ring {
+                let to = graph[from].iter().filter(|to| ring.contains(to));
+                lines.extend(to.map(|to| format!("    {} imports {}", name(from), name(to))));
+            }
+        }
+    }
+    assert!(files > 100, "only {files} files were read");
+    assert!(lines.is_empty(), "{}", lines.join("\n"));
 }
