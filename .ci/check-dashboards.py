@@ -1,4 +1,4 @@
-"""Whether dashboards and the autoscaler ask for metrics that docs/metrics.md lists, and for data sources that are provisioned."""
+"""Whether dashboards and the autoscaler ask for metrics that docs/src/metrics.md lists, and for data sources that are provisioned."""
 
 import json
 import re
@@ -23,7 +23,7 @@ for file in sorted((OBSERVABILITY / "grafana/dashboards").glob("*.json")):
         for target in panel["targets"]:
             asked |= set(re.findall(r"\bplat_\w+", target.get("expr", "")))
 asked |= set(re.findall(r"\bplat_tasks_(?:ready|leased)\b", Path("infra/kubernetes/base/worker.yaml").read_text()))
-listed = Path("docs/metrics.md")
+listed = Path("docs/src/metrics.md")
 if listed.is_file():
     known = set(re.findall(r"\bplat_\w+", listed.read_text()))
     # A histogram's parts, and counters with their suffix.

@@ -1,4 +1,4 @@
-//! What a coordinator tells Prometheus: `docs/metrics.md` lists it. The owner of the jobs writes, once a second; a scrape reads
+//! What a coordinator tells Prometheus: `docs/src/metrics.md` lists it. The owner of the jobs writes, once a second; a scrape reads
 //! atomics and never waits for the scheduler, nor the scheduler for it.
 
 use std::collections::{BTreeMap, BTreeSet};

@@ -1,4 +1,4 @@
-//! The list of metrics in docs/metrics.md against what coordinator and worker export.
+//! The list of metrics in docs/src/metrics.md against what coordinator and worker export.
 
 use std::collections::BTreeSet;
 
@@ -6,7 +6,7 @@ use prometheus_client::registry::Registry;
 
 /// Of each metric `name type labels`, as the document says it.
 fn documented(section: &str) -> BTreeSet<String> {
-    let text = include_str!("../../docs/metrics.md");
+    let text = include_str!("../../docs/src/metrics.md");
     let text = text.split("\n## ").find(|part| part.starts_with(section)).expect("the section is there");
     let rows = text.lines().filter(|line| line.starts_with("| `"));
     rows.map(|row| {

@@ -1,4 +1,4 @@
-//! What a worker tells Prometheus: `docs/metrics.md` lists it.
+//! What a worker tells Prometheus: `docs/src/metrics.md` lists it.
 
 use std::any::Any;
 use std::fmt;
@@ -219,7 +219,7 @@ mod tests {
         metrics.register(&mut registry);
         let store = Store::open("memory://").unwrap();
         metrics.moves_from_and_to(store.clone());
-        store.blocking().put_name("seven", "letters").unwrap();
+        store.blocking().put_record("seven", "letters").unwrap();
         let text = telemetry::metrics::text(&registry).unwrap();
         for line in [
             "plat_worker_tasks_done_total 1",
