@@ -1,6 +1,7 @@
-//! Cutting splats into blocks and sewing them back: `merge(cut(s)) == s`, up to the order of rows, for every set of
-//! splats with finite means. Both sides use [`Ground::block_at`], the one ownership rule, so no splat is lost or
-//! doubled, wherever it lies. Splats whose mean is not finite belong nowhere and are dropped.
+//! Cuts splats into blocks and merges blocks into one model.
+//!
+//! `merge(cut(s)) == s`, up to the order of rows, for all splats with finite means. Both directions use the same ownership rule,
+//! [`Ground::block_at`], so no splat is lost or duplicated. Splats whose mean is not finite have no owner and are dropped.
 
 use std::borrow::Borrow;
 use std::collections::BTreeMap;
@@ -10,7 +11,7 @@ use scene::{BlockId, Splats};
 use crate::ground::Ground;
 use crate::lod::Cut;
 
-/// The splats of each block of `level` that has any.
+/// The splats of each block of `level`, by owner. Blocks without splats are absent.
 pub fn cut(splats: &Splats, ground: &Ground, level: u8) -> BTreeMap<BlockId, Splats> {
     let mut rows: BTreeMap<BlockId, Vec<u32>> = BTreeMap::new();
     for i in 0..splats.len() {
@@ -22,29 +23,30 @@ pub fn cut(splats: &Splats, ground: &Ground, level: u8) -> BTreeMap<BlockId, Spl
     rows.into_iter().map(|(block, rows)| (block, splats.select(&rows))).collect()
 }
 
-/// The splats in the block's core, in order.
+/// The splats in the block's core, in their original order.
 pub fn keep_core(splats: &Splats, ground: &Ground, block: BlockId) -> Splats {
     splats.filter(|i| ground.owns(block, splats.mean(i).as_dvec3()))
 }
 
-/// All splats of all parts, by block whatever order they come in, of the highest SH degree among them.
+/// Concatenates all parts in the order of their blocks, independent of the order of arrival. The result has the highest SH degree of
+/// the parts.
 pub fn merge(parts: impl IntoIterator<Item = (BlockId, Splats)>) -> Splats {
     let mut parts: Vec<(BlockId, Splats)> = parts.into_iter().collect();
     parts.sort_by_key(|(block, _)| *block);
     let mut merged = Splats::new(parts.iter().map(|(_, splats)| splats.sh_degree()).max().unwrap_or(0));
     merged.reserve(parts.iter().map(|(_, splats)| splats.len()).sum());
-    // Each part is gone once it is sewn on.
+    // Each part is dropped after it is appended, to limit peak memory.
     for (_, splats) in parts {
         merged.append(&splats);
     }
     merged
 }
 
-/// What a cut of the tree shows: of every block's splats those that it owns there.
+/// The model of a cut of the tree: from each part the splats that its block owns in the cut.
 ///
 /// # Errors
-/// A part that is not to be had.
-pub fn sew<S: Borrow<Splats>, E>(
+/// The first error among `parts`.
+pub fn merge_cut<S: Borrow<Splats>, E>(
     cut: &Cut,
     ground: &Ground,
     parts: impl IntoIterator<Item = Result<(BlockId, S), E>>,
@@ -61,7 +63,7 @@ mod tests {
 
     use super::*;
 
-    /// Rows as bits, sorted: splats up to their order.
+    /// All rows as bits, sorted, to compare splats independent of their order.
     fn rows(splats: &Splats) -> Vec<Vec<u32>> {
         let row = |i: usize| splats.columns().iter().map(|c| c[i].to_bits()).collect();
         let mut rows: Vec<Vec<u32>> = (0..splats.len()).map(row).collect();
@@ -69,7 +71,7 @@ mod tests {
         rows
     }
 
-    /// Places on faces of the quadtree, at the rim, beyond it, tiny and huge.
+    /// Coordinates on faces of the quadtree, at the rim, beyond it, tiny and huge.
     fn coordinate() -> impl Strategy<Value = f32> {
         prop_oneof![
             -60.0f32..60.0,
@@ -107,7 +109,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn sewing_undoes_cutting(s in splats(), ground in ground(), level in 0u8..7) {
+        fn merge_inverts_cut(s in splats(), ground in ground(), level in 0u8..7) {
             let parts = cut(&s, &ground, level);
             for (block, part) in &parts {
                 prop_assert!(!part.is_empty());
@@ -118,14 +120,14 @@ mod tests {
         }
 
         #[test]
-        fn merging_does_not_depend_on_arrival(s in splats(), ground in ground()) {
+        fn merge_is_independent_of_the_order_of_parts(s in splats(), ground in ground()) {
             let parts = cut(&s, &ground, 3);
             prop_assert_eq!(merge(parts.clone()), merge(parts.into_iter().rev()));
         }
     }
 
     #[test]
-    fn what_is_nowhere_is_dropped() {
+    fn splats_with_non_finite_means_are_dropped() {
         let ground = Ground {
             ground_from_world: DQuat::IDENTITY,
             min: DVec2::ZERO,

@@ -1,4 +1,4 @@
-//! Draws a plan over its capture: an SVG to look at before spending a night on it.
+//! Draws a plan over its capture as an SVG, for review before training.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write;
@@ -8,25 +8,25 @@ use scene::{BlockId, Camera, Capture};
 
 use crate::ground::{Ground, Square, robust_box};
 use crate::plan::{Mode, Plan, Task};
-use crate::select::usable;
+use crate::visibility::is_usable;
 
-/// Side of the map and width of the panel beside it, in SVG units.
+/// Layout of the page, SVG units: side of the map, width of the panel beside it, margins and title height.
 const MAP: f64 = 1000.0;
 const PANEL: f64 = 380.0;
 const MARGIN: f64 = 40.0;
 const TITLE: f64 = 64.0;
-/// Points drawn at most.
+/// Maximum number of points drawn.
 const MAX_POINTS: usize = 20_000;
-/// Views drawn at most.
+/// Maximum number of cameras drawn.
 const MAX_VIEWS: usize = 3_000;
 const TRAIN: &str = "#1467a8";
 const TEST: &str = "#d9480f";
 const INK: &str = "#22262b";
 const SOFT: &str = "#6b737c";
-/// Outlines by height above the leaves.
-const LEVELS: [&str; 5] = ["#0b7a53", "#8a3ffc", "#b0206b", "#7a5b00", "#4a5568"];
+/// Colours of block outlines by height above the finest level.
+const LEVEL_COLOURS: [&str; 5] = ["#0b7a53", "#8a3ffc", "#b0206b", "#7a5b00", "#4a5568"];
 
-/// The plan as an SVG: points, cameras, blocks with views and splats, levels as a table, scale and legend.
+/// Draws a plan as an SVG: points, cameras, blocks with their views and splats, a table of levels, a scale bar and a legend.
 pub fn draw(plan: &Plan, capture: &Capture) -> String {
     let map = Map::of(plan, capture);
     let (width, height) = (MAP + PANEL + 3.0 * MARGIN, MAP + 2.0 * MARGIN + TITLE);
@@ -40,18 +40,18 @@ pub fn draw(plan: &Plan, capture: &Capture) -> String {
         "<defs><clipPath id=\"map\"><rect x=\"{MARGIN}\" y=\"{}\" width=\"{MAP}\" height=\"{MAP}\"/></clipPath></defs>",
         MARGIN + TITLE
     ));
-    title(&mut svg, plan, capture);
+    draw_title(&mut svg, plan, capture);
     svg.line(format_args!(
         "<rect x=\"{MARGIN}\" y=\"{}\" width=\"{MAP}\" height=\"{MAP}\" fill=\"#ffffff\" stroke=\"#d8d5cc\"/>",
         MARGIN + TITLE
     ));
     svg.line(format_args!("<g clip-path=\"url(#map)\">"));
-    points(&mut svg, &map, capture);
-    cameras(&mut svg, &map, plan, capture);
-    block_outlines(&mut svg, &map, plan);
+    draw_points(&mut svg, &map, capture);
+    draw_cameras(&mut svg, &map, plan, capture);
+    draw_blocks(&mut svg, &map, plan);
     svg.line(format_args!("</g>"));
-    scale_bar(&mut svg, &map);
-    panel(&mut svg, plan);
+    draw_scale_bar(&mut svg, &map);
+    draw_panel(&mut svg, plan);
     svg.line(format_args!("</svg>"));
     svg.0
 }
@@ -59,30 +59,30 @@ pub fn draw(plan: &Plan, capture: &Capture) -> String {
 struct Svg(String);
 
 impl Svg {
-    fn line(&mut self, what: std::fmt::Arguments<'_>) {
+    fn line(&mut self, text: std::fmt::Arguments<'_>) {
         // Writing to a String cannot fail.
-        let _ = writeln!(self.0, "{what}");
+        let _ = writeln!(self.0, "{text}");
     }
 
-    /// Text at a place; `style` holds further attributes.
-    fn text(&mut self, at: DVec2, size: f64, style: &str, what: &str) {
-        let what = what.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;");
+    /// Writes text; `style` holds further attributes.
+    fn text(&mut self, at: DVec2, size: f64, style: &str, text: &str) {
+        let text = text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;");
         self.line(format_args!(
-            "<text x=\"{:.1}\" y=\"{:.1}\" font-size=\"{size:.1}\" {style}>{what}</text>",
+            "<text x=\"{:.1}\" y=\"{:.1}\" font-size=\"{size:.1}\" {style}>{text}</text>",
             at.x, at.y
         ));
     }
 
-    /// Centred text with a white rim, so that it reads over anything. Written twice: not every viewer knows
+    /// Writes centred text with a white outline for legibility. The text is written twice because some viewers do not support
     /// `paint-order`.
-    fn haloed(&mut self, at: DVec2, size: f64, style: &str, what: &str) {
+    fn outlined_text(&mut self, at: DVec2, size: f64, style: &str, text: &str) {
         let rim = "stroke=\"#ffffff\" stroke-width=\"4\" stroke-linejoin=\"round\" stroke-opacity=\"0.9\"";
-        self.text(at, size, &format!("text-anchor=\"middle\" {rim} {style}"), what);
-        self.text(at, size, &format!("text-anchor=\"middle\" {style}"), what);
+        self.text(at, size, &format!("text-anchor=\"middle\" {rim} {style}"), text);
+        self.text(at, size, &format!("text-anchor=\"middle\" {style}"), text);
     }
 }
 
-/// Ground metres to SVG units.
+/// The mapping of ground metres to SVG units.
 struct Map {
     ground: Ground,
     centre: DVec2,
@@ -90,11 +90,11 @@ struct Map {
 }
 
 impl Map {
-    /// Shows the root square and (nearly) all cameras.
+    /// A map of the root square and the cameras; cameras far outside are cropped.
     fn of(plan: &Plan, capture: &Capture) -> Self {
         let ground = plan.ground;
         let Square { mut min, mut max } = ground.core(BlockId::ROOT);
-        let cameras = capture.views.iter().map(|v| &v.camera).filter(|c| usable(c));
+        let cameras = capture.views.iter().map(|v| &v.camera).filter(|c| is_usable(c));
         let centres: Vec<DVec3> = cameras.map(Camera::centre).filter(|c| c.is_finite()).collect();
         if let Some((low, high)) = robust_box(&centres, |c| ground.from_world(c)) {
             let reach = 0.5 * ground.edge_metres;
@@ -113,18 +113,18 @@ impl Map {
         self.at(self.ground.from_world(world).truncate())
     }
 
-    /// A square as x, y (of its upper left corner on the page) and side.
+    /// The upper left corner of a square on the page, and its side.
     fn square(&self, square: &Square) -> (DVec2, f64) {
         (self.at(DVec2::new(square.min.x, square.max.y)), (square.max.x - square.min.x) * self.units_per_metre)
     }
 
-    fn shows(&self, at: DVec2) -> bool {
+    fn contains(&self, at: DVec2) -> bool {
         let inside = DVec2::new(at.x - MARGIN, at.y - MARGIN - TITLE);
         inside.cmpge(DVec2::ZERO).all() && inside.cmple(DVec2::splat(MAP)).all()
     }
 }
 
-fn title(svg: &mut Svg, plan: &Plan, capture: &Capture) {
+fn draw_title(svg: &mut Svg, plan: &Plan, capture: &Capture) {
     let mode = match plan.settings.mode {
         Mode::Tree => "tree",
         Mode::Flat => "flat",
@@ -146,14 +146,14 @@ fn title(svg: &mut Svg, plan: &Plan, capture: &Capture) {
     svg.text(DVec2::new(MARGIN, MARGIN + 40.0), 14.0, &format!("fill=\"{SOFT}\""), &facts);
 }
 
-/// Sparse points in their colours (four bits a channel), as one path of dots per colour.
-fn points(svg: &mut Svg, map: &Map, capture: &Capture) {
+/// Draws sparse points with quantised colours (four bits per channel), as one path of dots per colour.
+fn draw_points(svg: &mut Svg, map: &Map, capture: &Capture) {
     let points = &capture.points;
     let mut by_colour: BTreeMap<[u8; 3], String> = BTreeMap::new();
     for i in (0..points.len()).step_by(points.len().div_ceil(MAX_POINTS).max(1)) {
         let at = map.world(points.positions[i]);
-        if map.shows(at) {
-            // White paint on white paper would not show.
+        if map.contains(at) {
+            // Brightness is limited so that white points are visible on the white map.
             let colour = points.colours.get(i).map_or([90; 3], |c| c.map(|v| (v.min(215) >> 4) * 17));
             let _ = write!(by_colour.entry(colour).or_default(), "M{:.1} {:.1}h0", at.x, at.y);
         }
@@ -168,23 +168,23 @@ fn points(svg: &mut Svg, map: &Map, capture: &Capture) {
     svg.line(format_args!("</g>"));
 }
 
-/// Cameras as small pyramids, seen from above.
-fn cameras(svg: &mut Svg, map: &Map, plan: &Plan, capture: &Capture) {
+/// Draws cameras as small pyramids, seen from above.
+fn draw_cameras(svg: &mut Svg, map: &Map, plan: &Plan, capture: &Capture) {
     let views = &capture.views;
     let size = (9.0 + 160.0 / (1.0 + views.len() as f64).sqrt()).min(34.0) / map.units_per_metre;
     for (i, view) in views.iter().enumerate().step_by(views.len().div_ceil(MAX_VIEWS).max(1)) {
-        if usable(&view.camera) {
+        if is_usable(&view.camera) {
             let test = Capture::is_test(i, plan.settings.test_every);
             let (colour, fill) = if test { (TEST, 0.30) } else { (TRAIN, 0.14) };
             let [apex, corners @ ..] = pyramid(&view.camera, size).map(|p| map.world(p));
-            if map.shows(apex) {
+            if map.contains(apex) {
                 wedge(svg, apex, corners, colour, fill);
             }
         }
     }
 }
 
-/// Apex and image corners, in order around the image, of a camera drawn this large (metres).
+/// The camera centre and the four image corners in cyclic order, at this distance from the centre.
 fn pyramid(camera: &Camera, size_metres: f64) -> [DVec3; 5] {
     let (k, back) = (&camera.pinhole, camera.camera_from_world.inverse());
     let corner = |u: f64, v: f64| {
@@ -210,11 +210,11 @@ fn wedge(svg: &mut Svg, apex: DVec2, corners: [DVec2; 4], colour: &str, fill: f6
 }
 
 fn colour_of(plan: &Plan, level: u8) -> &'static str {
-    LEVELS[usize::from(plan.levels - level.min(plan.levels)).min(LEVELS.len() - 1)]
+    LEVEL_COLOURS[usize::from(plan.levels - level.min(plan.levels)).min(LEVEL_COLOURS.len() - 1)]
 }
 
-/// Cores of all tasks, leaves first so that coarser outlines lie on top, and what the finest say of themselves.
-fn block_outlines(svg: &mut Svg, map: &Map, plan: &Plan) {
+/// Draws the cores of all tasks and the labels. Finer blocks come first, so that coarser outlines lie on top.
+fn draw_blocks(svg: &mut Svg, map: &Map, plan: &Plan) {
     for task in plan.tasks.iter().rev() {
         let above = plan.levels - task.block.level;
         let (at, side) = map.square(&map.ground.core(task.block));
@@ -226,7 +226,7 @@ fn block_outlines(svg: &mut Svg, map: &Map, plan: &Plan) {
             at.x - inset, at.y - inset, side + 2.0 * inset, side + 2.0 * inset
         ));
     }
-    if let Some(task) = example(plan) {
+    if let Some(task) = halo_example(plan) {
         let (at, side) = map.square(&map.ground.nominal_halo(task.block));
         let (x, y, colour) = (at.x, at.y, colour_of(plan, plan.levels));
         svg.line(format_args!(
@@ -240,24 +240,24 @@ fn block_outlines(svg: &mut Svg, map: &Map, plan: &Plan) {
     }
 }
 
-/// The finest block nearest to the middle: its halo is drawn.
-fn example(plan: &Plan) -> Option<&Task> {
+/// The finest block nearest to the centre. Only its halo is drawn.
+fn halo_example(plan: &Plan) -> Option<&Task> {
     let middle = plan.ground.core(BlockId::ROOT).centre();
     let distance = |t: &&Task| plan.ground.core(t.block).centre().distance_squared(middle);
     let leaves = plan.tasks.iter().filter(|t| t.block.level == plan.levels && plan.levels > 0);
     leaves.min_by(|a, b| distance(a).total_cmp(&distance(b)))
 }
 
-/// A block's id, and for blocks without finer ones its views, splats and steps.
+/// Labels a block with its id. A block without children also gets its views, splats and steps.
 fn label(svg: &mut Svg, map: &Map, plan: &Plan, task: &Task, has_children: bool) {
     let (corner, side) = map.square(&map.ground.core(task.block));
     let colour = colour_of(plan, task.block.level);
     if has_children {
-        // Coarser names would pile up in the corners: only the two levels above the leaves are named on the map.
+        // Only the two levels above the finest are labelled, because coarser labels would overlap.
         let above = f64::from(plan.levels - task.block.level);
         if above <= 2.0 {
             let at = DVec2::new(corner.x + 0.5 * side, corner.y + 14.0 * above + 4.0);
-            svg.haloed(at, 12.0, &format!("font-weight=\"bold\" fill=\"{colour}\""), &task.block.to_string());
+            svg.outlined_text(at, 12.0, &format!("font-weight=\"bold\" fill=\"{colour}\""), &task.block.to_string());
         }
         return;
     }
@@ -272,12 +272,12 @@ fn label(svg: &mut Svg, map: &Map, plan: &Plan, task: &Task, has_children: bool)
     for (i, line) in lines.iter().enumerate() {
         let weight = if i == 0 { "bold" } else { "normal" };
         let style = format!("font-weight=\"{weight}\" fill=\"{colour}\"");
-        svg.haloed(centre + DVec2::new(0.0, (i as f64 - 1.1) * 1.3 * size), size, &style, line);
+        svg.outlined_text(centre + DVec2::new(0.0, (i as f64 - 1.1) * 1.3 * size), size, &style, line);
     }
 }
 
-/// A bar of a round length, about a fifth of the map.
-fn scale_bar(svg: &mut Svg, map: &Map) {
+/// Draws a scale bar of a round length, about a fifth of the map.
+fn draw_scale_bar(svg: &mut Svg, map: &Map) {
     let rough = 0.2 * MAP / map.units_per_metre;
     let power = 10f64.powf(rough.log10().floor());
     let metres = [5.0, 2.0, 1.0].into_iter().map(|k| k * power).find(|&m| m <= rough).unwrap_or(power);
@@ -297,8 +297,8 @@ fn scale_bar(svg: &mut Svg, map: &Map) {
     svg.text(DVec2::new(x + 0.5 * length, y - 10.0), 14.0, "text-anchor=\"middle\"", &format!("{} m", short(metres)));
 }
 
-/// What each level does, and what the marks mean.
-fn panel(svg: &mut Svg, plan: &Plan) {
+/// Draws the table of levels and the legend.
+fn draw_panel(svg: &mut Svg, plan: &Plan) {
     let x = 2.0 * MARGIN + MAP;
     let mut y = MARGIN + TITLE + 16.0;
     svg.text(DVec2::new(x, y), 16.0, "font-weight=\"bold\"", "Levels");
@@ -340,14 +340,14 @@ fn panel(svg: &mut Svg, plan: &Plan) {
         let (apex, c) = (DVec2::new(x + 4.0, y - 4.0), |dx: f64, dy: f64| DVec2::new(x + 22.0 + dx, y - 4.0 + dy));
         wedge(svg, apex, [c(0.0, -9.0), c(3.0, -5.0), c(3.0, 5.0), c(0.0, 9.0)], colour, fill);
     };
-    let mut entry = |svg: &mut Svg, what: &str| {
+    let mut entry = |svg: &mut Svg, text: &str| {
         y += 26.0;
-        svg.text(DVec2::new(x + 38.0, y), 14.0, "", what);
+        svg.text(DVec2::new(x + 38.0, y), 14.0, "", text);
         y
     };
-    let at = entry(svg, "camera to train on");
+    let at = entry(svg, "training camera");
     glyph(svg, at, TRAIN, 0.14);
-    let at = entry(svg, "camera held out");
+    let at = entry(svg, "held-out camera");
     glyph(svg, at, TEST, 0.30);
     let boxed = |svg: &mut Svg, y: f64, level: u8, style: &str| {
         let colour = colour_of(plan, level);
@@ -357,18 +357,18 @@ fn panel(svg: &mut Svg, plan: &Plan) {
             y - 13.0
         ));
     };
-    let at = entry(svg, "block: its core, views to train + to test");
+    let at = entry(svg, "block core: training + held-out views");
     boxed(svg, at, plan.levels, "fill=\"none\" stroke-width=\"1.4\"");
     if let Some(coarsest) = plan.tasks.first().map(|t| t.block.level).filter(|&level| level < plan.levels) {
         let at = entry(svg, "block of a coarser level");
         boxed(svg, at, coarsest, "fill=\"none\" stroke-width=\"2.5\" stroke-dasharray=\"6 3\"");
     }
-    if example(plan).is_some() {
+    if halo_example(plan).is_some() {
         let at = entry(svg, "halo of one block");
         let style = format!("fill=\"{}\" fill-opacity=\"0.07\" stroke-dasharray=\"3 3\"", colour_of(plan, plan.levels));
         boxed(svg, at, plan.levels, &style);
     }
-    let at = entry(svg, "sparse points, in their colours");
+    let at = entry(svg, "sparse points");
     for (dx, dy, colour) in
         [(6.0, -6.0, "#887766"), (13.0, -2.0, "#446633"), (19.0, -8.0, "#994433"), (22.0, 0.0, "#555555")]
     {
@@ -376,7 +376,7 @@ fn panel(svg: &mut Svg, plan: &Plan) {
     }
 }
 
-/// A number with thin spaces between thousands.
+/// Formats a number with thin spaces between thousands.
 fn grouped(number: u64) -> String {
     let digits = number.to_string();
     let mut text = String::new();
@@ -389,7 +389,7 @@ fn grouped(number: u64) -> String {
     text
 }
 
-/// About three digits.
+/// Formats a number with about three significant digits.
 fn short(value: f64) -> String {
     let decimals = (2.0 - value.abs().max(1e-9).log10().floor()).clamp(0.0, 9.0) as usize;
     let text = format!("{value:.decimals$}");
@@ -405,7 +405,7 @@ mod tests {
     use crate::testing::aerial;
 
     #[test]
-    fn draws_every_block_and_camera() {
+    fn every_block_and_camera_is_drawn() {
         let capture = aerial(5, 200.0, 3000);
         let settings = PlanSettings { levels: Some(1), ..PlanSettings::default() };
         let plan = crate::plan(&capture, ArtefactId::of(b""), &settings, "a<b&c").unwrap();
@@ -413,7 +413,7 @@ mod tests {
         for task in &plan.tasks {
             assert!(svg.contains(&format!(">{}</text>", task.block)), "{}", task.block);
         }
-        // A dot and a wedge each, and one in the legend.
+        // One dot per camera and one in the legend.
         assert_eq!(svg.matches(&format!("r=\"1.8\" fill=\"{TRAIN}\"")).count(), 21 + 1);
         assert_eq!(svg.matches(&format!("r=\"1.8\" fill=\"{TEST}\"")).count(), 4 + 1);
         assert!(svg.contains("backend a&lt;b&amp;c") && svg.trim_end().ends_with("</svg>"));
@@ -422,7 +422,7 @@ mod tests {
     }
 
     #[test]
-    fn numbers_are_short() {
+    fn numbers_are_formatted() {
         assert_eq!([0.0, 0.012_345, 1.0, 153.296, 2e6].map(short), ["0", "0.0123", "1", "153", "2000000"]);
         assert_eq!([0, 999, 1000, 1_234_567].map(grouped), ["0", "999", "1\u{2009}000", "1\u{2009}234\u{2009}567"]);
     }

@@ -1,33 +1,32 @@
-//! The ground plane and its quadtree: which block owns a place.
+//! The ground plane and its quadtree of blocks, which define the owner of every place.
 //!
-//! The root is a square on the ground. Level `L` divides it into `2^L × 2^L` cores, half-open; those at the rim reach
-//! to infinity, so every place on Earth has exactly one owner at every level, and a block owns exactly what its four
-//! children own.
+//! The root is a square on the ground. Level `L` divides it into `2^L × 2^L` half-open cores. Cores at the rim extend to infinity, so
+//! every finite place has exactly one owner per level, and a block owns exactly what its four children own.
 
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use scene::{BlockId, Camera, Capture};
 use serde::{Deserialize, Serialize};
 
-/// A halo is the core scaled by this about its centre (DOGS, Rubble: 1.2 gives 24.25 dB, 1.4 gives 25.78, 1.5 25.97).
+/// Halo size relative to the core, scaled about its centre. (DOGS on Rubble: 24.25 dB at 1.2, 25.78 at 1.4, 25.97 at 1.5.)
 pub const HALO_SCALE: f64 = 1.4;
-/// A direction nearer to world z than this is taken to be world z: cos 20°.
+/// An up direction within 20° of world z snaps to world z (cosine of 20°).
 const SNAP_COSINE: f64 = 0.939_692_6;
-/// Cameras whose mean up vector is shorter than this do not agree on what is up.
+/// Cameras agree on an up direction if the length of their mean up vector exceeds this.
 const MIN_UP_AGREEMENT: f64 = 0.5;
-/// Places farther out than this (metres) are mistakes: they are owned, but do not stretch the root.
+/// Places farther from the origin than this are outliers. They have an owner but do not enlarge the root. Metres.
 const FAR_METRES: f64 = 1e8;
-/// The root is larger than the robust extent by this share of it, on each side.
+/// Padding of the root on each side, relative to the robust extent.
 const ROOT_PAD: f64 = 0.02;
-/// What is farther from the middle of the scene than this many of its extents is far (see [`Ground::is_far`]): places in the
-/// root square are within 0.71, the backdrop stands beyond 1.7.
+/// Radius of the foreground in scene extents (see [`Ground::is_background`]). The corners of the root square are at 0.71; background
+/// geometry starts at 1.7.
 const NEAR_EXTENTS: f64 = 1.5;
 
-/// A square of the ground plane, half-open, metres. Sides may be infinite.
+/// A half-open square of the ground plane, metres. Sides may be infinite.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Square {
-    /// Lower corner, in.
+    /// Lower corner, inclusive.
     pub min: DVec2,
-    /// Upper corner, out.
+    /// Upper corner, exclusive.
     pub max: DVec2,
 }
 
@@ -37,18 +36,18 @@ impl Square {
         at.cmpge(self.min).all() && at.cmplt(self.max).all()
     }
 
-    /// The middle; meaningless with infinite sides.
+    /// The centre. Not finite for infinite sides.
     pub fn centre(&self) -> DVec2 {
         (self.min + self.max) * 0.5
     }
 
-    /// The shortest distance to another square, metres; 0 where they touch.
+    /// The shortest distance to another square, metres; 0 if they touch.
     pub fn distance(&self, other: &Self) -> f64 {
         (other.min - self.max).max(self.min - other.max).max(DVec2::ZERO).length()
     }
 }
 
-/// Where the ground is: a rotation that turns z up, and the root square.
+/// The ground plane: a rotation that turns z up, and the root square.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Ground {
     /// Rotates world axes to ground axes (x and y along the ground, z up); unit quaternion.
@@ -57,22 +56,23 @@ pub struct Ground {
     pub min: DVec2,
     /// Side of the root square, metres; positive.
     pub edge_metres: f64,
-    /// Middle of the scene's heights, ground metres.
+    /// Mean of the lowest and highest scene height, ground metres.
     pub height_metres: f64,
-    /// Places farther than this from the middle of the root square at that height are far; positive.
+    /// Radius of the foreground around the centre of the root square at `height_metres`, metres; positive.
     pub near_metres: f64,
 }
 
 impl Ground {
-    /// The ground of a capture: up from its cameras (see `up_of`), and the square around the 1..99 percentiles of
-    /// sparse points and of camera centres. Finite for every input; without points and cameras a unit square.
+    /// Estimates the ground of a capture. The up direction comes from its cameras (see `estimate_up`). The root is the square around the
+    /// 1st to 99th percentiles of sparse points and of camera centres. All values are finite for every input; without points and
+    /// cameras the root is a unit square.
     pub fn of(capture: &Capture) -> Self {
         let near = |p: &DVec3| p.abs().max_element() < FAR_METRES;
         let points: Vec<DVec3> = capture.points.positions.iter().copied().filter(near).collect();
         let cameras: Vec<&Camera> = (capture.views.iter().map(|v| &v.camera))
             .filter(|c| c.camera_from_world.is_sane() && near(&c.centre()))
             .collect();
-        let up = if capture.geo_origin.is_some() { DVec3::Z } else { up_of(&cameras, &points) };
+        let up = if capture.geo_origin.is_some() { DVec3::Z } else { estimate_up(&cameras, &points) };
         let ground_from_world = DQuat::from_rotation_arc(up, DVec3::Z);
 
         let centres: Vec<DVec3> = cameras.iter().map(|c| c.centre()).collect();
@@ -86,33 +86,33 @@ impl Ground {
             let (min, near_metres) = (DVec2::ZERO, NEAR_EXTENTS);
             return Self { ground_from_world, min, edge_metres: 1.0, height_metres: 0.0, near_metres };
         }
-        let (heights, tall) = (0.5 * (min.z + max.z), max.z - min.z);
+        let (mid_height, height_range) = (0.5 * (min.z + max.z), max.z - min.z);
         let (min, max) = (min.truncate(), max.truncate());
         let (centre, extent) = ((min + max) * 0.5, (max - min).max_element() * (1.0 + 2.0 * ROOT_PAD));
-        // All in one spot: any size will do, as long as halving it twenty times still moves a coordinate.
+        // All points coincide. Any size works for which twenty halvings still change a coordinate.
         let edge_metres = if extent > 1e-6 * (1.0 + centre.abs().max_element()) { extent } else { 1.0 };
-        let near_metres = NEAR_EXTENTS * edge_metres.max(tall);
-        Self { ground_from_world, min: centre - 0.5 * edge_metres, edge_metres, height_metres: heights, near_metres }
+        let near_metres = NEAR_EXTENTS * edge_metres.max(height_range);
+        Self { ground_from_world, min: centre - 0.5 * edge_metres, edge_metres, height_metres: mid_height, near_metres }
     }
 
-    /// World metres to ground metres.
+    /// Transforms world coordinates to ground coordinates, metres.
     pub fn from_world(&self, world: DVec3) -> DVec3 {
         self.ground_from_world * world
     }
 
-    /// Ground metres to world metres.
+    /// Transforms ground coordinates to world coordinates, metres.
     pub fn to_world(&self, ground: DVec3) -> DVec3 {
         self.ground_from_world.inverse() * ground
     }
 
-    /// The side of a core of this level, metres.
+    /// The side length of a core of this level, metres.
     pub fn core_edge_metres(&self, level: u8) -> f64 {
         self.edge_metres / f64::from(1u32 << level.min(BlockId::MAX_LEVEL))
     }
 
-    /// The one block of `level` that owns this place. The answer for a NaN means nothing: see [`Ground::owns`].
+    /// The block of `level` that owns this place. Arbitrary for NaN; see [`Ground::owns`].
     ///
-    /// Cells are found at the finest level and shifted up, so a block owns exactly what its children own, to the bit.
+    /// The cell is computed at the finest level and shifted up, so a block owns exactly what its children own, without rounding errors.
     pub fn block_at(&self, level: u8, world: DVec3) -> BlockId {
         let level = level.min(BlockId::MAX_LEVEL);
         let cells = f64::from(1u32 << BlockId::MAX_LEVEL);
@@ -121,45 +121,46 @@ impl Ground {
         BlockId { level, x: cell(at.x), y: cell(at.y) }
     }
 
-    /// True when the place is in the block's core. A place that is not finite belongs to no block.
+    /// True when the block's core contains the place. A place that is not finite has no owner.
     pub fn owns(&self, block: BlockId, world: DVec3) -> bool {
         world.is_finite() && self.block_at(block.level, world) == block
     }
 
-    /// True for what is not of the ground but above and around all of it: the sky, and what stands high at a distance. Columns above the
-    /// ground say nothing of whose that is, so the root alone owns and trains it ([`crate::Cut::owner_of`]). What shows through
-    /// the ground from below is the blocks': on an aerial capture, whose views see nothing else, it costs 0.2 dB to take it from
-    /// them.
-    pub fn is_far(&self, world: DVec3) -> bool {
+    /// True for background: places above the ground that are outside the foreground radius, such as the sky and distant tall objects.
+    ///
+    /// Ground columns do not partition the background in a useful way, so only the root owns and trains it
+    /// ([`crate::Cut::owner_of`]). Places below the ground are never background: excluding them from the blocks of an aerial capture
+    /// costs 0.2 dB.
+    pub fn is_background(&self, world: DVec3) -> bool {
         let middle = (self.min + 0.5 * self.edge_metres).extend(self.height_metres);
         let from_middle = self.from_world(world) - middle;
         from_middle.z > 0.0 && from_middle.length() > self.near_metres
     }
 
-    /// The nominal core: finite, also at the rim (where ownership reaches on to infinity).
+    /// The nominal core. Finite, also at the rim, where ownership extends to infinity.
     pub fn core(&self, block: BlockId) -> Square {
         let edge = self.core_edge_metres(block.level);
         let min = self.min + DVec2::new(f64::from(block.x), f64::from(block.y)) * edge;
         Square { min, max: min + edge }
     }
 
-    /// The core scaled by [`HALO_SCALE`] about its centre, finite.
+    /// The nominal halo: the core scaled by [`HALO_SCALE`] about its centre. Finite.
     pub fn nominal_halo(&self, block: BlockId) -> Square {
-        self.grown(block, HALO_SCALE)
+        self.scaled_core(block, HALO_SCALE)
     }
 
-    fn grown(&self, block: BlockId, scale: f64) -> Square {
+    fn scaled_core(&self, block: BlockId, scale: f64) -> Square {
         let core = self.core(block);
         let pad = 0.5 * (scale - 1.0) * self.core_edge_metres(block.level);
         Square { min: core.min - pad, max: core.max + pad }
     }
 
-    /// The halo: as [`Ground::nominal_halo`], with sides at the scene's rim moved to infinity.
+    /// The halo: [`Ground::nominal_halo`] with its sides at the scene's rim moved to infinity.
     pub fn halo(&self, block: BlockId) -> Square {
-        self.open_at_rim(block, self.nominal_halo(block))
+        self.unbounded_at_rim(block, self.nominal_halo(block))
     }
 
-    fn open_at_rim(&self, block: BlockId, mut halo: Square) -> Square {
+    fn unbounded_at_rim(&self, block: BlockId, mut halo: Square) -> Square {
         let last = (1u32 << block.level.min(BlockId::MAX_LEVEL)) - 1;
         for (axis, cell) in [block.x, block.y].into_iter().enumerate() {
             if cell == 0 {
@@ -172,30 +173,30 @@ impl Ground {
         halo
     }
 
-    /// True when the place is in the block's halo. A place that is not finite is in none.
+    /// True when the block's halo contains the place. A place that is not finite is in no halo.
     pub fn in_halo(&self, block: BlockId, world: DVec3) -> bool {
         world.is_finite() && self.halo(block).contains(self.from_world(world).truncate())
     }
 
-    /// How far a place is from the block's nominal core, metres along the ground; 0 inside.
+    /// The distance of a place to the block's nominal core along the ground, metres; 0 inside.
     pub fn metres_from_core(&self, block: BlockId, world: DVec3) -> f64 {
         let (core, at) = (self.core(block), self.from_world(world).truncate());
         (core.min - at).max(at - core.max).max(DVec2::ZERO).length()
     }
 
-    /// The blocks of `level` in whose halo this place lies: one to four.
+    /// The one to four blocks of `level` whose halo contains the place.
     pub fn halos_at(&self, level: u8, world: DVec3) -> impl Iterator<Item = BlockId> {
         let edge = self.core_edge_metres(level);
         let last = (1u32 << level.min(BlockId::MAX_LEVEL)) - 1;
         let at = (self.from_world(world).truncate() - self.min) / edge;
-        // A hair more than the halo, then the exact test: in_halo stays the one definition.
+        // Candidates come from a slightly larger halo; in_halo makes the exact test.
         let reach = 0.5 * (HALO_SCALE - 1.0) + 1e-9;
         let cell = |v: f64| v.floor().clamp(0.0, f64::from(last)) as u32;
         let (x, y) = (cell(at.x - reach)..=cell(at.x + reach), cell(at.y - reach)..=cell(at.y + reach));
         y.flat_map(move |y| x.clone().map(move |x| BlockId { level, x, y })).filter(move |&b| self.in_halo(b, world))
     }
 
-    /// Every number finite, the rotation of unit length, the edge positive.
+    /// True when all values are finite, the rotation has unit length and the lengths are positive.
     pub fn is_sane(&self) -> bool {
         let unit = (self.ground_from_world.length() - 1.0).abs() < 1e-6;
         let positive = |metres: f64| metres.is_finite() && metres > 0.0;
@@ -205,29 +206,29 @@ impl Ground {
     }
 }
 
-/// Which way is up, as a unit vector, in order of trust:
-/// 1. cameras that agree on an up within 20° of world z, or that look down along it (nadir surveys): world z;
-/// 2. cameras that face one way and are spread over an area across it, as in a nadir survey in an arbitrary frame
-///    (its "up" vectors are horizontal): against the viewing direction;
-/// 3. the mean up vector, if the cameras agree on one;
-/// 4. the axis along which the sparse points vary least, signed so that cameras lie above; snapped to z within 20°.
-fn up_of(cameras: &[&Camera], points: &[DVec3]) -> DVec3 {
+/// Estimates the up direction, a unit vector, from the first rule that applies:
+/// 1. Cameras that agree on an up within 20° of world z, or that look down along it (nadir surveys): world z.
+/// 2. Cameras that face one way and are spread over an area across it (a nadir survey in an arbitrary frame, whose image-up vectors
+///    are horizontal): the direction opposite to the viewing direction.
+/// 3. Cameras that agree on an up: their mean up vector.
+/// 4. Otherwise the axis of least variance of the sparse points, signed so that cameras lie above, snapped to z within 20°.
+fn estimate_up(cameras: &[&Camera], points: &[DVec3]) -> DVec3 {
     let mean =
         |of: &dyn Fn(&Camera) -> DVec3| cameras.iter().map(|c| of(c)).sum::<DVec3>() / cameras.len().max(1) as f64;
     let camera_up = mean(&|c| c.camera_from_world.rotation.inverse() * DVec3::NEG_Y);
     let forward = mean(&|c| c.forward());
-    let (up, agree) = (camera_up.normalize_or_zero(), camera_up.length() > MIN_UP_AGREEMENT);
-    let (ahead, one_way) = (forward.normalize_or_zero(), forward.length() > 0.9);
-    if agree && up.z > SNAP_COSINE || one_way && ahead.z < -SNAP_COSINE {
+    let (up, is_agreed) = (camera_up.normalize_or_zero(), camera_up.length() > MIN_UP_AGREEMENT);
+    let (ahead, is_one_way) = (forward.normalize_or_zero(), forward.length() > 0.9);
+    if is_agreed && up.z > SNAP_COSINE || is_one_way && ahead.z < -SNAP_COSINE {
         return DVec3::Z;
     }
     let centres: Vec<DVec3> = cameras.iter().map(|c| c.centre()).collect();
     let (deviation, axes) = principal_axes(&centres);
-    let over_an_area = deviation[1] > 0.2 * deviation[2] && deviation[0] < 0.5 * deviation[1];
-    if one_way && over_an_area && axes[0].dot(ahead).abs() > SNAP_COSINE {
+    let is_spread = deviation[1] > 0.2 * deviation[2] && deviation[0] < 0.5 * deviation[1];
+    if is_one_way && is_spread && axes[0].dot(ahead).abs() > SNAP_COSINE {
         return -ahead;
     }
-    if agree {
+    if is_agreed {
         return up;
     }
     let (deviation, axes) = principal_axes(points);
@@ -241,7 +242,7 @@ fn up_of(cameras: &[&Camera], points: &[DVec3]) -> DVec3 {
     if axis.z > SNAP_COSINE { DVec3::Z } else { axis }
 }
 
-/// The box around the 1..99 percentiles (each axis for itself) of the places after `map`; `None` without places.
+/// The box between the 1st and 99th percentiles of the mapped places, per axis. `None` without places.
 pub(crate) fn robust_box(places: &[DVec3], map: impl Fn(DVec3) -> DVec3) -> Option<(DVec3, DVec3)> {
     let mut axis_values = [0, 1, 2].map(|axis| places.iter().map(|&p| map(p)[axis]).collect::<Vec<f64>>());
     if places.is_empty() {
@@ -251,7 +252,7 @@ pub(crate) fn robust_box(places: &[DVec3], map: impl Fn(DVec3) -> DVec3) -> Opti
     Some((bounds(0.01), bounds(0.99)))
 }
 
-/// The value below which a share `q` of the values lies (nearest rank); 0 without values. Reorders them.
+/// The `q` quantile of the values (nearest rank); 0 without values. Reorders the values.
 pub(crate) fn quantile(values: &mut [f64], q: f64) -> f64 {
     if values.is_empty() {
         return 0.0;
@@ -260,7 +261,7 @@ pub(crate) fn quantile(values: &mut [f64], q: f64) -> f64 {
     *values.select_nth_unstable_by(rank, f64::total_cmp).1
 }
 
-/// Standard deviations (ascending) and unit axes of the places inside their robust box.
+/// Principal axes of the places inside their robust box: standard deviations (ascending) and unit axes.
 fn principal_axes(places: &[DVec3]) -> ([f64; 3], [DVec3; 3]) {
     let Some((low, high)) = robust_box(places, |p| p) else {
         return ([0.0; 3], DMat3::IDENTITY.to_cols_array_2d().map(DVec3::from_array));
@@ -277,7 +278,7 @@ fn principal_axes(places: &[DVec3]) -> ([f64; 3], [DVec3; 3]) {
     (variances.map(|v| v.max(0.0).sqrt()), axes)
 }
 
-/// Eigenvalues (ascending) and eigenvectors of a symmetric matrix, by cyclic Jacobi rotations (Golub & Van Loan 8.5).
+/// Eigenvalues (ascending) and eigenvectors of a symmetric matrix by cyclic Jacobi rotations (Golub & Van Loan, section 8.5).
 fn eigen(mut a: DMat3) -> ([f64; 3], [DVec3; 3]) {
     let mut axes = DMat3::IDENTITY;
     for (p, q) in [(0, 1), (0, 2), (1, 2)].into_iter().cycle().take(60) {
@@ -307,7 +308,7 @@ mod tests {
     use proptest::prelude::*;
 
     use super::*;
-    use crate::testing::{aerial, capture, look, street, turned};
+    use crate::testing::{aerial, capture, look_at, rotated, street};
 
     fn up(capture: &Capture) -> DVec3 {
         Ground::of(capture).to_world(DVec3::Z)
@@ -325,7 +326,7 @@ mod tests {
                 let blocks: Vec<BlockId> = (0..side * side).map(|i| BlockId { level, x: i % side, y: i / side }).collect();
                 let owners: Vec<BlockId> = blocks.iter().copied().filter(|&b| ground.owns(b, at)).collect();
                 prop_assert_eq!(owners, vec![owner]);
-                // Inside the root, the core says the same as the ownership rule.
+                // Inside the root, the nominal core agrees with the ownership rule.
                 if ground.core(BlockId::ROOT).contains(at.truncate()) {
                     prop_assert!(ground.core(owner).contains(at.truncate()));
                 }
@@ -339,7 +340,7 @@ mod tests {
     }
 
     #[test]
-    fn half_open_faces() {
+    fn cores_are_half_open() {
         let ground = Ground {
             ground_from_world: DQuat::IDENTITY,
             min: DVec2::ZERO,
@@ -354,20 +355,20 @@ mod tests {
     }
 
     #[test]
-    fn up_is_found() {
-        // Nadir cameras whose image-up is north must not make north the up direction.
+    fn the_up_direction_is_estimated() {
+        // Nadir cameras have a horizontal image-up vector, which must not become the up direction.
         assert_eq!(up(&aerial(4, 100.0, 500)), DVec3::Z);
         assert_eq!(up(&street(20, 500)), DVec3::Z);
-        // The same two in an arbitrary frame, as structure from motion gives them.
+        // The same captures in an arbitrary frame, as structure from motion produces.
         for turn in [DQuat::from_rotation_x(-1.5), DQuat::from_axis_angle(DVec3::new(0.6, -0.8, 0.0), 2.0)] {
             for given in [aerial(4, 100.0, 500), street(20, 500)] {
-                let found = up(&turned(given, turn));
+                let found = up(&rotated(given, turn));
                 assert!(found.dot(turn * DVec3::Z) > 0.999, "{found}");
             }
         }
-        // Cameras that agree on nothing, above a plane across world x.
+        // Cameras without a common up direction, above a plane perpendicular to world x.
         let cameras = [0.0f64, 2.0, 4.0]
-            .map(|a| look(DVec3::new(9.0, a.cos(), a.sin()), DVec3::ZERO, DVec3::new(0.0, a.sin(), a.cos())));
+            .map(|a| look_at(DVec3::new(9.0, a.cos(), a.sin()), DVec3::ZERO, DVec3::new(0.0, a.sin(), a.cos())));
         let plane =
             (0..200).map(|i| DVec3::new(0.01 * f64::from(i % 3), f64::from(i % 14), f64::from(i / 14))).collect();
         let found = up(&capture(&cameras, plane, true));

@@ -1,36 +1,40 @@
-//! Cuts the city and sews it back.
+//! Divides a city into a quadtree of blocks, plans their training and merges the results.
 //!
-//! The ground plane is a quadtree of blocks ([`Ground`]). One ownership rule, half-open, says which block a place
-//! belongs to; [`cut()`] and [`merge()`] share it, so `merge(cut(s)) == s`. [`plan()`] turns a capture into an
-//! immutable, hashed list of tasks: which block trains on which windows of which views, against which frozen
-//! context, within which budget. [`lint()`] checks a plan, [`draw()`] shows it.
+//! The ground plane is a quadtree of blocks ([`Ground`]). One half-open ownership rule assigns every place to a block. [`cut()`] and
+//! [`merge()`] share it, so `merge(cut(s)) == s`. [`plan()`] turns a capture into an immutable, hashed list of tasks. A task states
+//! which block trains on which windows of which views, against which frozen context and within which budgets. [`lint()`] checks a
+//! plan, [`draw()`] draws it as an SVG.
 //!
-//! Architecture invariant: nothing here does I/O, reads a clock, starts a thread or knows a GPU. Everything is a
-//! function over plain data, and equal inputs give equal bytes.
+//! Architecture invariant: this crate does no I/O, reads no clock, starts no thread and uses no GPU. All functions are pure, and equal
+//! inputs give equal bytes.
 
-mod allot;
+mod block_box;
+mod budgets;
+mod cost;
+mod coverage;
 pub mod cut;
 pub mod draw;
 pub mod ground;
+mod layout;
 pub mod lint;
 pub mod lod;
 pub mod plan;
 pub mod planner;
-mod price;
 pub mod seams;
-pub mod select;
-mod shown;
 #[cfg(test)]
 mod testing;
 pub mod view_cut;
+mod view_selection;
+mod visibility;
 
-pub use cut::{cut, keep_core, merge, sew};
+pub use budgets::initial_splats;
+pub use cost::StepCost;
+pub use cut::{cut, keep_core, merge, merge_cut};
 pub use draw::draw;
 pub use ground::{Ground, Square};
 pub use lint::{Finding, Severity, lint};
 pub use lod::{Cut, context_of, sweep_of};
-pub use plan::{MOST_VIEWS_PER_STEP, Mode, Plan, PlanError, PlanSettings, Task, ViewUse};
+pub use plan::{MAX_VIEWS_PER_STEP, Mode, Plan, PlanError, PlanSettings, Task, ViewUse};
 pub use planner::plan;
-pub use price::Price;
 pub use seams::{Face, Seams};
 pub use view_cut::ViewTree;

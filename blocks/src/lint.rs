@@ -1,46 +1,46 @@
-//! Checks a plan against its capture before anything is spent on it.
+//! The linter: checks a plan against its capture before training starts.
 
 use std::collections::BTreeSet;
 use std::fmt;
 
 use scene::{BlockId, Capture};
 
+use crate::layout::MIN_VIEWS;
 use crate::lod::training_order;
 use crate::plan::{Mode, Plan, Task, ViewUse};
-use crate::planner::MIN_VIEWS;
-use crate::select::max_mip;
+use crate::visibility::max_mip;
 
 /// How bad a finding is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Severity {
-    /// The plan works, but somebody should look.
+    /// The plan can run, but may not be what the user wants.
     Warning,
     /// The plan must not run.
     Error,
 }
 
-/// Something found in a plan.
+/// A finding of the linter.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Finding {
     /// How bad it is.
     pub severity: Severity,
-    /// Where, unless it is the plan as a whole.
+    /// The block; `None` for the plan as a whole.
     pub block: Option<BlockId>,
-    /// What is wrong.
-    pub what: String,
+    /// The problem.
+    pub message: String,
 }
 
 impl fmt::Display for Finding {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let word = if self.severity == Severity::Error { "error" } else { "warning" };
         match self.block {
-            Some(block) => write!(f, "{word}: block {block}: {}", self.what),
-            None => write!(f, "{word}: {}", self.what),
+            Some(block) => write!(f, "{word}: block {block}: {}", self.message),
+            None => write!(f, "{word}: {}", self.message),
         }
     }
 }
 
-/// Everything wrong with a plan for this capture, errors first; empty for a good plan.
+/// All findings about a plan for this capture, errors first. Empty for a good plan.
 pub fn lint(plan: &Plan, capture: &Capture) -> Vec<Finding> {
     let mut findings = Findings(Vec::new());
     if let Err(error) = plan.check() {
@@ -49,23 +49,25 @@ pub fn lint(plan: &Plan, capture: &Capture) -> Vec<Finding> {
     }
     if let Some(asked) = plan.settings.levels.filter(|&asked| asked != plan.levels && plan.settings.mode == Mode::Tree)
     {
-        let what = format!("{} of {asked} levels: views and points do not fill more", plan.levels);
-        findings.warning(None, what);
+        let message = format!("{} of {asked} levels: views and points do not support more", plan.levels);
+        findings.warning(None, message);
     }
-    ownership(plan, capture, &mut findings);
+    check_ownership(plan, capture, &mut findings);
     let mut earlier: BTreeSet<BlockId> = BTreeSet::new();
     for task in &plan.tasks {
-        order(plan, task, &earlier, &mut findings);
-        views(plan, task, capture, &mut findings);
-        means(plan, task, &mut findings);
+        check_order(plan, task, &earlier, &mut findings);
+        check_views(plan, task, capture, &mut findings);
+        check_budgets(plan, task, &mut findings);
         earlier.insert(task.block);
     }
     let finest: u64 = plan.leaves().blocks().iter().filter_map(|&b| plan.task(b)).map(|t| u64::from(t.budget)).sum();
     let deepest: u64 = plan.tasks.iter().filter(|t| t.block.level == plan.levels).map(|t| u64::from(t.budget)).sum();
     let (budget, parts) = (u64::from(plan.settings.budget), plan.tasks.len() as u64);
     if deepest > budget + parts || finest < budget.saturating_sub(parts) {
-        let what = format!("the leaves' {deepest} splats (with all that fills in: {finest}) do not add up to {budget}");
-        findings.error(None, what);
+        let message = format!(
+            "the finest level's {deepest} splats (merged model: {finest}) do not add up to the budget of {budget}"
+        );
+        findings.error(None, message);
     }
     findings.0.sort_by_key(|f| std::cmp::Reverse(f.severity));
     findings.0
@@ -74,17 +76,17 @@ pub fn lint(plan: &Plan, capture: &Capture) -> Vec<Finding> {
 struct Findings(Vec<Finding>);
 
 impl Findings {
-    fn error(&mut self, block: impl Into<Option<BlockId>>, what: String) {
-        self.0.push(Finding { severity: Severity::Error, block: block.into(), what });
+    fn error(&mut self, block: impl Into<Option<BlockId>>, message: String) {
+        self.0.push(Finding { severity: Severity::Error, block: block.into(), message });
     }
 
-    fn warning(&mut self, block: impl Into<Option<BlockId>>, what: String) {
-        self.0.push(Finding { severity: Severity::Warning, block: block.into(), what });
+    fn warning(&mut self, block: impl Into<Option<BlockId>>, message: String) {
+        self.0.push(Finding { severity: Severity::Warning, block: block.into(), message });
     }
 }
 
-/// Every sparse point has one owner; most are in the halo of theirs.
-fn ownership(plan: &Plan, capture: &Capture, findings: &mut Findings) {
+/// Checks that every sparse point has an owner, and that most lie in their owner's halo and at the finest resolution.
+fn check_ownership(plan: &Plan, capture: &Capture, findings: &mut Findings) {
     let (leaves, tasks) = (plan.leaves(), plan.tasks.iter().map(|t| t.block).collect::<BTreeSet<_>>());
     let (mut finite, mut coarse, mut outside) = (0usize, 0usize, 0usize);
     let finest_metres = plan.rho_metres.iter().copied().fold(f64::INFINITY, f64::min);
@@ -96,7 +98,7 @@ fn ownership(plan: &Plan, capture: &Capture, findings: &mut Findings) {
                 outside += usize::from(!plan.ground.in_halo(owner, point));
             }
             _ => {
-                findings.error(None, format!("the sparse point at {point} has no owner"));
+                findings.error(None, format!("sparse point {point} has no owner"));
                 return;
             }
         }
@@ -106,23 +108,23 @@ fn ownership(plan: &Plan, capture: &Capture, findings: &mut Findings) {
         findings.warning(None, format!("{} sparse points are not finite", capture.points.len() - finite));
     }
     if percent(coarse) >= 5 {
-        let what =
+        let message =
             format!("{} % of the sparse points stay at a coarser level: too few views or points", percent(coarse));
-        findings.warning(None, what);
+        findings.warning(None, message);
     }
     if percent(outside) >= 1 {
         findings.warning(None, format!("{} % of the sparse points lie outside their owner's halo", percent(outside)));
     }
 }
 
-/// Parent and context exist and come earlier; a tree's child has its parent.
-fn order(plan: &Plan, task: &Task, earlier: &BTreeSet<BlockId>, findings: &mut Findings) {
-    for needed in task.context.iter().chain(&task.parent) {
-        if !earlier.contains(needed) {
-            findings.error(task.block, format!("needs block {needed}, which does not come before it"));
+/// Checks that parent and context exist and precede the task, and that a tree's block has its parent.
+fn check_order(plan: &Plan, task: &Task, earlier: &BTreeSet<BlockId>, findings: &mut Findings) {
+    for dependency in task.context.iter().chain(&task.parent) {
+        if !earlier.contains(dependency) {
+            findings.error(task.block, format!("depends on block {dependency}, which does not precede it"));
         }
-        if training_order(*needed) >= training_order(task.block) {
-            findings.error(task.block, format!("needs block {needed}, which is trained later"));
+        if training_order(*dependency) >= training_order(task.block) {
+            findings.error(task.block, format!("depends on block {dependency}, which is trained later"));
         }
     }
     if plan.settings.mode == Mode::Tree && task.parent != task.block.parent() {
@@ -130,14 +132,14 @@ fn order(plan: &Plan, task: &Task, earlier: &BTreeSet<BlockId>, findings: &mut F
     }
 }
 
-/// Train and test views are kept apart, exist, and windows and mips are inside them.
-fn views(plan: &Plan, task: &Task, capture: &Capture, findings: &mut Findings) {
+/// Checks that training and held-out views are disjoint and exist, and that mips and windows are inside them.
+fn check_views(plan: &Plan, task: &Task, capture: &Capture, findings: &mut Findings) {
     let is_test = |v: &ViewUse| Capture::is_test(v.view as usize, plan.settings.test_every);
     if let Some(v) = task.views.iter().find(|v| is_test(v)) {
         findings.error(task.block, format!("trains on held-out view {}", v.view));
     }
     if let Some(v) = task.test_views.iter().find(|v| !is_test(v)) {
-        findings.error(task.block, format!("is tested on view {}, which others train on", v.view));
+        findings.error(task.block, format!("is tested on training view {}", v.view));
     }
     for used in [&task.views, &task.test_views] {
         if !used.is_sorted_by(|a, b| a.view < b.view) {
@@ -151,7 +153,7 @@ fn views(plan: &Plan, task: &Task, capture: &Capture, findings: &mut Findings) {
         };
         let (full, window) = (view.camera.full(), v.window);
         if v.mip > max_mip(full.width, full.height) {
-            findings.error(task.block, format!("uses mip {} of '{}', which has none", v.mip, view.name));
+            findings.error(task.block, format!("uses mip {} of '{}', which does not exist", v.mip, view.name));
             continue;
         }
         let image = view.camera.mip(v.mip).full();
@@ -161,26 +163,26 @@ fn views(plan: &Plan, task: &Task, capture: &Capture, findings: &mut Findings) {
         }
     }
     match task.views.len() {
-        0 => findings.error(task.block, "has no view to train on".into()),
-        n if n < MIN_VIEWS => findings.warning(task.block, format!("is seen by {n} views, {MIN_VIEWS} are wanted")),
+        0 => findings.error(task.block, "has no training view".into()),
+        n if n < MIN_VIEWS => findings.warning(task.block, format!("has {n} training views, fewer than {MIN_VIEWS}")),
         _ => {}
     }
 }
 
-/// Budget, steps and memory make sense.
-fn means(plan: &Plan, task: &Task, findings: &mut Findings) {
+/// Checks splat budget, steps and memory.
+fn check_budgets(plan: &Plan, task: &Task, findings: &mut Findings) {
     if task.budget == 0 || task.steps == 0 {
-        findings.error(task.block, format!("has {} splats and {} steps", task.budget, task.steps));
+        findings.error(task.block, format!("has a budget of {} splats and {} steps", task.budget, task.steps));
     }
     if task.points == 0 {
         findings.error(task.block, "has no sparse point".into());
     }
-    let (needed, limit) = (task.memory_bytes, plan.settings.memory_limit_bytes);
-    if needed > limit {
+    let (bytes, limit) = (task.memory_bytes, plan.settings.memory_limit_bytes);
+    if bytes > limit {
         let mib = |bytes: u64| bytes.div_ceil(1 << 20);
         findings.error(
             task.block,
-            format!("needs {} MiB, the limit is {}: lower --budget or raise --levels", mib(needed), mib(limit)),
+            format!("needs {} MiB, the limit is {} MiB; lower --budget or raise --levels", mib(bytes), mib(limit)),
         );
     }
 }
@@ -193,9 +195,9 @@ mod tests {
     use crate::plan::PlanSettings;
     use crate::testing::aerial;
 
-    /// Each damage is found, at the block where it was done.
+    /// Each damage is found at the damaged block.
     #[test]
-    fn finds_what_was_broken() {
+    fn damage_is_found() {
         let capture = aerial(6, 200.0, 4000);
         let settings = PlanSettings { levels: Some(1), ..PlanSettings::default() };
         let good = crate::plan(&capture, ArtefactId::of(b""), &settings, "cpu").unwrap();
@@ -203,36 +205,36 @@ mod tests {
         type Damage = fn(&mut Plan);
         let damages: [(&str, Damage); 10] = [
             ("trains on held-out view 0", |p| p.tasks[2].views[0].view = 0),
-            ("which others train on", |p| p.tasks[2].test_views[0].view = 1),
+            ("is tested on training view", |p| p.tasks[2].test_views[0].view = 1),
             ("window outside", |p| p.tasks[2].views[0].window.x = u32::MAX),
-            ("which has none", |p| p.tasks[2].views[0].mip = 9),
+            ("which does not exist", |p| p.tasks[2].views[0].mip = 9),
             ("lists a view twice", |p| p.tasks[2].views[1] = p.tasks[2].views[0]),
-            ("has no view", |p| p.tasks[2].views.clear()),
+            ("has no training view", |p| p.tasks[2].views.clear()),
             ("not initialised from its parent", |p| p.tasks[2].parent = None),
             ("is trained later", |p| p.tasks[2].context = vec![BlockId { level: 1, x: 1, y: 1 }]),
             ("MiB, the limit is", |p| p.tasks[2].memory_bytes = u64::MAX),
-            ("has 0 splats", |p| p.tasks[2].budget = 0),
+            ("has a budget of 0 splats", |p| p.tasks[2].budget = 0),
         ];
-        for (what, damage) in damages {
+        for (expected, damage) in damages {
             let mut plan = good.clone();
             damage(&mut plan);
             let findings = lint(&plan, &capture);
-            let found = findings.iter().find(|f| f.what.contains(what));
+            let found = findings.iter().find(|f| f.message.contains(expected));
             assert_eq!(
                 found.map(|f| (f.severity, f.block)),
                 Some((Severity::Error, Some(good.tasks[2].block))),
-                "{what}: {findings:?}"
+                "{expected}: {findings:?}"
             );
             assert!(findings.is_sorted_by_key(|f| std::cmp::Reverse(f.severity)));
         }
         let mut lost = good.clone();
         lost.tasks.remove(0);
-        assert!(lint(&lost, &capture).iter().any(|f| f.what.contains("does not come before it")));
+        assert!(lint(&lost, &capture).iter().any(|f| f.message.contains("does not precede it")));
         let mut poor = good.clone();
         poor.tasks[1].budget += 90_000;
-        assert!(lint(&poor, &capture).iter().any(|f| f.what.contains("do not add up")));
+        assert!(lint(&poor, &capture).iter().any(|f| f.message.contains("do not add up")));
         let mut fewer = capture.clone();
         fewer.views.truncate(20);
-        assert!(lint(&good, &fewer).iter().any(|f| f.what.contains("the capture has 20")));
+        assert!(lint(&good, &fewer).iter().any(|f| f.message.contains("the capture has 20")));
     }
 }

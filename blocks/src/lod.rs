@@ -1,7 +1,6 @@
-//! Level-of-detail cuts: which blocks of the tree stand for which part of the plane.
+//! Level-of-detail cuts of the block tree, and the context and training order that follow from them.
 //!
-//! The same rule chooses what a block trains against (its context) and what a viewer shows: full detail nearby, one
-//! level coarser with every doubling of the distance.
+//! Training context and viewer use the same rule: full detail nearby, one level coarser with every doubling of the distance.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -10,19 +9,19 @@ use scene::{BlockId, Splats};
 
 use crate::ground::Ground;
 
-/// A set of blocks that stand for the whole plane: the deepest block around a place owns it.
+/// A set of blocks that represents the whole plane. The deepest block that contains a place owns it.
 ///
-/// Of a block only the splats that it owns here count ([`Cut::keep`]), so a place never shows twice, even where a
-/// coarse block fills in for finer ones that do not exist.
+/// A block contributes only the splats that it owns in the cut ([`Cut::keep`]). No place is rendered twice, also where a coarse block
+/// fills in for finer blocks that do not exist.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Cut {
-    /// Region -> the block that owns it, unless a deeper region says otherwise.
+    /// Region -> its owner. A deeper region inside takes precedence.
     regions: BTreeMap<BlockId, BlockId>,
     deepest: u8,
 }
 
 impl FromIterator<BlockId> for Cut {
-    /// A cut of these blocks, each owning its own core but for the members within.
+    /// The cut of these blocks. Each owns its core without the cores of deeper members.
     fn from_iter<T: IntoIterator<Item = BlockId>>(blocks: T) -> Self {
         Self::from_regions(blocks.into_iter().map(|b| (b, b)))
     }
@@ -35,8 +34,8 @@ impl Cut {
         Self { regions, deepest }
     }
 
-    /// A cut of blocks none of which lies inside another, where the gaps between them go to the block with the
-    /// nearest centre (ties to the lowest id). A gap is decided as the largest empty square of the tree.
+    /// The cut of disjoint blocks in which gaps belong to the block with the nearest centre (ties: the lowest id). Each gap is the
+    /// largest empty square of the tree and has one owner.
     pub fn nearest(ground: &Ground, blocks: impl IntoIterator<Item = BlockId>) -> Self {
         let blocks: BTreeSet<BlockId> = blocks.into_iter().collect();
         let mut inner: BTreeSet<BlockId> = BTreeSet::new();
@@ -54,53 +53,54 @@ impl Cut {
         Self::from_regions(regions.into_iter())
     }
 
-    /// The blocks of the cut, in order.
+    /// The blocks of the cut, sorted.
     pub fn blocks(&self) -> BTreeSet<BlockId> {
         self.regions.values().copied().collect()
     }
 
-    /// Each region with its owner, in order of the region. A region inside another one is taken out of that.
+    /// Each region with its owner, sorted by region. A region excludes the regions inside it.
     pub fn regions(&self) -> impl Iterator<Item = (BlockId, BlockId)> {
         self.regions.iter().map(|(&region, &owner)| (region, owner))
     }
 
-    /// The block that owns a place; `None` for a place that is not finite, or in a hole of the cut. What is far belongs to the
-    /// root, if that is in the cut, whichever blocks are: no other trains it.
+    /// The block that owns a place (world metres). `None` if the place is not finite or in a hole of the cut. Background belongs to the
+    /// root if the root is in the cut, because no other block trains it.
     pub fn owner_of(&self, ground: &Ground, world: DVec3) -> Option<BlockId> {
         if !world.is_finite() {
             return None;
         }
-        if let Some(&root) = self.regions.get(&BlockId::ROOT).filter(|_| ground.is_far(world)) {
+        if let Some(&root) = self.regions.get(&BlockId::ROOT).filter(|_| ground.is_background(world)) {
             return Some(root);
         }
         let cell = ground.block_at(self.deepest, world);
         (0..=self.deepest).rev().find_map(|level| self.regions.get(&cell.ancestor(level)).copied())
     }
 
-    /// The rows of this block's splats that it owns in this cut.
+    /// The rows of the block's splats that the block owns in this cut.
     pub fn keep(&self, splats: &Splats, ground: &Ground, block: BlockId) -> Splats {
         splats.filter(|i| self.owner_of(ground, splats.mean(i).as_dvec3()) == Some(block))
     }
 }
 
-/// The level wanted at a distance from something of level `level` whose core has this edge (both metres): one less
-/// at once, and one less again with every doubling of the distance.
-pub fn wanted_level(level: u8, distance_metres: f64, core_edge_metres: f64) -> u8 {
+/// The level of the context at a distance from the halo of a block of level `level` (distance and core edge in metres): one level
+/// coarser than the block immediately outside, and another level coarser with every doubling of the distance.
+pub fn target_level(level: u8, distance_metres: f64, core_edge_metres: f64) -> u8 {
     let steps = (1.0 + distance_metres / core_edge_metres).log2().floor();
-    // `as` saturates: an infinite distance wants level 0.
+    // `as` saturates: an infinite distance gives level 0.
     level.saturating_sub(1).saturating_sub(steps as u8)
 }
 
-/// What a block trains against: the cut, by [`wanted_level`], of the levels above it that exist. With the block's
-/// parent (which is left out here) it covers the plane. Where all blocks exist none lies inside another; where some
-/// do not, their nearest ancestor is in the cut to fill in. The root is always there, for what is far. Empty for the root.
+/// The coarser context of a block: the cut of the existing coarser levels by [`target_level`], without the block's parent.
+///
+/// Together with the parent the context covers the plane. In a complete tree its blocks are disjoint. Where blocks are missing, their
+/// nearest ancestor fills in. The root is always a member, for the background. The context of the root is empty.
 pub fn context_of(ground: &Ground, block: BlockId, existing: &BTreeSet<BlockId>) -> Vec<BlockId> {
     let (halo, edge) = (ground.nominal_halo(block), ground.core_edge_metres(block.level));
     let mut found = BTreeSet::new();
     let mut open = Vec::from_iter((block.level > 0 && existing.contains(&BlockId::ROOT)).then_some(BlockId::ROOT));
     while let Some(node) = open.pop() {
         let distance = ground.core(node).distance(&halo);
-        let split = wanted_level(block.level, distance, edge) > node.level;
+        let split = target_level(block.level, distance, edge) > node.level;
         let children = node.children().map(|child| (split && existing.contains(&child)).then_some(child));
         if children.iter().any(Option::is_none) {
             found.insert(node);
@@ -114,22 +114,25 @@ pub fn context_of(ground: &Ground, block: BlockId, existing: &BTreeSet<BlockId>)
     found.into_iter().collect()
 }
 
-/// The sweep of its level in which a block is trained, like the fields of a chessboard: no two blocks of one sweep share a face,
-/// so a level takes two sweeps and the blocks of each can be trained at once.
+/// The sweep, 0 or 1, in which a block is trained: a red-black (checkerboard) colouring of its level. Blocks of one sweep share no
+/// face, so all of them can be trained concurrently.
 pub fn sweep_of(block: BlockId) -> u8 {
     ((block.x ^ block.y) & 1) as u8
 }
 
-/// The order of training, and of a plan's tasks: by level, sweep, row, column.
+/// The sort key of training and of a plan's tasks: level, sweep, row, column.
 pub fn training_order(block: BlockId) -> (u8, u8, u32, u32) {
     (block.level, sweep_of(block), block.y, block.x)
 }
 
-/// The neighbours of `block` on its own level, beyond its faces, that are trained in an earlier sweep. They are final when the block starts:
-/// drawn, frozen, as the merged model will have them, so that the block fits what it will stand beside.
+/// The face neighbours of `block` on its own level that are trained in an earlier sweep. They are final when the block starts, and are
+/// rendered frozen as in the merged model, so that the block fits its neighbours at the seam.
 pub fn finished_neighbours(block: BlockId, of_level: &BTreeSet<BlockId>) -> impl Iterator<Item = BlockId> {
-    let beside = move |b: &BlockId| b.x.abs_diff(block.x) + b.y.abs_diff(block.y) == 1;
-    of_level.iter().copied().filter(move |b| b.level == block.level && beside(b) && sweep_of(*b) < sweep_of(block))
+    let is_face_neighbour = move |b: &BlockId| b.x.abs_diff(block.x) + b.y.abs_diff(block.y) == 1;
+    of_level
+        .iter()
+        .copied()
+        .filter(move |b| b.level == block.level && is_face_neighbour(b) && sweep_of(*b) < sweep_of(block))
 }
 
 #[cfg(test)]
@@ -149,7 +152,7 @@ mod tests {
         blocks
     }
 
-    /// Trees with gaps: a block stays only with its parent.
+    /// Trees with gaps: a block exists only if its parent does.
     fn some(levels: u8, keep: &[bool]) -> BTreeSet<BlockId> {
         let mut blocks = BTreeSet::new();
         for (i, block) in all(levels).into_iter().enumerate() {
@@ -171,11 +174,11 @@ mod tests {
             let context = context_of(&ground, block, &existing);
             let parent = block.parent().unwrap();
             let members: Vec<BlockId> = context.iter().copied().chain([parent]).collect();
-            assert!(members.contains(&BlockId::ROOT), "{block}: what is far is missing");
-            // Where others cover the plane the root is there for what is far alone.
+            assert!(members.contains(&BlockId::ROOT), "{block}: the background is missing");
+            // In a complete cover the root only owns the background.
             let of_ground = |b: &BlockId| b.level > 0 || block.level == 1;
             let members: Vec<BlockId> = members.into_iter().filter(of_ground).collect();
-            // Areas add up to the root's, and none lies inside another: an exact cover.
+            // The areas add up to the root's and the blocks are disjoint: an exact cover.
             assert_eq!(members.iter().map(|b| 1u64 << (2 * (8 - b.level))).sum::<u64>(), 1 << 16, "{block}");
             for a in &members {
                 assert!(a.level < block.level);
@@ -183,7 +186,7 @@ mod tests {
                 let distance = ground.core(*a).distance(&ground.nominal_halo(block));
                 assert_eq!(
                     a.level,
-                    a.level.max(wanted_level(block.level, distance, ground.core_edge_metres(block.level)))
+                    a.level.max(target_level(block.level, distance, ground.core_edge_metres(block.level)))
                 );
             }
         }
@@ -193,14 +196,14 @@ mod tests {
     }
 
     #[test]
-    fn detail_falls_with_the_doubling_of_distance() {
-        let levels = [0.0, 0.9, 1.0, 2.9, 3.0, 7.0, 1e300, f64::INFINITY].map(|d| wanted_level(5, d, 1.0));
+    fn the_level_falls_with_every_doubling_of_the_distance() {
+        let levels = [0.0, 0.9, 1.0, 2.9, 3.0, 7.0, 1e300, f64::INFINITY].map(|d| target_level(5, d, 1.0));
         assert_eq!(levels, [4, 4, 3, 3, 2, 1, 0, 0]);
     }
 
     proptest! {
         #[test]
-        fn trees_with_gaps_still_own_every_place_once(keep in prop::collection::vec(any::<bool>(), 3..50)) {
+        fn trees_with_gaps_own_every_place_once(keep in prop::collection::vec(any::<bool>(), 3..50)) {
             let (ground, existing) = (ground(), some(4, &keep));
             for &block in existing.iter().filter(|b| b.level > 0) {
                 let parent = block.parent().unwrap();
@@ -210,14 +213,14 @@ mod tests {
                 for at in places() {
                     let owner = cut.owner_of(&ground, at).unwrap();
                     prop_assert!(ground.owns(owner, at));
-                    // Under the block itself its parent shows, whatever else exists.
+                    // The block's own core belongs to its parent.
                     prop_assert!(!ground.owns(block, at) || owner == parent);
                 }
             }
         }
 
         #[test]
-        fn gaps_go_to_the_nearest(picks in prop::collection::btree_set((0u32..8, 0u32..8), 1..20)) {
+        fn gaps_belong_to_the_nearest_block(picks in prop::collection::btree_set((0u32..8, 0u32..8), 1..20)) {
             let ground = ground();
             let blocks: BTreeSet<BlockId> = picks.into_iter().map(|(x, y)| BlockId { level: 3, x, y }).collect();
             let cut = Cut::nearest(&ground, blocks.iter().copied());
@@ -233,7 +236,7 @@ mod tests {
     }
 
     #[test]
-    fn keeping_by_cut_partitions_splats() {
+    fn keep_partitions_splats() {
         let (ground, blocks) = (ground(), some(3, &[true, false, true, true]));
         let cut: Cut = blocks.iter().copied().collect();
         let mut splats = Splats::new(0);
@@ -245,7 +248,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_far_is_the_roots_alone() {
+    fn the_background_belongs_to_the_root() {
         let ground = Ground { near_metres: 96.0, ..ground() };
         let cut: Cut = all(2).into_iter().collect();
         let middle = DVec3::new(32.0, 32.0, 0.0);
@@ -254,11 +257,11 @@ mod tests {
             let (near, far) = (middle + direction * 95.9, middle + direction * 96.1);
             assert_eq!(cut.owner_of(&ground, near).map(|b| b.level), Some(2));
             assert_eq!(cut.owner_of(&ground, far), Some(BlockId::ROOT));
-            // Without a root, as in flat plans, whoever is below.
+            // Without a root, as in flat plans, the block below owns the background.
             let flat = Cut::nearest(&ground, all(2).into_iter().filter(|b| b.level == 2));
             assert_eq!(flat.owner_of(&ground, far), Some(ground.block_at(2, far)));
         }
-        // What shows through the ground is its block's.
+        // Places below the ground belong to their block.
         for direction in [DVec3::NEG_Z, DVec3::new(0.6, 0.0, -0.8)] {
             assert_eq!(cut.owner_of(&ground, middle + direction * 200.0).map(|b| b.level), Some(2));
         }

@@ -1,72 +1,73 @@
-//! The plan: an immutable, hashed list of what to do.
+//! The plan: an immutable, hashed list of training tasks, with its settings and its codec.
+//!
+//! A plan is stored as positional bincode in a frame, and as JSON. The order of fields and the serde names are part of both formats.
 
 use glam::DVec3;
 use scene::frame::{self, Kind};
 use scene::{ArtefactId, BlockId, CodecError, Rect};
 use serde::{Deserialize, Serialize};
 
-use crate::allot::first_splats;
 use crate::ground::{Ground, HALO_SCALE};
 use crate::lod::{Cut, training_order};
 
-/// The version of [`Plan`] that this program writes and reads.
+/// The format version of [`Plan`] that this program reads and writes.
 pub const VERSION: u32 = 5;
-/// The frame that carries a plan.
+/// The frame kind of a plan.
 pub const PLAN: Kind = Kind(*b"plan", VERSION);
-/// The deepest level a plan may have: 65,536 blocks a side.
+/// The maximum depth of a plan: 65,536 blocks a side.
 pub const MAX_LEVELS: u8 = 16;
 
-/// The most [`PlanSettings::views_per_step`].
-pub const MOST_VIEWS_PER_STEP: u32 = 16;
+/// The maximum of [`PlanSettings::views_per_step`].
+pub const MAX_VIEWS_PER_STEP: u32 = 16;
 
-/// No image is wider or higher, in pixels.
+/// The maximum width and height of a window, pixels.
 const MAX_SIDE: u32 = 1 << 24;
 
-/// How the scene is divided. All three share everything below the plan.
+/// How the scene is divided into blocks.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Mode {
-    /// The level-of-detail tree: every block a task, children initialised from their parent, against its neighbours.
+    /// The level-of-detail tree: every block is a task, initialised from its parent and trained against its context.
     #[default]
     Tree,
-    /// Only the leaves, each from the sparse points and for itself: the baseline to beat.
+    /// Only the leaves, each initialised from sparse points and trained without context: the baseline.
     Flat,
-    /// One task, full images.
+    /// One task on full images.
     Whole,
 }
 
-/// What a person decides; everything else follows from the capture.
+/// The user's settings. Everything else in a plan follows from them and the capture.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct PlanSettings {
     /// How the scene is divided.
     pub mode: Mode,
-    /// Levels below the root; `None` chooses from extent, resolution, views and points.
+    /// Levels below the root. `None`: chosen from extent, resolution, views and points.
     pub levels: Option<u8>,
-    /// Seeds every random number of the job.
+    /// Seed of all random numbers of the job.
     pub seed: u64,
-    /// Steps of full images of the whole scene; plans of all modes cost about this much. Trees of a scene too large for one block
-    /// (100,000 splats) cost what these steps do on so much of it, so that cost grows with the scene and not with its square.
+    /// Training work, as steps on full images of the whole scene. Plans of all modes cost about the same. For a scene larger than one
+    /// block (100,000 splats) the cost of a step is capped at one block, so that the cost grows linearly with the scene.
     pub steps: u32,
-    /// Windows that a task draws before splats move: more of them fill a large GPU.
+    /// Batch size: windows rendered per optimiser step, 1 to [`MAX_VIEWS_PER_STEP`]. Larger batches fill a large GPU.
     pub views_per_step: u32,
     /// Splats of the merged model.
     pub budget: u32,
-    /// What leaves may lose of their PSNR for fewer splats, dB; 0 prunes nothing.
+    /// PSNR that pruning of a leaf may lose, dB. 0: no pruning.
     pub tolerance_db: f64,
-    /// A block is refined where its parent's splats are off, in its own photos, by more than this many times what the root is
-    /// off by in all (root mean squares); 0 refines all, and lets no schedule follow what training says.
+    /// Refinement threshold, relative: a block is trained only if the RMS error of its parent's splats in the block's windows exceeds
+    /// this many times the root's overall RMS error. 0: every block is trained.
     pub residual: f64,
-    /// Every which view is held out; 0 holds out none.
+    /// Every n-th view is held out for testing. 0: none.
     pub test_every: u32,
     /// Degree of the spherical harmonics, 0 to 3.
     pub sh_degree: u8,
-    /// Opacity compensated for the pixel's blur, so that the model may be drawn at any resolution (Mip-Splatting's 2D filter);
-    /// else a plain 3DGS model.
+    /// Anti-aliased mode: opacity is compensated for the screen-space filter (Mip-Splatting's 2D filter), so that the model renders at
+    /// any resolution. Otherwise classic 3DGS.
     pub antialiased: bool,
-    /// Whether the root trains an exposure of each view, which all others take as it is.
+    /// Whether the root trains an exposure per view, which all other blocks reuse unchanged.
     pub exposure: bool,
-    /// What one task may take, bytes.
+    /// Memory limit of one task, bytes.
     pub memory_limit_bytes: u64,
 }
 
@@ -90,60 +91,64 @@ impl Default for PlanSettings {
     }
 }
 
-/// A window of a view at a mip.
+/// A window of a view at one mip.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub struct ViewUse {
     /// Index into the capture's views.
     pub view: u32,
-    /// Mip of the image, 0 = full size.
+    /// Mip of the image; 0 is full resolution.
     pub mip: u8,
-    /// The part of that mip's image that is used, in its pixels.
+    /// The window, pixels of that mip.
     pub window: Rect,
 }
 
-/// Train one block.
+/// The task of training one block.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Task {
-    /// The block; its name within the plan.
+    /// The block. It identifies the task within the plan.
     pub block: BlockId,
-    /// Where the first splats come from; `None` = the sparse points.
+    /// The block whose result initialises this one. `None`: initialised from sparse points.
     pub parent: Option<BlockId>,
-    /// Blocks that are rendered along, frozen: coarser ones outside the halo, and the finished neighbours of its own level,
-    /// inside the halo too. With the parent they cover the plane; where one lies inside another the deeper counts
-    /// ([`Task::context_cut`]).
+    /// Context: blocks that are rendered frozen with this one. Coarser blocks outside the halo, and finished neighbours of the same
+    /// level, which also count inside the halo. Together with the parent they cover the plane; see [`Task::context_cut`].
     pub context: Vec<BlockId>,
-    /// What it trains on, by view.
+    /// Training windows, sorted by view.
     pub views: Vec<ViewUse>,
-    /// What it is measured on, by view.
+    /// Held-out windows for evaluation, sorted by view.
     pub test_views: Vec<ViewUse>,
-    /// Sparse points in the halo.
+    /// Number of sparse points in the halo.
     pub points: u32,
-    /// Splats to end with inside the core.
+    /// Target number of splats in the core at the end of training.
     pub budget: u32,
-    /// Splats that a window shows at the end, halo included, mean over the windows; an estimate.
-    pub drawn: u32,
-    /// Frozen splats of the context that a window shows, mean over the windows; an estimate.
-    pub context_drawn: u32,
-    /// Steps, counted in windows.
+    /// Estimated number of own splats (core and halo) that a window shows at the end, mean over the windows.
+    #[serde(rename = "drawn")]
+    pub visible_splats: u32,
+    /// Estimated number of frozen context splats that a window shows, mean over the windows.
+    #[serde(rename = "context_drawn")]
+    pub visible_context_splats: u32,
+    /// Training steps, one window each.
     pub steps: u32,
-    /// Metres per pixel that the block is to resolve.
+    /// Target resolution, metres per pixel.
     pub rho_metres: f64,
-    /// Estimate of the memory it takes, bytes.
+    /// Estimated peak memory, bytes.
     pub memory_bytes: u64,
 }
 
 impl Task {
-    /// Pixels of all training windows.
+    /// The total number of pixels of all training windows.
     pub fn window_pixels(&self) -> u64 {
         self.views.iter().map(|v| v.window.area()).sum()
     }
 
-    /// The finished neighbour whose splats this place of the block's own core starts from, if not from the parent's: the nearest of
-    /// those in whose halo's inner half it lies. What a neighbour has there was trained together with what stays frozen on its side of
-    /// the face; the outer half it saw too little of.
-    pub fn lender(&self, ground: &Ground, place: DVec3) -> Option<BlockId> {
+    /// The donor of a place (world metres): the finished neighbour whose splats initialise that part of this block's core. `None`: the
+    /// parent's splats are used.
+    ///
+    /// The donor is the nearest finished neighbour whose halo contains the place in its inner half. The neighbour trained its splats
+    /// there together with the splats that stay frozen on its side of the face. In the outer half of its halo it has too few
+    /// observations.
+    pub fn donor(&self, ground: &Ground, place: DVec3) -> Option<BlockId> {
         const INNER: f64 = 0.25 * (HALO_SCALE - 1.0);
-        if !ground.owns(self.block, place) || ground.is_far(place) {
+        if !ground.owns(self.block, place) || ground.is_background(place) {
             return None;
         }
         let reach = INNER * ground.core_edge_metres(self.block.level);
@@ -155,97 +160,92 @@ impl Task {
             .map(|(_, neighbour)| neighbour)
     }
 
-    /// The already trained cut of the tree around (and, as the parent, under) the block.
+    /// The cut that the block is trained against: its context and its parent.
     pub fn context_cut(&self) -> Cut {
         self.context.iter().copied().chain(self.parent).collect()
     }
 }
 
-/// An immutable list of tasks, each after those that it needs.
+/// An immutable list of tasks in topological order: each task follows its dependencies.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Plan {
     /// [`VERSION`].
     pub version: u32,
-    /// The capture planned for.
+    /// The capture that the plan is for.
     pub capture: ArtefactId,
-    /// What the person decided.
+    /// The user's settings.
     pub settings: PlanSettings,
-    /// The backend that every task runs on, by full name.
+    /// Full name of the backend that every task must run on.
     pub backend: String,
-    /// The ground and its root square.
+    /// The ground plane and the root square.
     pub ground: Ground,
-    /// The deepest level.
+    /// The depth of the tree: the level of its finest blocks.
     pub levels: u8,
-    /// Metres per pixel of each level, `levels + 1` of them.
+    /// Resolution of each level, metres per pixel; `levels + 1` entries.
     pub rho_metres: Vec<f64>,
-    /// By level, sweep, row and column, so that each comes after its parent and its context.
+    /// Sorted by level, sweep, row and column. Each task follows its parent and its context.
     pub tasks: Vec<Task>,
 }
 
 impl Plan {
-    /// The plan's name: the hash of its frame.
+    /// The id of the plan: the hash of its frame.
     pub fn id(&self) -> ArtefactId {
         ArtefactId::of(&self.to_frame())
     }
 
-    /// The plan as bytes.
+    /// Encodes the plan as a frame.
     pub fn to_frame(&self) -> Vec<u8> {
         frame::encode(PLAN, self, &[])
     }
 
-    /// A plan from bytes.
+    /// Decodes and checks a plan.
     ///
     /// # Errors
-    /// Damage, another version, or numbers that no planner wrote.
+    /// A damaged frame, another version, or values that fail [`Plan::check`].
     pub fn from_frame(bytes: &[u8]) -> Result<Self, CodecError> {
         let (plan, _): (Self, _) = frame::decode(PLAN, bytes)?;
         plan.check()?;
         Ok(plan)
     }
 
-    /// Refuses plans whose numbers would make other functions meaningless; also for plans read from JSON.
+    /// Checks that all values are in range and consistent. Call it for a plan read from JSON.
     ///
     /// # Errors
-    /// What is out of range.
+    /// The first value that is out of range.
     pub fn check(&self) -> Result<(), CodecError> {
-        let bad = |what: String| Err(CodecError::new(format!("plan {what}")));
+        let bad = |problem: String| Err(CodecError::new(format!("plan {problem}")));
         if self.version != VERSION {
-            return bad(format!("of version {}, this program reads {VERSION}", self.version));
+            return bad(format!("has version {}; this program reads version {VERSION}", self.version));
         }
         let PlanSettings { sh_degree, views_per_step, .. } = self.settings;
-        let is_step = (1..=MOST_VIEWS_PER_STEP).contains(&views_per_step);
-        if !self.ground.is_sane() || self.levels > MAX_LEVELS || sh_degree > 3 || !is_step {
-            return bad("with a ground, depth, SH degree or number of views per step out of range".into());
+        let is_batch = (1..=MAX_VIEWS_PER_STEP).contains(&views_per_step);
+        if !self.ground.is_sane() || self.levels > MAX_LEVELS || sh_degree > 3 || !is_batch {
+            return bad("has a ground, depth, SH degree or number of views per step out of range".into());
         }
         let sane = |rho: &f64| rho.is_finite() && *rho > 0.0;
         if self.rho_metres.len() != usize::from(self.levels) + 1 || !self.rho_metres.iter().all(sane) {
-            return bad("whose resolutions do not fit its levels".into());
+            return bad("has resolutions that do not match its levels".into());
         }
         let in_tree = |b: &BlockId| b.level <= self.levels && b.x >> b.level == 0 && b.y >> b.level == 0;
         for task in &self.tasks {
             if !task.context.iter().chain(&task.parent).chain([&task.block]).all(in_tree) || !sane(&task.rho_metres) {
-                return bad(format!("whose task {} is not in its tree", task.block));
+                return bad(format!("has task {}, which is not in its tree", task.block));
             }
-            let window = |v: &ViewUse| {
+            let is_bad = |v: &ViewUse| {
                 let Rect { width, height, .. } = v.window;
                 v.mip > 31 || ![width, height].iter().all(|side| (1..=MAX_SIDE).contains(side))
             };
-            if task.views.iter().chain(&task.test_views).any(window) {
-                return bad(format!("whose task {} has a window that is empty or larger than any image", task.block));
+            if task.views.iter().chain(&task.test_views).any(is_bad) {
+                return bad(format!("has an empty or too large window in task {}", task.block));
             }
         }
         if self.tasks.is_empty() || !self.tasks.is_sorted_by(|a, b| training_order(a.block) < training_order(b.block)) {
-            return bad("without tasks or with tasks out of order".into());
+            return bad("has no tasks, or its tasks are out of order".into());
         }
         Ok(())
     }
 
-    /// Splats at most that a task starts with where it starts from points.
-    pub fn first_splats(&self, task: &Task) -> u32 {
-        first_splats(task, self.tasks.iter().any(|t| t.parent == Some(task.block)))
-    }
-
-    /// The task of a block.
+    /// The task of a block, if it has one.
     pub fn task(&self, block: BlockId) -> Option<&Task> {
         self.tasks
             .binary_search_by_key(&training_order(block), |t| training_order(t.block))
@@ -253,10 +253,10 @@ impl Plan {
             .map(|i| &self.tasks[i])
     }
 
-    /// The finest model: which task's splats count where. Every place has exactly one owner.
+    /// The finest cut: the owner of every place in the merged model. Every place has exactly one.
     ///
-    /// In a tree the owner is the deepest task around a place: the area of a block without a task stays with its
-    /// nearest ancestor. In a flat plan such areas go to the task with the nearest centre.
+    /// In a tree the owner is the deepest task whose core contains the place, so the area of a block without a task stays with its
+    /// nearest ancestor. In a flat plan such an area belongs to the task with the nearest centre.
     pub fn leaves(&self) -> Cut {
         let blocks = self.tasks.iter().map(|t| t.block);
         match self.settings.mode {
@@ -266,52 +266,50 @@ impl Plan {
     }
 }
 
-/// Why there is no plan.
+/// Why a capture cannot be planned.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum PlanError {
-    /// A setting out of its range.
+    /// A setting is out of range.
     #[error("{setting}: {problem}; {advice}")]
     Setting {
-        /// Which one.
+        /// The command-line flag or name of the setting.
         setting: &'static str,
-        /// What is wrong.
+        /// The problem.
         problem: String,
-        /// What to do.
+        /// What to do about it.
         advice: &'static str,
     },
-    /// No view is left to train on.
+    /// No training view remains.
     #[error(
-        "no view to train on: of {views} views {usable} have a usable camera and {test} are held out; add views or hold out fewer (--test-every)"
+        "no training view: of {views} views, {usable} have a usable camera and {test} are held out; add views or hold out fewer (--test-every)"
     )]
     NoTrainViews {
-        /// Views of the capture.
+        /// Number of views of the capture.
         views: usize,
-        /// Those with a sane camera.
+        /// Number of views with a usable camera.
         usable: usize,
-        /// Those held out.
+        /// Number of held-out views.
         test: usize,
     },
-    /// Nothing to start from.
+    /// The capture has no sparse points.
     #[error(
-        "the capture has no finite sparse points; plat needs them to divide the scene and to start from: run structure from motion or give a point cloud"
+        "the capture has no finite sparse points, which plat needs to divide and initialise the scene; run structure from motion or provide a point cloud"
     )]
     NoPoints,
-    /// Cameras and points do not fit together.
+    /// No training view observes a sparse point.
     #[error(
-        "no training view sees any of the {points} sparse points; check that poses and points are in the same frame and that cameras look along +z"
+        "no training view observes any of the {points} sparse points; check that poses and points are in the same frame and that cameras look along +z"
     )]
-    NothingSeen {
-        /// Finite sparse points.
+    NoObservations {
+        /// Number of finite sparse points.
         points: usize,
     },
-    /// Blocks too small for the capture.
-    #[error(
-        "no block of level {levels} is seen by {needed} views and holds enough points; use fewer levels (--levels)"
-    )]
+    /// The blocks are too small for the capture.
+    #[error("no block of level {levels} has {needed} views and enough sparse points; use fewer levels (--levels)")]
     NoBlocks {
-        /// The level tried.
+        /// The level that was tried.
         levels: u8,
-        /// Views a block needs.
+        /// Minimum number of views of a block.
         needed: usize,
     },
 }

@@ -1,4 +1,4 @@
-//! Where a cut may show: the faces between the areas of its owners, and how far a place is from them.
+//! Seams: the faces between blocks of different owners in a cut, and the distance of a place to them.
 
 use glam::{DVec2, DVec3};
 use scene::BlockId;
@@ -6,30 +6,30 @@ use scene::BlockId;
 use crate::ground::Ground;
 use crate::lod::Cut;
 
-/// A straight piece of the border between what two blocks own, on the ground.
+/// A straight segment of the border between the areas of two owners, on the ground.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Face {
-    /// The owner on the side of smaller coordinates.
+    /// The owner on the side of lower coordinates.
     pub a: BlockId,
     /// The owner on the other side.
     pub b: BlockId,
-    /// The ground axis that it stands across: 0 or 1.
+    /// The ground axis that the face is perpendicular to: 0 or 1.
     pub axis: usize,
-    /// Where on that axis, ground metres.
+    /// Coordinate on that axis, ground metres.
     pub at_metres: f64,
-    /// Its reach along the other axis, ground metres; infinite at the scene's rim, as ownership is.
-    pub reach_metres: [f64; 2],
+    /// Extent along the other axis, ground metres. Infinite at the scene's rim, as ownership is.
+    pub extent_metres: [f64; 2],
 }
 
 impl Face {
-    /// How far a place on the ground is from it, metres.
+    /// The distance of a place on the ground to the face, metres.
     pub fn distance(&self, ground: DVec2) -> f64 {
         let (across, along) = (ground[self.axis], ground[1 - self.axis]);
-        let beyond = (self.reach_metres[0] - along).max(along - self.reach_metres[1]).max(0.0);
+        let beyond = (self.extent_metres[0] - along).max(along - self.extent_metres[1]).max(0.0);
         (across - self.at_metres).hypot(beyond)
     }
 
-    /// Whether a place lies on the side of `a`.
+    /// True when the place is on the side of `a`.
     pub fn is_before(&self, ground: DVec2) -> bool {
         ground[self.axis] < self.at_metres
     }
@@ -39,12 +39,12 @@ impl Face {
 #[derive(Debug, Clone, PartialEq)]
 pub struct Seams {
     ground: Ground,
-    /// By axis and place on it.
+    /// Sorted by axis and coordinate.
     faces: Vec<Face>,
 }
 
 impl Seams {
-    /// The faces of a cut: none where one block owns all.
+    /// The faces of a cut; empty if one block owns everything.
     pub fn of(cut: &Cut, ground: &Ground) -> Self {
         let squares = squares(cut);
         let mut faces = Vec::new();
@@ -58,7 +58,8 @@ impl Seams {
                     continue;
                 };
                 *place = next;
-                // The square beside it, as large or larger; a divided one has faces of its own to tell. Of equals one tells.
+                // The adjacent square of equal or larger size. A divided neighbour reports the face itself; of two equal squares
+                // only the lower one does.
                 let neighbour = (0..=square.level).rev().find_map(|level| {
                     let found = squares.binary_search_by_key(&beside.ancestor(level), |(square, _)| *square);
                     found.ok().map(|i| squares[i])
@@ -75,24 +76,24 @@ impl Seams {
                     b: if forward { other_owner } else { owner },
                     axis,
                     at_metres: if forward { core.max[axis] } else { core.min[axis] },
-                    reach_metres: [
+                    extent_metres: [
                         open(cell == 0, core.min[along], f64::NEG_INFINITY),
                         open(cell == cells - 1, core.max[along], f64::INFINITY),
                     ],
                 });
             }
         }
-        let key = |face: &Face| (face.axis, face.at_metres, face.reach_metres[0]);
+        let key = |face: &Face| (face.axis, face.at_metres, face.extent_metres[0]);
         faces.sort_by(|a, b| key(a).partial_cmp(&key(b)).expect("a sane ground has no NaN"));
         Self { ground: *ground, faces }
     }
 
-    /// The faces, by axis, place on it and reach.
+    /// The faces, sorted by axis, coordinate and extent.
     pub fn faces(&self) -> &[Face] {
         &self.faces
     }
 
-    /// The pairs of blocks that have a face, in order, the lower first.
+    /// The sorted pairs of blocks that share a face, the lower block first.
     pub fn pairs(&self) -> Vec<[BlockId; 2]> {
         let mut pairs: Vec<[BlockId; 2]> =
             self.faces.iter().map(|face| [face.a.min(face.b), face.a.max(face.b)]).collect();
@@ -101,7 +102,7 @@ impl Seams {
         pairs
     }
 
-    /// The nearest face no farther than `within_metres` from a place in the world, and how far it is, metres.
+    /// The nearest face within `within_metres` of a place (world metres), and its distance in metres.
     pub fn nearest(&self, world: DVec3, within_metres: f64) -> Option<(&Face, f64)> {
         let at = self.ground.from_world(world).truncate();
         let mut found: Option<(&Face, f64)> = None;
@@ -120,7 +121,7 @@ impl Seams {
     }
 }
 
-/// The plane as squares of one owner each, by id: a square is divided where a deeper region lies in it.
+/// Divides the plane into squares with one owner each, sorted by id. A square with a deeper region inside is divided.
 fn squares(cut: &Cut) -> Vec<(BlockId, BlockId)> {
     let regions: std::collections::BTreeMap<BlockId, BlockId> = cut.regions().collect();
     let divided: std::collections::BTreeSet<BlockId> =
@@ -151,12 +152,12 @@ mod tests {
     }
 
     #[test]
-    fn four_blocks_have_four_faces_that_reach_to_infinity() {
+    fn four_blocks_have_four_faces_that_extend_to_infinity() {
         let cut: Cut = [BlockId::ROOT].into_iter().chain(BlockId::ROOT.children()).collect();
         let seams = Seams::of(&cut, &ground());
         assert_eq!(seams.faces().len(), 4);
         assert!(seams.faces().iter().all(|f| f.at_metres == 32.0 && f.a < f.b));
-        assert_eq!(seams.faces()[0].reach_metres, [f64::NEG_INFINITY, 32.0]);
+        assert_eq!(seams.faces()[0].extent_metres, [f64::NEG_INFINITY, 32.0]);
         assert_eq!(seams.pairs().len(), 4);
         let (face, distance) = seams.nearest(DVec3::new(33.5, -1e4, 7.0), 2.0).unwrap();
         assert_eq!((face.a, face.b, distance), (block(1, 0, 0), block(1, 1, 0), 1.5));
@@ -165,21 +166,21 @@ mod tests {
     }
 
     #[test]
-    fn one_block_has_no_face_and_an_odd_child_is_fenced_in() {
+    fn one_block_has_no_face_and_a_single_child_has_four() {
         assert!(Seams::of(&[BlockId::ROOT].into_iter().collect(), &ground()).faces().is_empty());
         assert!(Seams::of(&Cut::default(), &ground()).faces().is_empty());
         let inner = block(2, 1, 1);
         let seams = Seams::of(&[BlockId::ROOT, inner].into_iter().collect(), &ground());
-        // 16..32 on both axes; the root's own squares have none among themselves.
+        // The child covers 16..32 on both axes. The root's own squares have no faces between them.
         assert_eq!(seams.faces().len(), 4);
         assert_eq!(seams.pairs(), [[BlockId::ROOT, inner]]);
-        assert!(seams.faces().iter().all(|f| f.reach_metres == [16.0, 32.0]));
+        assert!(seams.faces().iter().all(|f| f.extent_metres == [16.0, 32.0]));
         let corner = seams.nearest(DVec3::new(35.0, 36.0, 0.0), 6.0).unwrap();
         assert!((corner.1 - 5.0).abs() < 1e-12);
     }
 
     proptest! {
-        /// The owner changes across every face, and nowhere else.
+        /// The owner changes across every face and nowhere else.
         #[test]
         fn faces_are_where_the_owner_changes(keep in prop::collection::vec(any::<bool>(), 3..40), nearest in any::<bool>()) {
             let ground = ground();
@@ -198,7 +199,7 @@ mod tests {
             };
             let seams = Seams::of(&cut, &ground);
             for face in seams.faces() {
-                let along = face.reach_metres[0].max(-100.0) + 0.4;
+                let along = face.extent_metres[0].max(-100.0) + 0.4;
                 let place = |across: f64| {
                     let mut at = DVec3::ZERO;
                     (at[face.axis], at[1 - face.axis]) = (across, along);
@@ -212,7 +213,7 @@ mod tests {
                 for step in [DVec3::X * 4.0, DVec3::Y * 4.0] {
                     let crosses = cut.owner_of(&ground, at) != cut.owner_of(&ground, at + step);
                     let face = seams.nearest(at + 0.5 * step, 2.0);
-                    // A step of 4 m at odd places crosses at most one border of 8 m squares.
+                    // A step of 4 m at odd coordinates crosses at most one border of 8 m squares.
                     prop_assert!(!crosses || face.is_some());
                 }
             }

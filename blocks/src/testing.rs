@@ -1,11 +1,11 @@
-//! Captures for the tests of this crate, made without randomness.
+//! Deterministic captures for the tests of this crate.
 
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use scene::{Camera, Capture, Pinhole, Rigid, SparsePoints, View};
 
 use crate::ground::Ground;
 
-/// A root of 64 m with its corner at the origin, and nothing far.
+/// A root of 64 m with its corner at the origin, without background.
 pub(crate) fn ground() -> Ground {
     Ground {
         ground_from_world: DQuat::IDENTITY,
@@ -16,15 +16,15 @@ pub(crate) fn ground() -> Ground {
     }
 }
 
-/// Counter-based numbers in [0, 1).
+/// A counter-based random number in [0, 1).
 pub(crate) fn noise(counter: u64) -> f64 {
     let mut z = counter.wrapping_add(0x9e37_79b9_7f4a_7c15).wrapping_mul(0xbf58_476d_1ce4_e5b9);
     z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
     ((z ^ (z >> 31)) >> 11) as f64 / (1u64 << 53) as f64
 }
 
-/// A camera at `eye` looking at `target`, image up along `up`.
-pub(crate) fn look(eye: DVec3, target: DVec3, up: DVec3) -> Camera {
+/// A camera at `eye` that faces `target`, with image-up along `up`.
+pub(crate) fn look_at(eye: DVec3, target: DVec3, up: DVec3) -> Camera {
     let z = (target - eye).normalize();
     let x = z.cross(up).normalize();
     let rotation = DQuat::from_mat3(&DMat3::from_cols(x, z.cross(x), z)).inverse();
@@ -34,7 +34,7 @@ pub(crate) fn look(eye: DVec3, target: DVec3, up: DVec3) -> Camera {
     }
 }
 
-/// A capture of these cameras and points; with `tracks`, a point is tracked by the views it projects into.
+/// A capture of these cameras and points. With `tracks`, each point has a track of all views it projects into.
 pub(crate) fn capture(cameras: &[Camera], positions: Vec<DVec3>, tracks: bool) -> Capture {
     let views: Vec<View> = (cameras.iter().enumerate())
         .map(|(i, &camera)| View { name: format!("{i:05}.jpg"), camera, mips: Vec::new(), masked: false })
@@ -55,14 +55,14 @@ pub(crate) fn capture(cameras: &[Camera], positions: Vec<DVec3>, tracks: bool) -
     Capture { views, points, geo_origin: None }
 }
 
-/// A survey from the air: `n × n` nadir cameras 60 m above a square of `side` metres with `points` points, all heading
-/// north (so that the mean image-up vector is horizontal, a trap).
+/// An aerial survey: `n × n` nadir cameras 60 m above a square of `side` metres with `points` points. All cameras head north, so their
+/// mean image-up vector is horizontal.
 pub(crate) fn aerial(n: usize, side: f64, points: usize) -> Capture {
     let place = |i: usize| (i as f64 + 0.5) / n as f64 * side - 0.5 * side;
     let cameras: Vec<Camera> = (0..n * n)
         .map(|i| {
             let eye = DVec3::new(place(i % n), place(i / n), 60.0);
-            look(eye, eye - DVec3::Z, DVec3::Y)
+            look_at(eye, eye - DVec3::Z, DVec3::Y)
         })
         .collect();
     let at = |i: usize, k: u64| noise(3 * i as u64 + k) - 0.5;
@@ -70,10 +70,10 @@ pub(crate) fn aerial(n: usize, side: f64, points: usize) -> Capture {
     capture(&cameras, positions, true)
 }
 
-/// A drive along x between two walls, cameras looking ahead.
+/// A drive along x between two walls with forward-facing cameras.
 pub(crate) fn street(views: usize, points: usize) -> Capture {
     let cameras: Vec<Camera> = (0..views)
-        .map(|i| look(DVec3::new(i as f64 * 2.0, 0.0, 1.6), DVec3::new(i as f64 * 2.0 + 10.0, 0.0, 1.6), DVec3::Z))
+        .map(|i| look_at(DVec3::new(i as f64 * 2.0, 0.0, 1.6), DVec3::new(i as f64 * 2.0 + 10.0, 0.0, 1.6), DVec3::Z))
         .collect();
     let length = views as f64 * 2.0 + 30.0;
     let positions = (0..points)
@@ -85,8 +85,8 @@ pub(crate) fn street(views: usize, points: usize) -> Capture {
     capture(&cameras, positions, true)
 }
 
-/// The capture with everything in it turned.
-pub(crate) fn turned(mut capture: Capture, rotation: DQuat) -> Capture {
+/// The capture in a rotated world frame.
+pub(crate) fn rotated(mut capture: Capture, rotation: DQuat) -> Capture {
     for p in &mut capture.points.positions {
         *p = rotation * *p;
     }

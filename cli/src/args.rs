@@ -476,7 +476,7 @@ pub(crate) struct PruneCapture {
 }
 
 fn views_per_step() -> impl TypedValueParser<Value = u32> {
-    clap::value_parser!(u32).range(1..=i64::from(blocks::MOST_VIEWS_PER_STEP))
+    clap::value_parser!(u32).range(1..=i64::from(blocks::MAX_VIEWS_PER_STEP))
 }
 
 fn share(text: &str) -> Result<f64, String> {

@@ -5,7 +5,7 @@
 //! shows is resolved by the cut. There, splats are drawn in three ways, and each model is judged by its best:
 //! - classic, as they are;
 //! - thinned: classic, after taking out of each splat what a pixel of that mip blurs more than one of the full image
-//!   ([`train::blur`]: a block hands its splats on thickened by this, so that they can be drawn at full size);
+//!   ([`train::low_pass`]: a block hands its splats on thickened by this, so that they can be drawn at full size);
 //! - anti-aliased: with opacity compensated for the pixel's blur.
 
 use std::borrow::Cow;
@@ -18,7 +18,7 @@ use render::{Frame, Options};
 use scene::{BadInput, BlockId, Camera, Splats, column};
 use serde::Serialize;
 use train::TrainView;
-use train::blur::from_full_images;
+use train::low_pass::from_full_resolution;
 
 use crate::args::{EvalArgs, Level};
 use crate::commands::eval::{self, Figures};
@@ -230,7 +230,7 @@ impl Bench<'_> {
         let mut splats = Cow::Borrowed(splats);
         if way.thinned && way.mip > 0 {
             let at_mip = TrainView { view, mip: way.mip, rect: camera.full(), camera: view_of.camera };
-            from_full_images(splats.to_mut(), &[at_mip]);
+            from_full_resolution(splats.to_mut(), &[at_mip]);
         }
         let frame = self.renderer.forward(&splats, None, &camera, &options);
         eval::measure(&view_of.name, &frame.colour, &photo, None)

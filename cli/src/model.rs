@@ -17,7 +17,7 @@ use std::path::{Path, PathBuf};
 use blocks::{Cut, Ground, Plan};
 use scene::{ArtefactId, BadInput, BlockId, CodecError, Exposures, GeoOrigin, Splats, frame, ply, spz};
 use serde::{Deserialize, Serialize};
-use store::file::{Saving, save};
+use store::file::{AtomicFile, save};
 use store::{BlockingStore, Store};
 use tempfile::TempDir;
 
@@ -179,7 +179,7 @@ pub(crate) fn write(
 
     let mut order: Vec<BlockId> = blocks.iter().map(|of| of.block).collect();
     order.sort_unstable();
-    let mut merged = Saving::begin(&out.join(MERGED_FILE))?;
+    let mut merged = AtomicFile::create(&out.join(MERGED_FILE))?;
     let header = ply::header(count, sh_degree, comments(plan.settings.antialiased));
     merged.write(&header)?;
     let mut bytes = header.len() as u64;
@@ -188,7 +188,7 @@ pub(crate) fn write(
         merged.write(&rows)?;
         bytes += rows.len() as u64;
     }
-    merged.finish()?;
+    merged.commit()?;
 
     if let Some(id) = exposures {
         save(&folder.join(EXPOSURES_FILE), &store.get(id)?)?;
@@ -258,7 +258,7 @@ pub(crate) fn read(path: &Path) -> Result<Model, BadInput> {
 fn read_trained(folder: &Path) -> Result<Model, BadInput> {
     let (manifest, plan) = read_plan(folder)?;
     let parts = plan.tasks.iter().map(|task| Ok((task.block, read_block(folder, task.block)?)));
-    let splats = blocks::sew(&plan.leaves(), &plan.ground, parts)?;
+    let splats = blocks::merge_cut(&plan.leaves(), &plan.ground, parts)?;
     let out = folder.parent().filter(|_| folder.ends_with("model")).unwrap_or(folder);
     let exposures = match manifest.exposures {
         Some(_) => {
@@ -284,7 +284,7 @@ impl Tree {
     /// What a cut shows.
     pub(crate) fn sewn(&self, cut: &Cut) -> Splats {
         let parts = self.results.iter().map(|(&block, splats)| Ok((block, splats)));
-        blocks::sew(cut, &self.plan.ground, parts).unwrap_or_else(|never: Infallible| match never {})
+        blocks::merge_cut(cut, &self.plan.ground, parts).unwrap_or_else(|never: Infallible| match never {})
     }
 }
 

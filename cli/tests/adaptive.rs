@@ -5,7 +5,7 @@ mod common;
 use blocks::{Plan, Task};
 use city::CitySettings;
 use common::json_of;
-use dataset::rehearse::{self, Settings};
+use dataset::synth::{self, Settings};
 use scene::{BlockId, Splats, frame};
 
 #[test]
@@ -14,7 +14,7 @@ fn a_plain_stays_coarse_beside_houses() {
     let at = folder.path();
     let small = common::small(72, 144, 96);
     let city = Settings { city: CitySettings { plain: 0.5, ..small.city }, ..small };
-    rehearse::write(&at.join("city"), &city, &|_, _, _| ()).unwrap();
+    synth::write(&at.join("city"), &city, &|_, _, _| ()).unwrap();
     let train = |out: &str, words: &[&str]| {
         let job =
             ["train", "city", "--steps", "2000", "--budget", "5000", "--levels", "2", "--tolerance-db", "0", "--out"];
@@ -33,7 +33,7 @@ fn a_plain_stays_coarse_beside_houses() {
     let owned = |splats: &Splats, task: &Task| {
         let place = |i: usize| splats.mean(i).as_dvec3();
         let of_block =
-            |i: &usize| plan.ground.owns(task.block, place(*i)) && task.lender(&plan.ground, place(*i)).is_none();
+            |i: &usize| plan.ground.owns(task.block, place(*i)) && task.donor(&plan.ground, place(*i)).is_none();
         (0..splats.len()).filter(of_block).count()
     };
     let (mut settled, mut refined) = (Vec::new(), Vec::new());

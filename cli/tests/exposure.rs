@@ -8,7 +8,7 @@ use std::process::{Command, Output};
 
 use blocks::Plan;
 use city::CitySettings;
-use dataset::rehearse::{self, Settings};
+use dataset::synth::{self, Settings};
 use scene::{ArtefactId, BlockId, Capture, Exposures, Splats, frame, ply};
 use serde_json::Value;
 
@@ -41,7 +41,7 @@ fn expose_photos(images: &Path) -> Vec<f64> {
 
 /// Of the splats that are far, their rows as bits.
 fn far(splats: &Splats, plan: &Plan) -> Vec<Vec<u32>> {
-    let is_far = |&i: &usize| plan.ground.is_far(splats.mean(i).as_dvec3());
+    let is_far = |&i: &usize| plan.ground.is_background(splats.mean(i).as_dvec3());
     let row = |i: usize| splats.columns().iter().map(|column| column[i].to_bits()).collect();
     let mut rows: Vec<_> = (0..splats.len()).filter(is_far).map(row).collect();
     rows.sort();
@@ -53,7 +53,7 @@ fn exposures_and_the_sky_come_from_the_root_and_stay_as_they_are() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
     let settings = common::small(32, 80, 60);
-    rehearse::write(&at.join("city"), &settings, &|_, _, _| ()).unwrap();
+    synth::write(&at.join("city"), &settings, &|_, _, _| ()).unwrap();
     let gains = expose_photos(&at.join("city/images"));
     let train = |out: &str, more: &[&str]| {
         let job = ["train", "city", "--out", out, "--steps", "1500", "--budget", "4000", "--tolerance-db", "0"];
@@ -121,7 +121,7 @@ fn exposures_and_the_sky_come_from_the_root_and_stay_as_they_are() {
     assert!(pruned.status.success() && !said(&pruned).contains("exposures"), "{}", said(&pruned));
     assert_eq!(bytes("pruned/model/exposures.plat"), file);
     let other = Settings { city: CitySettings { seed: 4, ..settings.city }, ..settings };
-    rehearse::write(&at.join("other"), &other, &|_, _, _| ()).unwrap();
+    synth::write(&at.join("other"), &other, &|_, _, _| ()).unwrap();
     let pruned = prune("other", "by_others");
     assert!(said(&pruned).contains("exposures are left out"), "{}", said(&pruned));
 

@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::pin::Pin;
 
-use blocks::{Plan, Price};
+use blocks::{Plan, StepCost};
 use cluster::{Failure, FailureKind, JobSpec, Offer, TaskIndex, TaskNode};
 use proto::control_request::What;
 use proto::coordinator_server::Coordinator;
@@ -149,7 +149,7 @@ fn dag_of(plan: &Plan) -> Result<Vec<TaskNode>, CodecError> {
 /// About the CPU milliseconds that a task takes. What counts are the ratios between tasks; speeds are learnt in the same measure.
 fn work_of(task: &blocks::Task) -> u64 {
     // `as` saturates: a plan may ask for any number of steps.
-    (f64::from(task.steps) * Price::of(task).total() * Price::CPU_SECONDS * 1e3) as u64
+    (f64::from(task.steps) * StepCost::of(task).total() * StepCost::CPU_SECONDS * 1e3) as u64
 }
 
 fn store_status(error: StoreError) -> Status {

@@ -44,8 +44,8 @@ fn plan() -> Plan {
             budget: 1,
             steps: 1,
             rho_metres: 1.0,
-            drawn: 0,
-            context_drawn: 0,
+            visible_splats: 0,
+            visible_context_splats: 0,
             memory_bytes: 0,
         }
     };
@@ -319,10 +319,10 @@ async fn a_standby_says_who_leads_and_follows_a_leader_that_leaves() {
     // It was told: an hour's patience is not needed.
     let mut standby = standby.leads().await;
     assert_eq!(standby.status(job).await.ready, 1);
-    let (epoch, lease) = store.newest("leader").await.unwrap().unwrap();
+    let (epoch, lease) = store.newest_record("leader").await.unwrap().unwrap();
     let lease = Leader::from_bytes(epoch, &lease).unwrap();
     assert_eq!((lease.epoch, &lease.address, lease.released), (2, &standby.address, false));
-    assert_eq!(store.names("leader").await.unwrap(), ["leader/000001.json", "leader/000002.json"]);
+    assert_eq!(store.record_names("leader").await.unwrap(), ["leader/000001.json", "leader/000002.json"]);
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -33,8 +33,8 @@ fn plan() -> Plan {
             budget: 1,
             steps: 1,
             rho_metres: 1.0,
-            drawn: 0,
-            context_drawn: 0,
+            visible_splats: 0,
+            visible_context_splats: 0,
             memory_bytes: 0,
         }
     };

@@ -8,7 +8,7 @@ use blocks::{Plan, PlanSettings, Task, ViewUse};
 use dataset::windows::WindowReader;
 use glam::Vec3;
 use scene::{BlockId, Capture, Exposures, Splats};
-use train::importance::Views;
+use train::importance::EvaluationViews;
 use train::prune::{self, Pruning};
 use train::{Backend, Recipe, TrainError, TrainView};
 
@@ -176,7 +176,7 @@ impl Block<'_> {
         }
         let clock = Stopwatch::start();
         let mut next_checkpoint = self.trainer.options.checkpoint_seconds;
-        let (mut splats, exposures) = train::train_on(job, from, &mut |mut now| {
+        let (mut splats, exposures) = train::train_from(job, from, &mut |mut now| {
             metrics.steps.inc();
             let (seconds, last) = (clock.wall_seconds(), now.step == now.steps);
             // The last one is what pruning begins with.
@@ -221,14 +221,14 @@ impl Block<'_> {
                 metrics.steps.inc();
                 late = over();
                 // Once more at the end, with what pruning chose.
-                let (step, healing) = (trained + now.step.min(now.steps - 1), &mut now.healing);
-                let due = due(step, healing.views, false);
-                if due.is_some() || healing.step == healing.steps {
-                    loss = healing.loss().unwrap_or(f64::NAN);
+                let (step, recovery) = (trained + now.step.min(now.steps - 1), &mut now.recovery);
+                let due = due(step, recovery.views, false);
+                if due.is_some() || recovery.step == recovery.steps {
+                    loss = recovery.loss().unwrap_or(f64::NAN);
                 }
                 let told = due.is_none_or(|evaluate| {
-                    let count = healing.count();
-                    tell(step, loss, count, if evaluate { healing.splats() } else { None }, false)
+                    let count = recovery.count();
+                    tell(step, loss, count, if evaluate { recovery.splats() } else { None }, false)
                 });
                 going(told && !late)
             })
@@ -278,7 +278,7 @@ impl Block<'_> {
         if self.task.parent.is_some() || settings.residual == 0.0 || self.plan.tasks.len() == 1 {
             return Ok(None);
         }
-        let all = Views { views, context: None, antialiased: settings.antialiased, exposures, source: self.reader };
+        let all = EvaluationViews { views, context: None, antialiased: settings.antialiased, exposures, source: self.reader };
         refine::residual(all, splats)
     }
 
@@ -286,7 +286,7 @@ impl Block<'_> {
     /// depend on the resolution.
     pub(crate) fn handed_on(&self, mut splats: Splats, views: &[TrainView]) -> Splats {
         if !self.plan.settings.antialiased {
-            train::blur::to_full_images(&mut splats, views);
+            train::low_pass::to_full_resolution(&mut splats, views);
         }
         splats
     }
@@ -309,7 +309,7 @@ impl Block<'_> {
         let own = siblings.iter().position(|t| t.block == task.block).map_or(0, |i| counts[i]);
         let of_level = plan.tasks.iter().filter(|t| t.block.level == task.block.level).map(|t| u64::from(t.budget));
         let of_level = of_level.sum::<u64>().max(1);
-        let is_far = |root: &Splats| (0..root.len()).filter(|&i| plan.ground.is_far(root.mean(i).as_dvec3())).count();
+        let is_far = |root: &Splats| (0..root.len()).filter(|&i| plan.ground.is_background(root.mean(i).as_dvec3())).count();
         let far = results.get(&BlockId::ROOT).map_or(0, is_far) as u64;
         let total = total * (of_level - far.min(of_level / 2)) / of_level;
         (total * own / counts.iter().sum::<u64>().max(1)).max(1) as usize
@@ -332,7 +332,7 @@ impl Block<'_> {
         let Self { plan, reader, exposures_given: exposures, .. } = *self;
         let Some(all) = self.residual_given.filter(|_| plan.settings.residual > 0.0) else { return Ok(false) };
         let antialiased = plan.settings.antialiased;
-        let around = Views { views, context: start.1.as_ref(), antialiased, exposures, source: reader };
+        let around = EvaluationViews { views, context: start.1.as_ref(), antialiased, exposures, source: reader };
         let found = refine::residual_of_core(around, &start.0, counts)?;
         tracing::debug!(block = %self.task.block, found, all, "what its parent lacks, and what the root lacks");
         Ok(found.is_some_and(|found| found <= plan.settings.residual * all))
@@ -366,7 +366,7 @@ impl Block<'_> {
     /// Is this place a task's in the end? What is far is the root's.
     pub(crate) fn owns(&self, task: &Task, place: glam::DVec3) -> bool {
         let ground = &self.plan.ground;
-        ground.owns(task.block, place) && (task.parent.is_none() || !ground.is_far(place))
+        ground.owns(task.block, place) && (task.parent.is_none() || !ground.is_background(place))
     }
 
     /// Is this place the block's to train: in its halo, not far, and not in the core of a neighbour that is final already?
@@ -375,7 +375,7 @@ impl Block<'_> {
         let owner = cut.owner_of(ground, place);
         self.task.parent.is_none()
             || (ground.in_halo(self.task.block, place)
-                && !ground.is_far(place)
+                && !ground.is_background(place)
                 && owner.is_none_or(|b| b.level < self.task.block.level))
     }
 }
@@ -386,12 +386,12 @@ fn has_diverged(skipped: u32, step: u32) -> bool {
     skipped > FEW && skipped > step / 20
 }
 
-const _: () = assert!(blocks::MOST_VIEWS_PER_STEP == train::MOST_VIEWS_PER_STEP);
+const _: () = assert!(blocks::MAX_VIEWS_PER_STEP == train::MAX_VIEWS_PER_STEP);
 
 /// The recipe of a block's level: a child starts from splats that fit already, one mip coarser.
 pub(crate) fn recipe_of(settings: &PlanSettings, task: &Task) -> Recipe {
     let from_points = task.parent.is_none();
     let recipe = if from_points { Recipe::default() } else { Recipe::refinement() };
     let recipe = Recipe { views_per_step: settings.views_per_step, ..recipe };
-    if settings.residual > 0.0 { recipe } else { recipe.unmeasured(from_points) }
+    if settings.residual > 0.0 { recipe } else { recipe.fixed_schedule(from_points) }
 }

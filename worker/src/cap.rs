@@ -176,7 +176,7 @@ fn rehearse(job: &Job, cap: &Cap, until: f64) -> Pace {
             _ => 1.0 - coarse.iter().sum::<f32>(),
         };
         let coarse = vec![1.0; coarser];
-        let mut recipe = Recipe { coarse, closer_at: 0.0, views_per_step: 1, sh_from: [0.0; 3], ..job.recipe.clone() };
+        let mut recipe = Recipe { coarse, detail_factor: 0.0, views_per_step: 1, sh_from: [0.0; 3], ..job.recipe.clone() };
         // Never begins.
         recipe.growth.from = 2.0;
         let steps = 2 * count as u32;
@@ -241,8 +241,8 @@ mod tests {
             budget: 1000,
             steps: steps[i],
             rho_metres: 1.0,
-            drawn: 1000,
-            context_drawn: 0,
+            visible_splats: 1000,
+            visible_context_splats: 0,
             memory_bytes: 0,
         };
         Plan {

@@ -1,12 +1,12 @@
 //! What a plan will take, before anything runs. An estimate: no result depends on it.
 //!
-//! A training step is priced as in the plan ([`Price`]). Pixels and splats change over a task's schedule (coarse mips first, growth
+//! A training step is priced as in the plan ([`StepCost`]). Pixels and splats change over a task's schedule (coarse mips first, growth
 //! towards the budget), which the means here follow. Other machines are as much slower or faster as they are; one and the same
 //! was 1.4 times faster at another hour.
 
 use std::collections::BTreeSet;
 
-use blocks::{Plan, Price, Task};
+use blocks::{Plan, StepCost, Task};
 use scene::BlockId;
 use serde::Serialize;
 use train::prune::{self, Pruning};
@@ -59,11 +59,11 @@ pub(crate) fn parents(plan: &Plan) -> BTreeSet<BlockId> {
 /// What a task will take on the CPU backend, CPU seconds.
 pub(crate) fn cpu_seconds(plan: &Plan, task: &Task, leaf: bool) -> f64 {
     let settings = &plan.settings;
-    let price = Price::of(task);
+    let price = StepCost::of(task);
     let recipe = recipe_of(settings, task);
     let first = match task.parent {
         Some(_) => INHERITED,
-        None => (f64::from(task.points.min(plan.first_splats(task))) / f64::from(task.budget.max(1))).max(0.01),
+        None => (f64::from(task.points.min(blocks::initial_splats(plan, task))) / f64::from(task.budget.max(1))).max(0.01),
     };
     // Geometric growth from `first` to 1 until its end; an inner block may begin with more than it asks for.
     let until = f64::from(recipe.growth.until);
@@ -77,8 +77,8 @@ pub(crate) fn cpu_seconds(plan: &Plan, task: &Task, leaf: bool) -> f64 {
     mean_pixels += left;
     let seconds = |pixels: f64, splats: f64| {
         // What is shown is of whenever there are most splats: a root that begins with more than its budget shows no more than that.
-        let splats = price.shown * splats.min(1.0) + price.trained * splats;
-        Price::CPU_SECONDS * (price.pixels * pixels / MEAN_PIXELS + splats + price.context)
+        let splats = price.visible * splats.min(1.0) + price.trained * splats;
+        StepCost::CPU_SECONDS * (price.pixels * pixels / MEAN_PIXELS + splats + price.context)
     };
     let step = seconds(mean_pixels, mean_splats);
     let read = PER_READ_PIXEL * task.window_pixels() as f64;
@@ -86,7 +86,7 @@ pub(crate) fn cpu_seconds(plan: &Plan, task: &Task, leaf: bool) -> f64 {
         return read + f64::from(task.steps) * step;
     }
     let trained = f64::from(prune::steps_before(task.steps));
-    let looks = Pruning::within(settings.tolerance_db).looks(task.steps, task.views.len());
+    let looks = Pruning::within(settings.tolerance_db).evaluations(task.steps, task.views.len());
     let healing = f64::from(task.steps) - trained + LOOKING * looks as f64;
     read + trained * step + healing * seconds(1.0, PRUNED)
 }

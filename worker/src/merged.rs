@@ -69,7 +69,7 @@ impl Finished {
             let mut all: BTreeMap<BlockId, &Splats> = parts.iter().map(|(&of, part)| (of, part)).collect();
             all.insert(block, splats);
             let all = all.into_iter().map(Ok);
-            blocks::sew(&cut, &plan.ground, all).unwrap_or_else(|never: Infallible| match never {})
+            blocks::merge_cut(&cut, &plan.ground, all).unwrap_or_else(|never: Infallible| match never {})
         })
     }
 
@@ -217,8 +217,8 @@ mod tests {
             test_views: Vec::new(),
             points: 0,
             budget: 1,
-            drawn: 0,
-            context_drawn: 0,
+            visible_splats: 0,
+            visible_context_splats: 0,
             steps: 1,
             rho_metres: 1.0,
             memory_bytes: 0,

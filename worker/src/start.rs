@@ -31,9 +31,9 @@ impl Block<'_> {
             let rows: Vec<usize> = (0..points.len()).filter(|&i| keep(points.positions[i])).collect();
             let places: Vec<glam::DVec3> = rows.iter().map(|&i| points.positions[i]).collect();
             // There may be more points than splats are wanted.
-            let budget = plan.first_splats(task) as usize;
+            let budget = blocks::initial_splats(plan, task) as usize;
             let most = budget.saturating_sub(backdrop.len()).max(budget / 2).max(1);
-            let chosen = train::init::thinned(&places, most);
+            let chosen = train::init::subsample(&places, most);
             let points = SparsePoints {
                 positions: chosen.iter().map(|&i| places[i]).collect(),
                 colours: chosen.iter().map(|&i| points.colours[rows[i]]).collect(),
@@ -47,10 +47,10 @@ impl Block<'_> {
         let cut = task.context_cut();
         let mut initial = Splats::new(sh_degree);
         let mut context = Splats::new(sh_degree);
-        let lender = |place: Vec3| task.lender(&plan.ground, place.as_dvec3());
+        let lender = |place: Vec3| task.donor(&plan.ground, place.as_dvec3());
         let for_mips = |mut splats: Splats| {
             if !plan.settings.antialiased {
-                train::blur::from_full_images(&mut splats, views);
+                train::low_pass::from_full_resolution(&mut splats, views);
             }
             splats
         };
@@ -61,8 +61,8 @@ impl Block<'_> {
             initial.append(&for_mips(splats.filter(|i| inside(i) && lender(splats.mean(i)).is_none())));
             // Only what a window can show is worth keeping in memory.
             let frozen = splats.filter(|i| !inside(i));
-            let seen = train::sight::finest(&frozen, views, 0.2);
-            context.append(&for_mips(frozen.filter(|i| seen[i].is_seen())));
+            let seen = train::visibility::finest_pixels(&frozen, views, 0.2);
+            context.append(&for_mips(frozen.filter(|i| seen[i].is_visible())));
         }
         let context = (!context.is_empty()).then_some(context);
         Ok((initial, context))

@@ -1,0 +1,346 @@
+//! Tests of whole plans.
+
+use std::collections::BTreeSet;
+
+use glam::DVec3;
+use scene::{BlockId, Camera};
+
+use super::*;
+use crate::budgets::BLOCK_SPLATS;
+use crate::cost::epoch_cost;
+use crate::lint::{Severity, lint};
+use crate::plan::Task;
+use crate::testing::{aerial, capture, look_at, noise, street};
+
+fn settings(mode: Mode, levels: Option<u8>) -> PlanSettings {
+    PlanSettings { mode, levels, steps: 4000, budget: 50_000, ..PlanSettings::default() }
+}
+
+fn plan_of(capture: &Capture, mode: Mode, levels: Option<u8>) -> Plan {
+    let plan = plan(capture, ArtefactId::of(b"capture"), &settings(mode, levels), "cpu").unwrap();
+    let errors: Vec<String> =
+        (lint(&plan, capture).iter()).filter(|f| f.severity == Severity::Error).map(ToString::to_string).collect();
+    assert!(errors.is_empty(), "{errors:?}");
+    plan
+}
+
+#[test]
+fn a_tree_is_complete_and_ordered() {
+    let capture = aerial(8, 300.0, 8000);
+    let plan = plan_of(&capture, Mode::Tree, Some(2));
+    assert_eq!((plan.levels, plan.tasks.len()), (2, 1 + 4 + 16));
+    assert_eq!(plan.tasks[0].block, BlockId::ROOT);
+    assert!(plan.tasks[0].parent.is_none() && plan.tasks[0].context.is_empty());
+    for (coarse, fine) in plan.rho_metres.iter().zip(&plan.rho_metres[1..]) {
+        assert!((coarse / fine - 2.0).abs() < 1e-12);
+    }
+    for task in &plan.tasks[1..] {
+        assert_eq!(task.parent, task.block.parent());
+        assert!(task.views.iter().all(|v| !Capture::is_test(v.view as usize, 8)));
+        assert_eq!(plan.task(task.block), Some(task));
+    }
+    let mips: Vec<u8> = [0, 1, 5].map(|i: usize| plan.tasks[i].views[0].mip).to_vec();
+    assert_eq!(mips, [2, 1, 0]);
+    assert!(lint(&plan, &capture).is_empty(), "{:?}", lint(&plan, &capture));
+}
+
+#[test]
+fn automatic_levels_follow_resolution_views_and_points() {
+    // 300 m at 0.12 m a pixel are 2,500 pixels: one division leaves at least 768 per leaf.
+    assert_eq!(plan_of(&aerial(12, 300.0, 20_000), Mode::Tree, None).levels, 1);
+    assert_eq!(plan_of(&aerial(12, 300.0, 1000), Mode::Tree, None).levels, 0, "too few points");
+    assert_eq!(plan_of(&aerial(4, 300.0, 20_000), Mode::Tree, None).levels, 0, "too few views");
+    assert_eq!(plan_of(&aerial(8, 60.0, 20_000), Mode::Tree, None).levels, 0, "too small");
+}
+
+#[test]
+fn automatic_levels_are_worth_their_work_or_needed() {
+    // Views along a street observe all blocks ahead.
+    let capture = street(120, 20_000);
+    let levels = |budget: u32| {
+        let settings = PlanSettings { budget, ..settings(Mode::Tree, None) };
+        plan(&capture, ArtefactId::of(b"capture"), &settings, "cpu").unwrap().levels
+    };
+    assert_eq!([50_000, 2_000_000].map(levels), [0, 1]);
+}
+
+/// From the air, photos are looked at about as often at every height as one block would look at them.
+#[test]
+fn heights_get_work_for_what_they_are_the_first_to_see() {
+    let capture = aerial(12, 300.0, 20_000);
+    let plan = plan_of(&capture, Mode::Tree, Some(2));
+    let epochs = |level: u8| {
+        let of_level = plan.tasks.iter().filter(|t| t.block.level == level);
+        let (steps, views) = of_level.fold((0, 0), |(s, v), t| (s + t.steps, v + t.views.len()));
+        f64::from(steps) / views as f64
+    };
+    let whole = 4000.0 / plan.tasks[0].views.len() as f64;
+    let ratios = [0, 1, 2].map(|level| epochs(level) / whole);
+    assert!(ratios[0] > 0.5 && ratios[1] > ratios[2] && ratios[2] > 0.2, "{ratios:?}");
+}
+
+#[test]
+fn budgets_add_up_to_the_merged_model() {
+    for (levels, mode) in [(0, Mode::Whole), (0, Mode::Tree), (1, Mode::Tree), (2, Mode::Tree), (2, Mode::Flat)] {
+        let plan = plan_of(&aerial(8, 300.0, 8000), mode, Some(levels));
+        let finest: u64 = plan.tasks.iter().filter(|t| t.block.level == plan.levels).map(|t| u64::from(t.budget)).sum();
+        assert_eq!(plan.tasks.iter().filter(|t| t.block.level == levels).count(), 1 << (2 * levels));
+        assert_eq!(finest, 50_000, "{mode:?} {levels}");
+        assert!(plan.tasks.iter().all(|t| t.budget > 0 && t.steps > 0 && t.memory_bytes > 0));
+    }
+}
+
+#[test]
+fn all_modes_cost_about_the_same() {
+    let capture = aerial(8, 300.0, 8000);
+    let work = |plan: &Plan| -> f64 {
+        let epochs = |t: &Task| f64::from(t.steps) / t.views.len() as f64;
+        plan.tasks.iter().map(|t| epochs(t) * epoch_cost(t)).sum()
+    };
+    let whole = plan_of(&capture, Mode::Whole, None);
+    assert_eq!(whole.tasks[0].steps, 4000);
+    for (mode, levels) in [(Mode::Tree, 0), (Mode::Tree, 1), (Mode::Tree, 2), (Mode::Flat, 1), (Mode::Flat, 2)] {
+        let plan = plan_of(&capture, mode, Some(levels));
+        let ratio = work(&plan) / work(&whole);
+        assert!((0.95..1.10).contains(&ratio), "{mode:?} {levels}: {ratio}");
+    }
+}
+
+#[test]
+fn finished_neighbours_are_donors_along_their_faces() {
+    let plan = plan_of(&aerial(8, 300.0, 8000), Mode::Tree, Some(1));
+    let ground = &plan.ground;
+    let block = |x, y| BlockId { level: 1, x, y };
+    let donor = |of: BlockId, x: f64, y: f64| {
+        // Relative to the centre of the root, in edges of its children.
+        let at = ground.core(BlockId::ROOT).centre() + glam::DVec2::new(x, y) * ground.core_edge_metres(1);
+        plan.task(of).unwrap().donor(ground, ground.to_world(at.extend(0.0)))
+    };
+    // A block of the second sweep has two finished neighbours here, a block of the first none.
+    let last = block(1, 0);
+    assert_eq!(donor(last, 0.05, -0.5), Some(block(0, 0)));
+    assert_eq!(donor(last, 0.5, -0.05), Some(block(1, 1)));
+    assert_eq!(donor(last, 0.05, -0.08), Some(block(0, 0)), "the nearest one");
+    for (x, y) in [(0.11, -0.5), (0.5, -0.11), (0.9, -0.9), (-0.05, -0.5), (0.5, 0.05), (f64::NAN, -0.5)] {
+        assert_eq!(donor(last, x, y), None, "{x} {y}");
+    }
+    assert_eq!(donor(block(1, 1), 0.05, 0.5), None);
+    assert_eq!(donor(block(0, 0), -0.05, -0.5), None);
+    assert_eq!(donor(BlockId::ROOT, 0.05, 0.5), None);
+}
+
+#[test]
+fn splats_beyond_the_capacity_of_a_block_do_not_raise_the_work() {
+    // Small photos, so that splats dominate the cost.
+    let mut capture = aerial(8, 300.0, 8000);
+    capture.views.iter_mut().for_each(|view| view.camera = view.camera.mip(2));
+    let work = |budget: u32| -> f64 {
+        let settings = PlanSettings { budget, ..settings(Mode::Tree, Some(2)) };
+        let plan = plan(&capture, ArtefactId::of(b"capture"), &settings, "cpu").unwrap();
+        plan.tasks.iter().map(|t| f64::from(t.steps) / t.views.len() as f64 * epoch_cost(t)).sum()
+    };
+    let [few, many, more] = [BLOCK_SPLATS / 16, BLOCK_SPLATS, 4 * BLOCK_SPLATS].map(work);
+    assert!(many > 1.5 * few && (0.95..1.05).contains(&(more / many)), "{few} {many} {more}");
+}
+
+#[test]
+fn whole_and_flat_plans_have_the_expected_tasks() {
+    let capture = street(40, 4000);
+    let whole = plan_of(&capture, Mode::Whole, Some(3));
+    assert_eq!((whole.levels, whole.tasks.len()), (0, 1));
+    let root = &whole.tasks[0];
+    assert_eq!((root.views.len(), root.test_views.len()), (35, 5));
+    assert!(root.views.iter().all(|v| v.mip == 0 && (v.window.width, v.window.height) == (640, 480)));
+    let flat = plan_of(&capture, Mode::Flat, Some(2));
+    assert!(flat.tasks.iter().all(|t| t.block.level == 2 && t.parent.is_none() && t.context.is_empty()));
+    // A street crosses only some of the leaves. The area of the others has an owner too.
+    assert!(flat.tasks.len() < 16);
+    assert!(flat.leaves().owner_of(&flat.ground, DVec3::new(-1e6, 1e6, 0.0)).is_some());
+}
+
+#[test]
+fn areas_without_a_task_belong_to_their_ancestor() {
+    let capture = street(40, 4000);
+    let plan = plan_of(&capture, Mode::Tree, Some(3));
+    let (leaves, tasks) = (plan.leaves(), plan.tasks.iter().map(|t| t.block).collect::<BTreeSet<_>>());
+    for i in 0..2000 {
+        let at = DVec3::new(noise(2 * i) * 300.0 - 100.0, noise(2 * i + 1) * 300.0 - 150.0, 0.0);
+        let cell = plan.ground.block_at(plan.levels, at);
+        let deepest = (0..=plan.levels).rev().map(|l| cell.ancestor(l)).find(|b| tasks.contains(b));
+        let deepest = if plan.ground.is_background(at) { Some(BlockId::ROOT) } else { deepest };
+        assert_eq!(leaves.owner_of(&plan.ground, at), deepest);
+    }
+    let owned: u64 = leaves.blocks().iter().filter_map(|&b| plan.task(b)).map(|t| u64::from(t.budget)).sum();
+    assert!(owned >= 50_000);
+}
+
+#[test]
+fn a_tree_too_deep_for_its_capture_is_reduced() {
+    let capture = aerial(4, 100.0, 600);
+    let plan = plan_of(&capture, Mode::Tree, Some(9));
+    assert!(plan.levels < 5);
+    assert!(lint(&plan, &capture).iter().any(|f| f.severity == Severity::Warning && f.message.contains("of 9 levels")));
+}
+
+#[test]
+fn plans_are_deterministic_and_round_trip() {
+    let capture = aerial(5, 150.0, 3000);
+    let plan = plan_of(&capture, Mode::Tree, Some(1));
+    assert_eq!(plan, plan_of(&capture, Mode::Tree, Some(1)));
+    assert_eq!(Plan::from_frame(&plan.to_frame()).unwrap(), plan);
+    let json = serde_json::to_string(&plan).unwrap();
+    let back: Plan = serde_json::from_str(&json).unwrap();
+    assert_eq!(back.id(), plan.id());
+    assert!(Plan::from_frame(&plan.to_frame()[..99]).is_err());
+    let mut other = plan.clone();
+    other.settings.seed = 1;
+    assert_ne!(other.id(), plan.id());
+    let mut broken = plan.clone();
+    broken.tasks.swap(0, 1);
+    assert!(Plan::from_frame(&broken.to_frame()).is_err());
+    for side in [0, u32::MAX] {
+        broken = plan.clone();
+        broken.tasks[0].views[0].window.width = side;
+        assert!(Plan::from_frame(&broken.to_frame()).is_err());
+    }
+    broken = plan;
+    broken.ground.edge_metres = f64::NAN;
+    assert!(Plan::from_frame(&broken.to_frame()).is_err());
+}
+
+/// Every capture gives a plan without lint errors or a `PlanError`, for every mode and depth.
+#[test]
+fn degenerate_captures_give_a_plan_or_an_error() {
+    let grid = |n: usize| (0..n).map(move |i| DVec3::new((i % 30) as f64, (i / 30) as f64, noise(i as u64)));
+    let above = |x: f64, y: f64| {
+        let eye = DVec3::new(x, y, 20.0);
+        look_at(eye, eye - DVec3::Z, DVec3::Y)
+    };
+    let line: Vec<Camera> = (0..30).map(|i| above(f64::from(i), 15.0)).collect();
+    let corner: Vec<Camera> = (0..30).map(|_| above(0.0, 0.0)).collect();
+    let islands: Vec<Camera> = (0..40).map(|i| above(f64::from(i % 2) * 5e4 + f64::from(i), 0.0)).collect();
+    let island_points =
+        (0..2000).map(|i| DVec3::new(f64::from(i % 2) * 5e4 + noise(i as u64) * 40.0, noise(i as u64 + 9) * 20.0, 0.0));
+    // A ring of cameras and of points with an empty centre.
+    let ring = |radius: f64, i: usize| {
+        let (sin, cos) = (f64::from(i as u32) * 0.618).sin_cos();
+        DVec3::new(radius * cos, radius * sin, noise(i as u64))
+    };
+    let around: Vec<Camera> = (0..60).map(|i| above(ring(200.0, i).x, ring(200.0, i).y)).collect();
+    let rim = |n: usize| (0..n).map(move |i| ring(190.0 + 20.0 * noise(3 * i as u64), i));
+    let captures = [
+        ("line", capture(&line, grid(900).collect(), true)),
+        ("corner", capture(&corner, grid(900).collect(), true)),
+        ("islands", capture(&islands, island_points.collect(), true)),
+        ("hole", capture(&around, rim(900).collect(), true)),
+        ("one view", capture(&line[..1], grid(900).collect(), true)),
+        ("two views", capture(&line[..2], grid(900).collect(), true)),
+        ("one spot", capture(&line, vec![DVec3::new(3.0, 15.0, 1.0); 500], true)),
+        ("one point", capture(&line, vec![DVec3::new(3.0, 15.0, 1.0)], true)),
+        ("no tracks", capture(&line, grid(900).collect(), false)),
+        ("no points", capture(&line, Vec::new(), false)),
+        ("nothing finite", capture(&line, vec![DVec3::NAN; 9], false)),
+        ("nothing seen", capture(&line, vec![DVec3::Z * 500.0; 9], false)),
+        ("huge", capture(&line, grid(900).map(|p| p * 1e300).collect(), false)),
+        ("nothing", Capture::default()),
+    ];
+    for (name, capture) in &captures {
+        for mode in [Mode::Tree, Mode::Flat, Mode::Whole] {
+            for levels in [None, Some(0), Some(1), Some(3), Some(MAX_LEVELS)] {
+                let id = ArtefactId::of(b"capture");
+                match plan(capture, id, &settings(mode, levels), "cpu") {
+                    Ok(plan) => {
+                        let findings = lint(&plan, capture);
+                        let error = findings.iter().find(|f| f.severity == Severity::Error);
+                        assert!(error.is_none(), "{name} {mode:?} {levels:?}: {}", findings[0]);
+                        let sane = |t: &Task| !t.views.is_empty() && t.steps < 1_000_000;
+                        let bad = plan.tasks.iter().find(|t| !sane(t));
+                        assert!(bad.is_none(), "{name} {mode:?} {levels:?}: {bad:?}");
+                        let svg = crate::draw(&plan, capture);
+                        assert!(!svg.contains("NaN") && !svg.contains("inf"), "{name}: {svg}");
+                    }
+                    Err(error) => assert!(
+                        ["one view", "no points", "nothing finite", "nothing seen", "huge", "nothing"].contains(name)
+                            || mode == Mode::Flat,
+                        "{name} {mode:?} {levels:?}: {error}"
+                    ),
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn crowded_leaves_are_split() {
+    let even = aerial(14, 300.0, 8000);
+    // A sixteenth of the area holds more points than all the rest.
+    let mut crowd = even.points.positions.clone();
+    let at = |i: u64, k: u64| noise(1_000_000 + 3 * i + k);
+    crowd.extend((0..24_000).map(|i| DVec3::new(-140.0 + 60.0 * at(i, 0), -140.0 + 60.0 * at(i, 1), 4.0 * at(i, 2))));
+    let cameras: Vec<Camera> = even.views.iter().map(|view| view.camera).collect();
+    let [even, crowded] = [even.points.positions, crowd].map(|points| {
+        let capture = capture(&cameras, points, true);
+        (plan_of(&capture, Mode::Tree, None), capture)
+    });
+    assert_eq!(even.0.levels, 1);
+    let (plan, capture) = crowded;
+    assert!(plan.levels > 1, "{}", plan.levels);
+    let split: BTreeSet<BlockId> = plan.tasks.iter().filter(|t| t.block.level == 2).filter_map(|t| t.parent).collect();
+    assert_eq!(split, BTreeSet::from([plan.ground.block_at(1, DVec3::new(-110.0, -110.0, 0.0))]));
+    // The children have the same resolution: only the work is divided.
+    assert_eq!(plan.rho_metres[1], plan.rho_metres[2]);
+    assert!(!lint(&plan, &capture).iter().any(|f| f.message.contains("coarser")), "{:?}", lint(&plan, &capture));
+    let [low, high] = epochs_of_leaves(&plan);
+    assert!(high < 1.1 * low, "{low} {high}");
+}
+
+#[test]
+fn areas_without_finer_views_stay_with_their_parent() {
+    // Pixels are small near the path. The far side has as many views, at eight times the distance.
+    let cameras: Vec<Camera> = (0..60)
+        .map(|i| {
+            let eye = DVec3::new(f64::from(i) * 5.0 - 150.0, -150.0, 30.0);
+            look_at(eye, eye + DVec3::new(0.0, 100.0, -20.0), DVec3::Z)
+        })
+        .collect();
+    let at = |i: u64, k: u64| noise(3 * i + k) - 0.5;
+    let points: Vec<DVec3> =
+        (0..20_000).map(|i| DVec3::new(300.0 * at(i, 0), 300.0 * at(i, 1), 4.0 * at(i, 2))).collect();
+    let plan = plan_of(&capture(&cameras, points, true), Mode::Tree, Some(3));
+    let rows = |level: u8| -> BTreeSet<u32> {
+        plan.tasks.iter().filter(|t| t.block.level == level).map(|t| t.block.y).collect()
+    };
+    assert!(rows(1).len() == 2 && rows(3).contains(&1), "{:?} {:?}", rows(1), rows(3));
+    assert!(!rows(3).contains(&7), "{:?}", rows(3));
+    // Views and points are not the limit: blocks of level 2, twice as coarse, exist farther out.
+    assert!(rows(2).last() > rows(3).last().map(|row| row / 2).as_ref(), "{:?} {:?}", rows(2), rows(3));
+    // Leaves of all levels get the same number of epochs.
+    let [low, high] = epochs_of_leaves(&plan);
+    assert!(high < 1.1 * low, "{low} {high}");
+}
+
+/// Minimum and maximum steps per view of tasks without children.
+fn epochs_of_leaves(plan: &Plan) -> [f64; 2] {
+    let parents: BTreeSet<_> = plan.tasks.iter().filter_map(|t| t.parent).collect();
+    let leaves = plan.tasks.iter().filter(|t| !parents.contains(&t.block));
+    leaves
+        .map(|t| f64::from(t.steps) / t.views.len() as f64)
+        .fold([f64::MAX, 0.0], |[low, high], v| [low.min(v), high.max(v)])
+}
+
+#[test]
+fn settings_out_of_range_are_refused() {
+    let capture = aerial(3, 60.0, 300);
+    for bad in [
+        PlanSettings { steps: 0, ..PlanSettings::default() },
+        PlanSettings { budget: 0, ..PlanSettings::default() },
+        PlanSettings { sh_degree: 4, ..PlanSettings::default() },
+        PlanSettings { levels: Some(17), ..PlanSettings::default() },
+    ] {
+        let error = plan(&capture, ArtefactId::of(b""), &bad, "cpu").unwrap_err();
+        assert!(matches!(error, PlanError::Setting { .. }), "{error}");
+    }
+    let all_test = PlanSettings { test_every: 1, ..PlanSettings::default() };
+    let error = plan(&capture, ArtefactId::of(b""), &all_test, "cpu").unwrap_err();
+    assert_eq!(error, PlanError::NoTrainViews { views: 9, usable: 9, test: 9 });
+}
