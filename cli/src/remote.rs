@@ -177,7 +177,7 @@ pub(crate) fn runtime() -> Result<Runtime, Failure> {
 /// The store of a coordinator, if it is the same from here.
 pub(crate) async fn shared_store(url: &str) -> Result<Store, Failure> {
     let store = Store::open(url)?;
-    match store.newest(proto::leader::FOLDER).await? {
+    match store.newest_record(proto::leader::FOLDER).await? {
         Some(_) => Ok(store),
         None => {
             let advice = "mount it here under the same path, or start the coordinator with a --store that all reach";

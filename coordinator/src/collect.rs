@@ -30,15 +30,15 @@ impl Leftovers {
         // First nobody finds them, then they go.
         for key in &self.keys {
             for folder in ["results", "checkpoints"] {
-                store.remove_name(&format!("{folder}/{key}")).await?;
+                store.remove_record(&format!("{folder}/{key}")).await?;
             }
         }
-        for name in store.names("").await? {
+        for name in store.record_names("").await? {
             if FOLDERS_WITHOUT_REFERENCES.iter().any(|folder| name.split('/').next() == Some(folder)) {
                 continue;
             }
             // Whatever the record means: 32 bytes that are an artefact's name refer to it.
-            for part in store.get_name(&name).await?.unwrap_or_default().windows(32) {
+            for part in store.get_record(&name).await?.unwrap_or_default().windows(32) {
                 if let Ok(id) = part.try_into() {
                     self.artefacts.remove(&ArtefactId(id));
                 }
@@ -64,18 +64,18 @@ mod tests {
         }
         let [plan, result, shared, ingested, checkpointed] = ids[..] else { panic!("five") };
         let (own, other) = (ArtefactId::of(b"own task"), ArtefactId::of(b"task of another"));
-        store.put_name(&format!("results/{own}"), result.0.to_vec().into()).await.unwrap();
-        store.put_name(&format!("checkpoints/{own}"), "state".into()).await.unwrap();
-        store.put_name(&format!("results/{other}"), shared.0.to_vec().into()).await.unwrap();
+        store.put_record(&format!("results/{own}"), result.0.to_vec().into()).await.unwrap();
+        store.put_record(&format!("checkpoints/{own}"), "state".into()).await.unwrap();
+        store.put_record(&format!("results/{other}"), shared.0.to_vec().into()).await.unwrap();
         let memo = [b"some bytes before ".as_slice(), &ingested.0, b" and after"].concat();
-        store.put_name("ingest/photos", memo.into()).await.unwrap();
-        store.put_name(&format!("checkpoints/{other}"), checkpointed.0.to_vec().into()).await.unwrap();
+        store.put_record("ingest/photos", memo.into()).await.unwrap();
+        store.put_record(&format!("checkpoints/{other}"), checkpointed.0.to_vec().into()).await.unwrap();
         let left = Leftovers { artefacts: ids.iter().copied().collect(), keys: BTreeSet::from([own]) };
         assert_eq!(left.clone().delete(&store).await.unwrap(), 3);
         for (id, stays) in [(plan, false), (result, false), (shared, true), (ingested, true), (checkpointed, false)] {
             assert_eq!(store.exists(id).await.unwrap(), stays, "{id}");
         }
-        let names = store.names("").await.unwrap();
+        let names = store.record_names("").await.unwrap();
         assert_eq!(names, [format!("checkpoints/{other}"), "ingest/photos".into(), format!("results/{other}")]);
         // Once more finds nothing that the first left: those that stay are still referred to.
         assert_eq!(left.delete(&store).await.unwrap(), 3);

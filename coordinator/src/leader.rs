@@ -59,7 +59,7 @@ async fn stand_by(
     let mut seen = None;
     let mut since = Instant::now();
     loop {
-        let lease = match store.newest(FOLDER).await {
+        let lease = match store.newest_record(FOLDER).await {
             Ok(newest) => {
                 let epoch = newest.as_ref().map_or(0, |(epoch, _)| *epoch);
                 let lease = newest.as_ref().map(|(epoch, bytes)| Leader::from_bytes(*epoch, bytes));
@@ -121,7 +121,7 @@ async fn lead(
     }
     let lease = ended?;
     let released = Leader { beat: u64::MAX, released: true, ..lease };
-    if let Err(error) = options.store.put_name(&released.name(), released.to_bytes().into()).await {
+    if let Err(error) = options.store.put_record(&released.name(), released.to_bytes().into()).await {
         tracing::warn!("the lease is left to run out: {error}");
     }
     Ok(())
@@ -155,14 +155,14 @@ async fn lead_with(
 
 /// Creates the lease of a new leader, and deletes those that nobody looks at any more.
 async fn announce(store: &Store, lease: &Leader) -> Result<(), ServeError> {
-    let created = store.create_name(&lease.name(), lease.to_bytes().into()).await.map_err(of_store(store))?;
-    if !created && store.get_name(&lease.name()).await.map_err(of_store(store))? != Some(lease.to_bytes().into()) {
+    let created = store.create_record(&lease.name(), lease.to_bytes().into()).await.map_err(of_store(store))?;
+    if !created && store.get_record(&lease.name()).await.map_err(of_store(store))? != Some(lease.to_bytes().into()) {
         // Its number is that of an epoch which nobody else can have; the state was moved away, or another one's lies here.
         let what = format!("the lease {} is there, of a coordinator with another state", lease.name());
         return Err(StateError::Damaged { store: store.url().into(), what }.into());
     }
     if let Some(old) = lease.epoch.checked_sub(LEASES_KEPT) {
-        store.remove_name(&name(old)).await.map_err(of_store(store))?;
+        store.remove_record(&name(old)).await.map_err(of_store(store))?;
     }
     Ok(())
 }
@@ -181,13 +181,13 @@ async fn beat(store: Store, mut lease: Leader, period: Duration, deposed: Cancel
             () = stop.cancelled() => return,
             _ = ticks.tick() => {}
         }
-        match store.newest(FOLDER).await {
+        match store.newest_record(FOLDER).await {
             Ok(Some((epoch, _))) if epoch > lease.epoch => return deposed.cancel(),
             Ok(_) => {}
             Err(error) => tracing::warn!("who leads cannot be read: {error}"),
         }
         lease.beat += 1;
-        if let Err(error) = store.put_name(&lease.name(), lease.to_bytes().into()).await {
+        if let Err(error) = store.put_record(&lease.name(), lease.to_bytes().into()).await {
             tracing::warn!("the lease cannot be renewed: {error}");
         }
     }

@@ -1,4 +1,4 @@
-//! The store for code that is not async: rayon threads, trainers, tests.
+//! A blocking wrapper of [`Store`] for code that is not async: rayon threads, trainers, tests.
 
 use std::future::Future;
 use std::ops::Range;
@@ -8,21 +8,25 @@ use futures::executor::block_on;
 use futures::future::try_join_all;
 use scene::ArtefactId;
 
+use crate::artefacts::Store;
+use crate::error::StoreError;
 use crate::open::Network;
-use crate::{Store, StoreError};
 
-/// A [`Store`] whose calls return when the work is done. On a thread without an async runtime a folder is read and
-/// written by that thread itself; on a thread of one, the runtime's pool for blocking work does it.
+/// A [`Store`] whose calls block until they are done. Local folders are read and written by the calling thread, or, if it
+/// belongs to an async runtime, by that runtime's blocking pool.
 #[derive(Debug, Clone)]
 pub struct BlockingStore {
     store: Store,
 }
 
-impl BlockingStore {
-    pub(crate) fn new(store: Store) -> Self {
-        Self { store }
+impl Store {
+    /// The same store for code that is not async.
+    pub fn blocking(&self) -> BlockingStore {
+        BlockingStore { store: self.clone() }
     }
+}
 
+impl BlockingStore {
     /// The async store.
     pub fn store(&self) -> &Store {
         &self.store
@@ -34,15 +38,15 @@ impl BlockingStore {
     /// As there.
     pub fn put(&self, bytes: impl Into<Bytes>) -> Result<ArtefactId, StoreError> {
         let bytes = bytes.into();
-        self.wait(|store| async move { store.put(bytes).await })
+        self.run(|store| async move { store.put(bytes).await })
     }
 
-    /// See [`Store::put`]: all of them side by side.
+    /// See [`Store::put`]: concurrent puts of several artefacts.
     ///
     /// # Errors
-    /// The first of theirs.
+    /// The first error.
     pub fn put_all(&self, all: Vec<Vec<u8>>) -> Result<Vec<ArtefactId>, StoreError> {
-        self.wait(|store| async move { try_join_all(all.into_iter().map(|bytes| store.put(bytes.into()))).await })
+        self.run(|store| async move { try_join_all(all.into_iter().map(|bytes| store.put(bytes.into()))).await })
     }
 
     /// See [`Store::get`].
@@ -50,7 +54,7 @@ impl BlockingStore {
     /// # Errors
     /// As there.
     pub fn get(&self, id: ArtefactId) -> Result<Bytes, StoreError> {
-        self.wait(|store| async move { store.get(id).await })
+        self.run(|store| async move { store.get(id).await })
     }
 
     /// See [`Store::get_or_discard`].
@@ -58,16 +62,16 @@ impl BlockingStore {
     /// # Errors
     /// As there.
     pub fn get_or_discard(&self, id: ArtefactId) -> Result<Option<Bytes>, StoreError> {
-        self.wait(|store| async move { store.get_or_discard(id).await })
+        self.run(|store| async move { store.get_or_discard(id).await })
     }
 
-    /// See [`Store::get_or_discard`]: all of them side by side.
+    /// See [`Store::get_or_discard`]: concurrent reads of several artefacts.
     ///
     /// # Errors
-    /// The first of theirs.
+    /// The first error.
     pub fn get_all_or_discard(&self, ids: &[ArtefactId]) -> Result<Vec<Option<Bytes>>, StoreError> {
         let ids = ids.to_vec();
-        self.wait(|store| async move { try_join_all(ids.into_iter().map(|id| store.get_or_discard(id))).await })
+        self.run(|store| async move { try_join_all(ids.into_iter().map(|id| store.get_or_discard(id))).await })
     }
 
     /// See [`Store::get_ranges`].
@@ -76,7 +80,7 @@ impl BlockingStore {
     /// As there.
     pub fn get_ranges(&self, id: ArtefactId, ranges: &[Range<u64>]) -> Result<Vec<Bytes>, StoreError> {
         let ranges = ranges.to_vec();
-        self.wait(|store| async move { store.get_ranges(id, &ranges).await })
+        self.run(|store| async move { store.get_ranges(id, &ranges).await })
     }
 
     /// See [`Store::size`].
@@ -84,7 +88,7 @@ impl BlockingStore {
     /// # Errors
     /// As there.
     pub fn size(&self, id: ArtefactId) -> Result<Option<u64>, StoreError> {
-        self.wait(|store| async move { store.size(id).await })
+        self.run(|store| async move { store.size(id).await })
     }
 
     /// See [`Store::exists`].
@@ -92,29 +96,29 @@ impl BlockingStore {
     /// # Errors
     /// As there.
     pub fn exists(&self, id: ArtefactId) -> Result<bool, StoreError> {
-        self.wait(|store| async move { store.exists(id).await })
+        self.run(|store| async move { store.exists(id).await })
     }
 
-    /// See [`Store::put_name`].
+    /// See [`Store::put_record`].
     ///
     /// # Errors
     /// As there.
-    pub fn put_name(&self, name: &str, bytes: impl Into<Bytes>) -> Result<(), StoreError> {
+    pub fn put_record(&self, name: &str, bytes: impl Into<Bytes>) -> Result<(), StoreError> {
         let (name, bytes) = (name.to_owned(), bytes.into());
-        self.wait(|store| async move { store.put_name(&name, bytes).await })
+        self.run(|store| async move { store.put_record(&name, bytes).await })
     }
 
-    /// See [`Store::get_name`].
+    /// See [`Store::get_record`].
     ///
     /// # Errors
     /// As there.
-    pub fn get_name(&self, name: &str) -> Result<Option<Bytes>, StoreError> {
+    pub fn get_record(&self, name: &str) -> Result<Option<Bytes>, StoreError> {
         let name = name.to_owned();
-        self.wait(|store| async move { store.get_name(&name).await })
+        self.run(|store| async move { store.get_record(&name).await })
     }
 
-    /// What a network is needed for is done on the store's own runtime, as this thread may have none, or one that waits for us.
-    fn wait<T, W>(&self, work: impl FnOnce(Store) -> W) -> T
+    /// Network requests run on the store's own runtime: the calling thread may have no runtime, or one that it blocks.
+    fn run<T, W>(&self, work: impl FnOnce(Store) -> W) -> T
     where
         T: Send + 'static,
         W: Future<Output = T> + Send + 'static,

@@ -1,22 +1,24 @@
-//! What can go wrong with a store, one line each.
+//! Errors of a store, one line each, and the reasons given in them.
 
 use std::error::Error;
 use std::io;
 
 use scene::{ArtefactId, BadInput};
 
-/// A store that did not do what was asked.
+use crate::paths::MAX_RECORD_NAME_BYTES;
+
+/// A store operation that failed.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum StoreError {
     /// Not the URL of a store.
     #[error(transparent)]
     BadUrl(#[from] BadInput),
-    /// A folder that cannot be made or opened.
+    /// A folder that cannot be created or opened, or a network runtime that does not start.
     #[error("{store}: cannot be made or opened as a folder: {reason}; choose a folder that you may write to")]
-    Closed {
+    CannotOpen {
         /// The store's URL.
         store: String,
-        /// What the file system said.
+        /// The file system's reason.
         reason: String,
     },
     /// No such artefact.
@@ -27,7 +29,7 @@ pub enum StoreError {
         /// The store's URL.
         store: String,
     },
-    /// Bytes that are not those of the id.
+    /// Bytes that do not have the hash or the length of the artefact.
     #[error("artefact {id} in the store {store} is damaged; delete it and run the step that makes it again")]
     Corrupt {
         /// The artefact.
@@ -35,13 +37,13 @@ pub enum StoreError {
         /// The store's URL.
         store: String,
     },
-    /// A record name that the store does not take.
+    /// An invalid record name.
     #[error(
         "'{0}' is not a name for a record: up to {limit} ASCII letters, digits and ._-/, no part empty or hidden",
-        limit = crate::NAME_LIMIT
+        limit = MAX_RECORD_NAME_BYTES
     )]
-    BadName(String),
-    /// The place itself failed.
+    BadRecordName(String),
+    /// The underlying object store failed.
     #[error("cannot {action} {path} in the store {store}: {reason}")]
     Failed {
         /// read, write, create, delete, list, look for
@@ -50,12 +52,12 @@ pub enum StoreError {
         path: String,
         /// The store's URL.
         store: String,
-        /// What the place said, and what to do where that is known.
+        /// The object store's reason, with advice where there is any.
         reason: String,
     },
 }
 
-/// The root of an error in one line; plain words where the operating system's are known.
+/// The root cause of an error in one line, with advice for the operating system's common failures.
 pub(crate) fn reason(error: &(dyn Error + 'static)) -> String {
     let mut root = error;
     loop {
@@ -65,7 +67,8 @@ pub(crate) fn reason(error: &(dyn Error + 'static)) -> String {
                     return "the disk is full; free some space and run again".into();
                 }
                 io::ErrorKind::FileTooLarge => {
-                    return "the system allows no file as long (ulimit -f); raise that and run again".into();
+                    return "the file exceeds the system's size limit (ulimit -f); raise the limit and run again"
+                        .into();
                 }
                 io::ErrorKind::ReadOnlyFilesystem => return "the file system is read-only; choose another".into(),
                 io::ErrorKind::PermissionDenied => return "permission denied; choose a folder you may write to".into(),
@@ -79,28 +82,31 @@ pub(crate) fn reason(error: &(dyn Error + 'static)) -> String {
     }
 }
 
-/// As [`reason`], with plain words for what object servers say.
-pub(crate) fn reason_of(error: &object_store::Error) -> String {
-    let said = reason(error);
-    let whole = error.to_string();
-    if whole.contains("NoSuchBucket") {
+/// As [`reason`], with advice for the common failures of object servers.
+pub(crate) fn object_store_reason(error: &object_store::Error) -> String {
+    let root = reason(error);
+    if error.to_string().contains("NoSuchBucket") {
         return "there is no such bucket; create it, or name another".into();
     }
     match error {
         object_store::Error::PermissionDenied { .. } | object_store::Error::Unauthenticated { .. } => {
             format!(
                 "{}; check AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY and AWS_REGION, and what they may do",
-                short(&said)
+                truncated(&root)
             )
         }
-        _ => short(&said),
+        _ => truncated(&root),
     }
 }
 
-/// What a server says may be a page.
-fn short(text: &str) -> String {
-    const LIMIT: usize = 300;
-    if text.chars().count() <= LIMIT { text.into() } else { text.chars().take(LIMIT).chain("...".chars()).collect() }
+/// Servers may answer with a whole HTML page.
+fn truncated(text: &str) -> String {
+    const MAX_CHARS: usize = 300;
+    if text.chars().count() <= MAX_CHARS {
+        text.into()
+    } else {
+        text.chars().take(MAX_CHARS).chain("...".chars()).collect()
+    }
 }
 
 #[cfg(test)]
@@ -108,16 +114,16 @@ mod tests {
     use super::*;
 
     #[test]
-    fn known_failures_are_said_in_plain_words() {
+    fn common_io_errors_have_advice() {
         for (kind, words) in [
             (io::ErrorKind::StorageFull, "the disk is full"),
-            (io::ErrorKind::FileTooLarge, "the system allows no file as long"),
+            (io::ErrorKind::FileTooLarge, "the file exceeds the system's size limit"),
             (io::ErrorKind::ReadOnlyFilesystem, "read-only"),
             (io::ErrorKind::PermissionDenied, "permission denied"),
         ] {
             let source = Box::new(io::Error::from(kind));
             let error = object_store::Error::Generic { store: "x", source };
-            assert!(reason(&error).starts_with(words) || reason(&error).contains(words), "{}", reason(&error));
+            assert!(reason(&error).contains(words), "{}", reason(&error));
         }
     }
 }

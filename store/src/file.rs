@@ -1,4 +1,5 @@
-//! Files beside a store, whole or not at all: what a full disk or a killed program leaves never has a file's own name.
+//! Atomic writes of local files: a temporary file in the same folder, then a rename. After a full disk or a crash a file is
+//! either as it was before or complete.
 
 use std::error::Error;
 use std::fs::{self, File, OpenOptions};
@@ -17,10 +18,10 @@ pub struct SaveError {
 }
 
 impl SaveError {
-    /// Of this file, for this reason.
+    /// The error of writing this file.
     pub fn new(path: &Path, error: &(dyn Error + 'static)) -> Self {
         let mut reason = reason(error);
-        // Where the reason says what to do, that is all there is to say.
+        // Reasons with a semicolon contain advice already.
         if !reason.contains(';') {
             reason += "; check the folder and the space on the disk";
         }
@@ -28,97 +29,96 @@ impl SaveError {
     }
 }
 
-/// Writes a file: under another name first, so that it is there as a whole or as it was before. A link is followed, a
-/// device or pipe written as it is.
+/// Writes a file atomically. A symbolic link is followed; a device or pipe is written directly.
 ///
 /// # Errors
-/// A place that refuses it.
+/// The file cannot be created, written or renamed.
 pub fn save(path: &Path, bytes: &[u8]) -> Result<(), SaveError> {
-    let mut saving = Saving::begin(path)?;
-    saving.write(bytes)?;
-    saving.finish()
+    let mut file = AtomicFile::create(path)?;
+    file.write(bytes)?;
+    file.commit()
 }
 
-/// A file that is written part by part, as by [`save`]: it has its name when [`finish`](Self::finish) returns, and nothing is left of
-/// it where that is not reached.
+/// A file that is written in parts, atomically as by [`save`]: it replaces the old file in [`commit`](Self::commit). Dropping it
+/// uncommitted removes the temporary file.
 #[derive(Debug)]
-pub struct Saving {
-    /// As it was named, for errors.
-    shown: PathBuf,
-    /// Where it goes.
+pub struct AtomicFile {
+    /// The path as given by the caller, for errors.
+    given_path: PathBuf,
+    /// The path with links resolved.
     path: PathBuf,
     file: File,
-    /// The name that it has until it is whole; none where it is a device or pipe.
-    part: Option<PathBuf>,
+    /// The temporary file; `None` for a device or pipe.
+    temporary: Option<PathBuf>,
 }
 
-impl Saving {
-    /// Begins the file.
+impl AtomicFile {
+    /// Creates the temporary file.
     ///
     /// # Errors
-    /// A place that refuses it.
-    pub fn begin(path: &Path) -> Result<Self, SaveError> {
+    /// The file cannot be created or may not be replaced.
+    pub fn create(path: &Path) -> Result<Self, SaveError> {
         Self::open(path).map_err(|error| SaveError::new(path, &error))
     }
 
-    /// Adds to its end.
+    /// Appends bytes.
     ///
     /// # Errors
-    /// A disk that refuses it.
+    /// The write fails.
     pub fn write(&mut self, bytes: &[u8]) -> Result<(), SaveError> {
-        self.file.write_all(bytes).map_err(|error| SaveError::new(&self.shown, &error))
+        self.file.write_all(bytes).map_err(|error| SaveError::new(&self.given_path, &error))
     }
 
-    /// Gives it its name.
+    /// Renames the temporary file to its final name.
     ///
     /// # Errors
-    /// A folder that refuses it.
-    pub fn finish(mut self) -> Result<(), SaveError> {
-        let Some(part) = self.part.take() else { return Ok(()) };
-        fs::rename(&part, &self.path).map_err(|error| {
-            let _ = fs::remove_file(&part);
-            SaveError::new(&self.shown, &error)
+    /// The rename fails; the temporary file is removed.
+    pub fn commit(mut self) -> Result<(), SaveError> {
+        let Some(temporary) = self.temporary.take() else { return Ok(()) };
+        fs::rename(&temporary, &self.path).map_err(|error| {
+            let _ = fs::remove_file(&temporary);
+            SaveError::new(&self.given_path, &error)
         })
     }
 
-    fn open(shown: &Path) -> io::Result<Self> {
-        let path = shown.canonicalize().unwrap_or_else(|_| shown.to_path_buf());
-        let shown = shown.to_path_buf();
+    fn open(given_path: &Path) -> io::Result<Self> {
+        let path = given_path.canonicalize().unwrap_or_else(|_| given_path.to_path_buf());
+        let given_path = given_path.to_path_buf();
         let permissions = match OpenOptions::new().write(true).open(&path) {
             Ok(file) => match file.metadata()? {
-                about if about.is_file() => Some(about.permissions()),
-                _ => return Ok(Self { shown, path, file, part: None }),
+                metadata if metadata.is_file() => Some(metadata.permissions()),
+                _ => return Ok(Self { given_path, path, file, temporary: None }),
             },
             Err(error) if error.kind() == ErrorKind::NotFound => None,
-            // Also a file that is protected from being written, which renaming would not ask about.
+            // Includes a write-protected file, which a rename would replace all the same.
             Err(error) => return Err(error),
         };
-        let part = part_beside(&path);
-        let saving = Self { shown, path, file: File::create(&part)?, part: Some(part) };
-        permissions.map_or(Ok(()), |permissions| saving.file.set_permissions(permissions))?;
-        Ok(saving)
+        let temporary = temporary_path(&path);
+        let atomic = Self { given_path, path, file: File::create(&temporary)?, temporary: Some(temporary) };
+        permissions.map_or(Ok(()), |permissions| atomic.file.set_permissions(permissions))?;
+        Ok(atomic)
     }
 }
 
-impl Drop for Saving {
+impl Drop for AtomicFile {
     fn drop(&mut self) {
-        if let Some(part) = &self.part {
-            let _ = fs::remove_file(part);
+        if let Some(temporary) = &self.temporary {
+            let _ = fs::remove_file(temporary);
         }
     }
 }
 
-/// A hidden name in the same folder that nothing else writes.
-fn part_beside(path: &Path) -> PathBuf {
+/// A hidden name in the same folder, unique to this process and call.
+fn temporary_path(path: &Path) -> PathBuf {
     static COUNT: AtomicU64 = AtomicU64::new(0);
     let count = COUNT.fetch_add(1, Ordering::Relaxed);
     path.with_file_name(format!(".plat-{}-{count}.part", std::process::id()))
 }
 
-/// Adds to the end of a file; what it cannot take as a whole is taken back.
+/// Appends to a file. A partial write is truncated again.
 ///
 /// # Errors
-/// A disk that refuses it.
+/// The write fails.
 pub fn append(file: &mut File, bytes: &[u8]) -> io::Result<()> {
     let length = file.metadata()?.len();
     file.write_all(bytes).inspect_err(|_| {
@@ -138,7 +138,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_is_replaced_and_nothing_else_left() {
+    fn a_file_is_replaced_and_no_temporary_file_left() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a");
         for bytes in ["first and long", "second", ""] {
@@ -155,24 +155,24 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_finished_is_as_if_it_had_not_begun() {
+    fn an_uncommitted_file_leaves_nothing() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a");
-        let begun = |parts: &[&str]| {
-            let mut saving = Saving::begin(&path).unwrap();
-            parts.iter().for_each(|part| saving.write(part.as_bytes()).unwrap());
-            saving
+        let written = |parts: &[&str]| {
+            let mut file = AtomicFile::create(&path).unwrap();
+            parts.iter().for_each(|part| file.write(part.as_bytes()).unwrap());
+            file
         };
-        drop(begun(&["lost"]));
+        drop(written(&["lost"]));
         assert!(names(folder.path()).is_empty());
-        begun(&["one ", "two ", ""]).finish().unwrap();
-        drop(begun(&["lost"]));
+        written(&["one ", "two ", ""]).commit().unwrap();
+        drop(written(&["lost"]));
         assert_eq!((names(folder.path()), &*fs::read_to_string(&path).unwrap()), (vec!["a".to_owned()], "one two "));
     }
 
     #[cfg(target_os = "linux")]
     #[test]
-    fn links_devices_and_protection_stay() {
+    fn links_devices_and_permissions_are_kept() {
         use std::os::unix::fs::{FileTypeExt, PermissionsExt, symlink};
         let folder = tempfile::tempdir().unwrap();
         let [file, link, full] = ["file", "link", "full"].map(|name| folder.path().join(name));
@@ -191,7 +191,7 @@ mod tests {
 
     #[cfg(target_os = "linux")]
     #[test]
-    fn what_does_not_fit_is_taken_back() {
+    fn a_failed_append_is_truncated() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("lines");
         let mut file = OpenOptions::new().create(true).append(true).open(&path).unwrap();

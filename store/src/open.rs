@@ -1,4 +1,4 @@
-//! A store's URL: which kind of place it names, and how that is reached.
+//! Opens a store's URL: a local folder, memory, or an S3 bucket configured by the environment.
 
 use std::error::Error;
 use std::path::Path as FilePath;
@@ -15,44 +15,45 @@ use object_store::{BackoffConfig, ClientConfigKey, ObjectStore, RetryConfig};
 use scene::BadInput;
 use tokio::runtime::{Builder, Handle, Runtime};
 
-use crate::{StoreError, error};
+use crate::error::{self, StoreError};
+use crate::paths::is_plain_segment;
 
 const ADVICE: &str = "give the path of a folder, file:///path, s3://bucket/prefix or memory://";
-/// The longest time that one object may take to come or go, unless AWS_TIMEOUT says another.
+/// Timeout of one request, unless AWS_TIMEOUT gives another.
 const REQUEST_TIMEOUT: &str = "300 seconds";
-/// A request that fails in a way that may pass is not tried again after this long.
+/// A request that fails with a transient error is not retried after this long.
 const RETRY_TIMEOUT: Duration = Duration::from_secs(60);
 
-/// Where objects lie, and what carries them there if that is a network.
-pub(crate) struct Place {
+/// An opened object store, with its runtime if it is remote.
+pub(crate) struct Location {
     pub(crate) objects: Arc<dyn ObjectStore>,
     pub(crate) network: Option<Arc<Network>>,
 }
 
-/// What comes from outside, beside the URL.
-pub(crate) struct Surroundings<V> {
-    /// The environment; what is called `AWS_…` there says how S3 is reached.
+/// Configuration beside the URL.
+pub(crate) struct Environment<V> {
+    /// Environment variables; those named `AWS_…` configure S3.
     pub(crate) variables: V,
-    /// How often a request that fails in a way that may pass is tried again.
+    /// Retries of a request that fails with a transient error.
     pub(crate) retries: usize,
 }
 
-/// Opens what the URL names.
+/// Opens the object store that the URL names.
 pub(crate) fn open(
     url: &str,
-    surroundings: Surroundings<impl Iterator<Item = (String, String)>>,
-) -> Result<Place, StoreError> {
-    let here = |objects: Arc<dyn ObjectStore>| Place { objects, network: None };
+    environment: Environment<impl Iterator<Item = (String, String)>>,
+) -> Result<Location, StoreError> {
+    let local = |objects: Arc<dyn ObjectStore>| Location { objects, network: None };
     match url.split_once("://") {
         None if url.is_empty() => Err(BadInput::new("the store", "has an empty URL", ADVICE).into()),
-        None => Ok(here(Arc::new(folder(url, FilePath::new(url))?))),
-        Some(("memory", "")) => Ok(here(Arc::new(InMemory::new()))),
+        None => Ok(local(Arc::new(folder(url, FilePath::new(url))?))),
+        Some(("memory", "")) => Ok(local(Arc::new(InMemory::new()))),
         Some(("file", _)) => {
             let path = url::Url::parse(url).ok().and_then(|url| url.to_file_path().ok());
             let path = path.ok_or_else(|| BadInput::new(url, "is not the URL of a local folder", ADVICE))?;
-            Ok(here(Arc::new(folder(url, &path)?)))
+            Ok(local(Arc::new(folder(url, &path)?)))
         }
-        Some(("s3", rest)) => bucket(url, rest, surroundings),
+        Some(("s3", rest)) => bucket(url, rest, environment),
         Some((scheme, _)) => {
             let problem = format!("stores of the kind {scheme}:// are not supported by this version");
             Err(BadInput::new(url, problem, ADVICE).into())
@@ -61,48 +62,44 @@ pub(crate) fn open(
 }
 
 fn folder(url: &str, path: &FilePath) -> Result<LocalFileSystem, StoreError> {
-    let closed = |error: &(dyn Error + 'static)| StoreError::Closed { store: url.into(), reason: error::reason(error) };
-    std::fs::create_dir_all(path).map_err(|error| closed(&error))?;
-    LocalFileSystem::new_with_prefix(path).map_err(|error| closed(&error))
+    let cannot_open =
+        |error: &(dyn Error + 'static)| StoreError::CannotOpen { store: url.into(), reason: error::reason(error) };
+    std::fs::create_dir_all(path).map_err(|error| cannot_open(&error))?;
+    LocalFileSystem::new_with_prefix(path).map_err(|error| cannot_open(&error))
 }
 
-/// `rest` is what follows `s3://`: a bucket, and after a slash the prefix of all objects.
+/// Opens an S3 bucket. `rest` is the URL after `s3://`: `bucket` or `bucket/prefix`.
 fn bucket(
     url: &str,
     rest: &str,
-    surroundings: Surroundings<impl Iterator<Item = (String, String)>>,
-) -> Result<Place, StoreError> {
+    environment: Environment<impl Iterator<Item = (String, String)>>,
+) -> Result<Location, StoreError> {
     const SHAPE: &str = "give it as s3://bucket or s3://bucket/prefix, of ASCII letters, digits and ._-";
     let (bucket, prefix) = rest.split_once('/').unwrap_or((rest, ""));
     if bucket.contains('@') || bucket.contains(':') {
         let advice = "give the server by AWS_ENDPOINT_URL, the keys by AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY";
-        // Not repeated here: what stands before an @ may be a secret.
+        // The message omits the URL: the text before an @ may be a secret.
         return Err(BadInput::new("the store's URL", "names a key or a server beside the bucket", advice).into());
     }
-    let plain = |part: &str| {
-        !part.is_empty()
-            && !part.starts_with('.')
-            && part.bytes().all(|b| b.is_ascii_alphanumeric() || matches!(b, b'.' | b'_' | b'-'))
-    };
     let parts: Vec<&str> = prefix.trim_end_matches('/').split('/').filter(|_| !prefix.is_empty()).collect();
-    if !plain(bucket) || !parts.iter().all(|part| plain(part)) {
+    if !is_plain_segment(bucket) || !parts.iter().all(|part| is_plain_segment(part)) {
         return Err(BadInput::new(url, "is not the URL of a bucket", SHAPE).into());
     }
 
     let mut builder = AmazonS3Builder::new().with_config(client(ClientConfigKey::Timeout), REQUEST_TIMEOUT);
-    for (name, value) in surroundings.variables.filter(|(name, _)| name.starts_with("AWS_")) {
-        // Those that are none of the store's business (AWS_PROFILE, say) are left alone.
+    for (name, value) in environment.variables.filter(|(name, _)| name.starts_with("AWS_")) {
+        // Other AWS_ variables, such as AWS_PROFILE, do not configure the store.
         if let Ok(key) = name.to_ascii_lowercase().parse::<AmazonS3ConfigKey>() {
             builder = builder.with_config(key, value);
         }
     }
-    check_reach(url, &builder)?;
+    check_config(url, &builder)?;
     let (network, handle) = Network::start(url)?;
     let allowed = allows_http(&builder);
     let local = endpoint_of(&builder).is_some_and(|endpoint| is_loopback(&endpoint));
     let retry = RetryConfig {
         backoff: BackoffConfig::default(),
-        max_retries: surroundings.retries,
+        max_retries: environment.retries,
         retry_timeout: RETRY_TIMEOUT,
     };
     let s3 = builder
@@ -111,30 +108,32 @@ fn bucket(
         .with_retry(retry)
         .with_http_connector(SpawnedReqwestConnector::new(handle))
         .build()
-        .map_err(|error| BadInput::new(url, format!("cannot be reached: {}", error::reason(&error)), CHECK))?;
+        .map_err(|error| {
+            BadInput::new(url, format!("cannot be reached: {}", error::reason(&error)), CHECK_VARIABLES)
+        })?;
     let objects: Arc<dyn ObjectStore> = if parts.is_empty() {
         Arc::new(s3)
     } else {
         Arc::new(PrefixStore::new(s3, Path::from_iter(parts.iter().copied())))
     };
-    Ok(Place { objects, network: Some(Arc::new(network)) })
+    Ok(Location { objects, network: Some(Arc::new(network)) })
 }
 
-const CHECK: &str = "check the AWS_ variables of the environment";
+const CHECK_VARIABLES: &str = "check the AWS_ variables of the environment";
 
-/// What would otherwise be found out only by the first request, some in minutes.
-fn check_reach(url: &str, builder: &AmazonS3Builder) -> Result<(), BadInput> {
+/// Refuses a configuration that only the first request would otherwise find wrong, at worst after minutes of retries.
+fn check_config(url: &str, builder: &AmazonS3Builder) -> Result<(), BadInput> {
     use AmazonS3ConfigKey as Key;
-    let given = |key: Key| builder.get_config_value(&key).is_some_and(|value| !value.is_empty());
-    if given(Key::AccessKeyId) != given(Key::SecretAccessKey) {
+    let is_set = |key: Key| builder.get_config_value(&key).is_some_and(|value| !value.is_empty());
+    if is_set(Key::AccessKeyId) != is_set(Key::SecretAccessKey) {
         let advice = "set both AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or neither";
         return Err(BadInput::new(url, "has half of its keys", advice));
     }
     let Some(endpoint) = endpoint_of(builder) else { return Ok(()) };
-    // Without keys the machine's own are asked for, which only Amazon's have.
+    // Without keys the client would query the EC2 metadata service, which exists on Amazon's machines only.
     let others = [Key::WebIdentityTokenFile, Key::ContainerCredentialsRelativeUri, Key::ContainerCredentialsFullUri];
     let unsigned = builder.get_config_value(&Key::SkipSignature).is_some_and(|value| is_true(&value));
-    if !given(Key::AccessKeyId) && !unsigned && !others.into_iter().any(given) {
+    if !is_set(Key::AccessKeyId) && !unsigned && !others.into_iter().any(is_set) {
         let advice = "set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_SKIP_SIGNATURE=true for a public bucket";
         return Err(BadInput::new(url, "has an endpoint and no keys", advice));
     }
@@ -176,21 +175,22 @@ fn is_loopback(endpoint: &str) -> bool {
     }
 }
 
-/// A runtime of the store's own: connections live as long as the store does, whichever runtime or thread asks.
+/// The runtime of a remote store's connections, which outlive the runtimes and threads of callers.
 #[derive(Debug)]
 pub(crate) struct Network(Option<Runtime>);
 
 impl Network {
     fn start(url: &str) -> Result<(Self, Handle), StoreError> {
-        // The one library of cryptography; that it is set already is as good.
+        // Fails if the process has installed a provider already, which serves as well.
         let _ = rustls::crypto::ring::default_provider().install_default();
         let runtime = Builder::new_multi_thread().worker_threads(1).thread_name("plat-store").enable_all().build();
-        let runtime = runtime.map_err(|error| StoreError::Closed { store: url.into(), reason: error.to_string() })?;
+        let runtime =
+            runtime.map_err(|error| StoreError::CannotOpen { store: url.into(), reason: error.to_string() })?;
         let handle = runtime.handle().clone();
         Ok((Self(Some(runtime)), handle))
     }
 
-    /// Where what must not be async is carried out.
+    /// A handle to spawn requests on.
     pub(crate) fn handle(&self) -> Option<&Handle> {
         self.0.as_ref().map(Runtime::handle)
     }
@@ -198,7 +198,7 @@ impl Network {
 
 impl Drop for Network {
     fn drop(&mut self) {
-        // The last clone of a store may go on a thread that must not wait.
+        // The last clone of a store may be dropped on an async thread, which must not block.
         if let Some(runtime) = self.0.take() {
             runtime.shutdown_background();
         }

@@ -1,9 +1,17 @@
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+
 use futures::StreamExt;
 use futures::future::join_all;
 use object_store::memory::InMemory;
+use object_store::path::Path;
+use object_store::{ObjectStore, PutMode};
+use scene::ArtefactId;
 
 use super::*;
 use crate::doctor::examine;
+use crate::open::Environment;
+use crate::paths::artefact_path;
 
 fn stores() -> (tempfile::TempDir, Vec<BlockingStore>) {
     let folder = tempfile::tempdir().unwrap();
@@ -18,7 +26,7 @@ fn artefact_file(root: &std::path::Path, id: ArtefactId) -> std::path::PathBuf {
 }
 
 #[test]
-fn what_is_put_is_got_whole_and_in_ranges() {
+fn an_artefact_is_read_whole_and_in_ranges() {
     let (_folder, stores) = stores();
     for store in &stores {
         let id = store.put("the survey map").unwrap();
@@ -36,13 +44,13 @@ fn what_is_put_is_got_whole_and_in_ranges() {
 }
 
 #[test]
-fn what_is_damaged_can_be_put_again() {
+fn a_damaged_artefact_is_discarded_and_can_be_put_again() {
     let folder = tempfile::tempdir().unwrap();
     let store = Store::open(folder.path().to_str().unwrap()).unwrap().blocking();
     let id = store.put("the survey map").unwrap();
     assert_eq!(store.get_or_discard(id).unwrap().unwrap(), "the survey map");
     std::fs::write(artefact_file(folder.path(), id), "the survey cap").unwrap();
-    // Of the right length, it is left alone.
+    // Put keeps an object of the right length.
     assert_eq!(store.put("the survey map").unwrap(), id);
     assert!(matches!(store.get(id), Err(StoreError::Corrupt { .. })));
     assert_eq!(store.get_or_discard(id).unwrap(), None);
@@ -53,7 +61,7 @@ fn what_is_damaged_can_be_put_again() {
 }
 
 #[test]
-fn traffic_is_counted_apart() {
+fn metered_stores_count_their_own_traffic() {
     let all = Store::open("memory://").unwrap();
     let (one, other) = (all.metered(), all.metered());
     let id = one.blocking().put("the survey map").unwrap();
@@ -61,13 +69,13 @@ fn traffic_is_counted_apart() {
     other.blocking().get(id).unwrap();
     other.blocking().get_ranges(id, &[11..14, 4..10]).unwrap();
     assert!(other.blocking().get(ArtefactId::of(b"never put")).is_err());
-    other.blocking().put_name("a/b", "12345").unwrap();
-    other.blocking().get_name("a/b").unwrap();
+    other.blocking().put_record("a/b", "12345").unwrap();
+    other.blocking().get_record("a/b").unwrap();
     assert_eq!(one.traffic(), Traffic { read: 0, written: 14 });
-    // The byte between the ranges came along.
+    // The byte between the ranges is read with them.
     assert_eq!(other.clone().traffic(), Traffic { read: 14 + 10 + 5, written: 5 });
     assert_eq!(all.traffic(), Traffic::default());
-    // What lies between ranges far apart stays where it is.
+    // A large gap between ranges is not read.
     let far = other.blocking().put(vec![7; 10_000]).unwrap();
     let before = other.traffic().read;
     assert_eq!(other.blocking().get_ranges(far, &[9000..9100, 0..50]).unwrap(), [vec![7; 100], vec![7; 50]]);
@@ -75,23 +83,23 @@ fn traffic_is_counted_apart() {
 }
 
 #[test]
-fn names_are_replaced_and_confined() {
+fn records_are_replaced_and_their_names_confined() {
     let (_folder, stores) = stores();
     for store in &stores {
-        assert_eq!(store.get_name("ingest/ab").unwrap(), None);
-        store.put_name("ingest/ab", "one").unwrap();
-        store.put_name("ingest/ab", "two").unwrap();
-        assert_eq!(store.get_name("ingest/ab").unwrap().unwrap(), "two");
-        let long = "x".repeat(NAME_LIMIT + 1);
+        assert_eq!(store.get_record("ingest/ab").unwrap(), None);
+        store.put_record("ingest/ab", "one").unwrap();
+        store.put_record("ingest/ab", "two").unwrap();
+        assert_eq!(store.get_record("ingest/ab").unwrap().unwrap(), "two");
+        let long = "x".repeat(MAX_RECORD_NAME_BYTES + 1);
         for bad in ["", "/etc", "a//b", "../a", "a/..", "a\\b", "a b", ".hidden", "ä", &long] {
-            assert!(matches!(store.put_name(bad, "x"), Err(StoreError::BadName(_))), "{bad}");
-            assert!(matches!(store.get_name(bad), Err(StoreError::BadName(_))), "{bad}");
+            assert!(matches!(store.put_record(bad, "x"), Err(StoreError::BadRecordName(_))), "{bad}");
+            assert!(matches!(store.get_record(bad), Err(StoreError::BadRecordName(_))), "{bad}");
         }
     }
 }
 
 #[test]
-fn damage_is_named_and_a_cut_artefact_is_mended_by_the_next_put() {
+fn damage_is_reported_and_a_truncated_artefact_is_repaired_by_the_next_put() {
     let folder = tempfile::tempdir().unwrap();
     let store = Store::open(folder.path().to_str().unwrap()).unwrap().blocking();
     let id = store.put("some bytes").unwrap();
@@ -117,7 +125,7 @@ fn a_second_put_does_not_write() {
 }
 
 #[test]
-fn a_place_that_refuses_writes_gives_one_line() {
+fn a_refused_write_is_a_one_line_error() {
     let folder = tempfile::tempdir().unwrap();
     let store = Store::open(folder.path().to_str().unwrap()).unwrap().blocking();
     std::fs::write(folder.path().join("artefacts"), "a file where the folder should be").unwrap();
@@ -126,7 +134,7 @@ fn a_place_that_refuses_writes_gives_one_line() {
 }
 
 #[test]
-fn other_urls_are_refused() {
+fn invalid_urls_are_refused() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("file");
     std::fs::write(&file, "x").unwrap();
@@ -145,18 +153,18 @@ async fn the_blocking_store_works_on_a_runtime_thread_too() {
 }
 
 #[test]
-fn the_url_of_a_bucket_and_its_variables_are_checked() {
+fn bucket_urls_and_aws_variables_are_checked() {
     let vars = |vars: &[(&str, &str)]| -> Vec<(String, String)> {
         vars.iter().map(|(name, value)| ((*name).to_owned(), (*value).to_owned())).collect()
     };
     let open = |url: &str, of: &[(&str, &str)]| {
-        Store::open_with(url, Surroundings { variables: vars(of).into_iter(), retries: 0 })
+        Store::open_with(url, Environment { variables: vars(of).into_iter(), retries: 0 })
     };
     let keys = [("AWS_ACCESS_KEY_ID", "k"), ("AWS_SECRET_ACCESS_KEY", "s3cret")];
     let at = |endpoint: &'static str| [keys[0], keys[1], ("AWS_ENDPOINT_URL", endpoint)];
     for url in ["s3://bucket", "s3://bucket/", "s3://my.bucket-1/a/b_c", "s3://bucket/prefix/"] {
         assert_eq!(open(url, &keys).unwrap().url(), url);
-        // Of the server nothing is asked yet.
+        // No request is sent yet.
         assert!(open(url, &at("http://127.0.0.1:1")).is_ok() && open(url, &at("https://far.example:9000")).is_ok());
     }
     for url in
@@ -178,7 +186,7 @@ fn the_url_of_a_bucket_and_its_variables_are_checked() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_server_that_is_away_gives_one_line_on_any_thread() {
+async fn an_unreachable_server_is_a_one_line_error_on_any_thread() {
     let port = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
     let vars = [
         ("AWS_ACCESS_KEY_ID", "k".to_owned()),
@@ -187,35 +195,35 @@ async fn a_server_that_is_away_gives_one_line_on_any_thread() {
         ("AWS_TIMEOUT", "2 seconds".to_owned()),
     ];
     let variables = vars.into_iter().map(|(name, value)| (name.to_owned(), value));
-    let store = Store::open_with("s3://bucket/prefix", Surroundings { variables, retries: 0 }).unwrap();
-    let line = store.get_name("a").await.unwrap_err().to_string();
+    let store = Store::open_with("s3://bucket/prefix", Environment { variables, retries: 0 }).unwrap();
+    let line = store.get_record("a").await.unwrap_err().to_string();
     assert!(line.starts_with("cannot read names/a in the store s3://bucket/prefix: "), "{line}");
     let blocking = store.blocking();
-    assert!(blocking.get_name("a").is_err());
+    assert!(blocking.get_record("a").is_err());
     let elsewhere = blocking.clone();
-    assert!(std::thread::spawn(move || elsewhere.get_name("a")).join().unwrap().is_err());
+    assert!(std::thread::spawn(move || elsewhere.get_record("a")).join().unwrap().is_err());
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn of_many_that_create_a_name_one_does() {
+async fn of_concurrent_creates_exactly_one_succeeds() {
     let folder = tempfile::tempdir().unwrap();
     for store in [Store::open("memory://").unwrap(), Store::open(folder.path().to_str().unwrap()).unwrap()] {
         for round in 0..10 {
             let name = format!("leader/{round:06}.json");
-            let tries = (0..16).map(|writer: u8| store.create_name(&name, vec![writer].into()));
+            let tries = (0..16).map(|writer: u8| store.create_record(&name, vec![writer].into()));
             let won: Vec<bool> = join_all(tries).await.into_iter().map(Result::unwrap).collect();
             let winner = won.iter().position(|won| *won).unwrap();
             assert_eq!(won.iter().filter(|won| **won).count(), 1);
-            assert_eq!(store.newest("leader").await.unwrap().unwrap(), (round, vec![winner as u8].into()));
+            assert_eq!(store.newest_record("leader").await.unwrap().unwrap(), (round, vec![winner as u8].into()));
         }
-        store.put_name("leader/newest.json", "no number".into()).await.unwrap();
-        store.put_name("leaders/99.json", "elsewhere".into()).await.unwrap();
-        assert_eq!(store.newest("leader").await.unwrap().unwrap().0, 9);
-        store.remove_name("leader/000009.json").await.unwrap();
-        store.remove_name("leader/000009.json").await.unwrap();
-        assert_eq!(store.newest("leader").await.unwrap().unwrap().0, 8);
-        assert_eq!(store.newest("nowhere").await.unwrap(), None);
-        assert_eq!(store.names("leader").await.unwrap().len(), 10);
+        store.put_record("leader/newest.json", "no number".into()).await.unwrap();
+        store.put_record("leaders/99.json", "elsewhere".into()).await.unwrap();
+        assert_eq!(store.newest_record("leader").await.unwrap().unwrap().0, 9);
+        store.remove_record("leader/000009.json").await.unwrap();
+        store.remove_record("leader/000009.json").await.unwrap();
+        assert_eq!(store.newest_record("leader").await.unwrap().unwrap().0, 8);
+        assert_eq!(store.newest_record("nowhere").await.unwrap(), None);
+        assert_eq!(store.record_names("leader").await.unwrap().len(), 10);
     }
 }
 
@@ -232,14 +240,14 @@ async fn an_artefact_can_be_removed_and_put_again() {
     }
 }
 
-/// A clock that goes a millisecond further whenever it is read.
+/// A clock that advances by a millisecond on each read.
 fn ticking() -> impl Fn() -> std::time::Duration {
     let read = AtomicU64::new(0);
     move || std::time::Duration::from_millis(read.fetch_add(1, Ordering::Relaxed))
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn the_doctor_finds_good_stores_fit_and_leaves_nothing() {
+async fn the_doctor_passes_good_stores_and_leaves_nothing_behind() {
     let folder = tempfile::tempdir().unwrap();
     for store in [Store::open("memory://").unwrap(), Store::open(folder.path().to_str().unwrap()).unwrap()] {
         let found = examine(&store, "test", &ticking()).await.unwrap();
@@ -252,11 +260,11 @@ async fn the_doctor_finds_good_stores_fit_and_leaves_nothing() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn the_doctor_finds_stores_unfit_that_create_what_is_there_or_list_late() {
+async fn the_doctor_fails_stores_without_exclusive_create_or_consistent_listing() {
     use faulty::{Fault, Faulty};
     for (fault, words) in [
-        (Fault::CreateReplaces, "were told that they had: two coordinators"),
-        (Fault::CreateUnknown, "cannot be created only where there is none"),
+        (Fault::CreateReplaces, "succeeded instead of one: two coordinators"),
+        (Fault::CreateUnknown, "an exclusive create"),
         (Fault::ListsNothing, "not listed"),
     ] {
         let objects = Arc::new(Faulty { inner: InMemory::new(), fault });
@@ -265,7 +273,7 @@ async fn the_doctor_finds_stores_unfit_that_create_what_is_there_or_list_late() 
     }
 }
 
-/// Servers as there are some.
+/// Object stores with the faults of some real servers.
 mod faulty {
     use futures::stream::BoxStream;
     use object_store::{
