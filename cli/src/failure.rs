@@ -3,7 +3,7 @@
 use blocks::PlanError;
 use coordinator::LocalError;
 use dataset::ingest::IngestError;
-use dataset::rehearse::RehearseError;
+use dataset::synth::SynthError;
 use scene::BadInput;
 use store::StoreError;
 use store::file::SaveError;
@@ -61,11 +61,11 @@ impl From<SaveError> for Failure {
     }
 }
 
-impl From<RehearseError> for Failure {
-    fn from(error: RehearseError) -> Self {
+impl From<SynthError> for Failure {
+    fn from(error: SynthError) -> Self {
         match error {
-            RehearseError::BadInput(error) => error.into(),
-            RehearseError::Save(error) => error.into(),
+            SynthError::BadInput(error) => error.into(),
+            SynthError::Save(error) => error.into(),
         }
     }
 }

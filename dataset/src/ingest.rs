@@ -220,7 +220,7 @@ impl Job<'_> {
         // To a bucket each takes its time, whatever its size.
         let ids = self.store.put_all(encoded)?;
         let memo = Memo { mips: ids.into_iter().zip(lengths).collect(), masked };
-        self.store.put_name(name, frame::encode(MEMO, &memo, &[]))?;
+        self.store.put_record(name, frame::encode(MEMO, &memo, &[]))?;
         Ok(memo)
     }
 
@@ -233,7 +233,7 @@ impl Job<'_> {
 
     /// What is remembered, if all of it is still there, at its full length.
     fn recall(&self, name: &str) -> Result<Option<Memo>, StoreError> {
-        let Some(bytes) = self.store.get_name(name)? else { return Ok(None) };
+        let Some(bytes) = self.store.get_record(name)? else { return Ok(None) };
         let Ok((memo, _)) = frame::decode::<Memo>(MEMO, &bytes) else { return Ok(None) };
         for &(id, length) in &memo.mips {
             if self.store.size(id)? != Some(length) {

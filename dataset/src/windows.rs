@@ -15,7 +15,7 @@ use bytes::Bytes;
 use scene::{Capture, CodecError, Pixels, Rect};
 use store::{BlockingStore, StoreError};
 
-use crate::bounded::Bounded;
+use crate::byte_lru::ByteLru;
 use crate::mips::{Index, Layout};
 
 /// A window that could not be read.
@@ -82,22 +82,22 @@ pub struct WindowStats {
 /// window takes one answer of the store instead of two, and tiles as they were read, where that is asked for: blocks side by side look
 /// at the same parts of the same photos.
 #[derive(Debug)]
-pub struct Common {
-    indexes: Mutex<Bounded<Mip, Arc<Index>>>,
+pub struct SharedTileCache {
+    indexes: Mutex<ByteLru<Mip, Arc<Index>>>,
     /// By mip and place in its artefact.
-    tiles: Mutex<Bounded<(Mip, u64), Bytes>>,
+    tiles: Mutex<ByteLru<(Mip, u64), Bytes>>,
 }
 
 /// A view, and which of its mips.
 type Mip = (u32, u8);
 
-impl Common {
+impl SharedTileCache {
     /// The indexes of the mips of some thousand photos.
     const INDEX_BYTES: usize = 32 << 20;
 
     /// Keeps so many bytes of tiles: none is right where the store is as near as memory.
     pub fn keeping(tile_bytes: usize) -> Self {
-        Self { indexes: Mutex::new(Bounded::new(Self::INDEX_BYTES)), tiles: Mutex::new(Bounded::new(tile_bytes)) }
+        Self { indexes: Mutex::new(ByteLru::new(Self::INDEX_BYTES)), tiles: Mutex::new(ByteLru::new(tile_bytes)) }
     }
 
     fn index(&self, mip: Mip) -> Option<Arc<Index>> {
@@ -152,12 +152,12 @@ pub struct WindowReader {
 impl WindowReader {
     /// A reader that keeps at most `cache_bytes` bytes of pixels.
     pub fn new(capture: Arc<Capture>, store: BlockingStore, cache_bytes: usize) -> Self {
-        Self::sharing(Arc::new(Common::keeping(0)), capture, store, cache_bytes)
+        Self::sharing(Arc::new(SharedTileCache::new(0)), capture, store, cache_bytes)
     }
 
     /// The same, with what other readers of the capture have read of it.
-    pub fn sharing(common: Arc<Common>, capture: Arc<Capture>, store: BlockingStore, cache_bytes: usize) -> Self {
-        let cache = Mutex::new(Cache { windows: Bounded::new(cache_bytes), coming: HashSet::new() });
+    pub fn sharing(common: Arc<SharedTileCache>, capture: Arc<Capture>, store: BlockingStore, cache_bytes: usize) -> Self {
+        let cache = Mutex::new(Cache { windows: ByteLru::new(cache_bytes), coming: HashSet::new() });
         let (arrived, stats) = (Condvar::new(), Counters::default());
         Self { shared: Arc::new(Shared { capture, store, common, cache, arrived, stats }), fetchers: OnceLock::new() }
     }
@@ -198,7 +198,7 @@ impl WindowReader {
 
     /// Begins to fetch a window that will be asked for soon, if it is not there, there is room for a queue of such, and the others
     /// have not too much to do.
-    pub fn expect(&self, view: u32, mip: u8, rect: Rect) {
+    pub fn prefetch(&self, view: u32, mip: u8, rect: Rect) {
         let key = (view, mip, rect);
         let fetchers = self.fetchers.get_or_init(|| fetchers(&self.shared));
         let mut cache = self.shared.cache();
@@ -226,8 +226,8 @@ impl train::WindowSource for WindowReader {
         Self::window(self, view, mip, rect).map_err(|error| error.to_string())
     }
 
-    fn expect(&self, view: u32, mip: u8, rect: Rect) {
-        Self::expect(self, view, mip, rect);
+    fn prefetch(&self, view: u32, mip: u8, rect: Rect) {
+        Self::prefetch(self, view, mip, rect);
     }
 }
 
@@ -236,7 +236,7 @@ impl train::WindowSource for WindowReader {
 struct Shared {
     capture: Arc<Capture>,
     store: BlockingStore,
-    common: Arc<Common>,
+    common: Arc<SharedTileCache>,
     cache: Mutex<Cache>,
     /// An expected window came, or failed.
     arrived: Condvar,
@@ -342,7 +342,7 @@ type Key = (u32, u8, Rect);
 
 #[derive(Debug)]
 struct Cache {
-    windows: Bounded<Key, Arc<Pixels>>,
+    windows: ByteLru<Key, Arc<Pixels>>,
     /// Those that are being fetched because they are expected.
     coming: HashSet<Key>,
 }

@@ -8,7 +8,7 @@ use std::path::Path;
 use city::{CitySettings, Traffic};
 use dataset::ingest::{IngestError, IngestOptions, ingest, load_capture};
 use dataset::open::{OpenOptions, Source, open};
-use dataset::rehearse::{self, Settings};
+use dataset::synth::{self, Settings};
 use glam::{DQuat, DVec3};
 use image::{DynamicImage, ImageFormat, Rgb, RgbImage};
 use scene::CameraModel;
@@ -48,7 +48,7 @@ fn city() -> (TempDir, Reconstruction) {
     // Nothing moves, so that photos have no masks.
     let city = CitySettings { traffic: Traffic::None, ..CitySettings::default() };
     let settings = Settings { city, views: 24, width: 48, height: 32, ..Settings::default() };
-    rehearse::write(folder.path(), &settings, &|_, _, _| ()).unwrap();
+    synth::write(folder.path(), &settings, &|_, _, _| ()).unwrap();
     let read = |name: &str| fs::read(folder.path().join("sparse/0").join(name)).unwrap();
     let model = Reconstruction {
         cameras: colmap::read_cameras_bin(&read("cameras.bin")).unwrap(),

@@ -394,7 +394,7 @@ impl WindowSource for Heard<'_> {
         self.0.window(view, mip, rect)
     }
 
-    fn expect(&self, view: u32, _: u8, _: Rect) {
+    fn prefetch(&self, view: u32, _: u8, _: Rect) {
         self.1.lock().unwrap()[0].push(view);
     }
 }

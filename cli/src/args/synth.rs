@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use city::faults::Fault;
 use city::{Layout, Traffic};
 use clap::Args;
-use dataset::rehearse::Around;
+use dataset::synth::Around;
 use glam::DVec3;
 
 use super::{Size, metres};

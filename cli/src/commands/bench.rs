@@ -7,7 +7,7 @@ use ::bench::parts::{Ingest, Tree, TreeFaces, TreeLevel};
 use ::bench::reference::read_references;
 use ::bench::{CurvePoint, PartLine, append_part, read_folder, replace_table, table};
 use city::CitySettings;
-use dataset::rehearse::Settings;
+use dataset::synth::Settings;
 use serde::Serialize;
 use store::Store;
 use store::file::save;

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use ::bench::{CurvePoint, birdseye_camera, oblique_camera, write_png};
 use ::render::cpu::Renderer;
 use city::{CitySettings, Traffic};
-use dataset::rehearse::{self, Settings, Summary};
+use dataset::synth::{self, Settings, Summary};
 use glam::DVec3;
 use serde::Serialize;
 use store::Store;
@@ -104,7 +104,7 @@ pub(crate) fn build(args: &DemoArgs, output: &Output) -> Result<Built, Failure> 
 /// Photographs the city, in the place of an older one.
 pub(crate) fn rehearsed(folder: &Path, settings: &Settings, output: &Output) -> Result<Summary, Failure> {
     let bars = output.stages();
-    Ok(rehearse::replace(folder, settings, &|what, done, total| bars.at(what, done, total))?)
+    Ok(synth::replace(folder, settings, &|what, done, total| bars.at(what, done, total))?)
 }
 
 /// The city and how it is trained.

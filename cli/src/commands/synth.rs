@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use ::bench::write_png;
 use city::CitySettings;
 use city::faults::Fault;
-use dataset::rehearse::{self, Settings, Summary};
+use dataset::synth::{self, Settings, Summary};
 use serde::Serialize;
 
 use crate::args::SynthArgs;
@@ -30,13 +30,13 @@ pub(crate) fn run(args: &SynthArgs, output: &Output) -> Result<(), Failure> {
     let stages = output.stages();
     let progress = |what, done, total| stages.at(what, done, total);
     if let Some(file) = &args.gallery {
-        write_png(file, &rehearse::gallery(&settings, &progress)?)?;
+        write_png(file, &synth::gallery(&settings, &progress)?)?;
         drop(stages);
         return output.result(&Drawn { gallery: file.clone() }, &file.display().to_string());
     }
     let out = args.out.clone().ok_or_else(|| Failure::Input("--out is missing: say where the capture goes".into()))?;
     output.note(format!("building a city of {} km² and taking {} photos of it", args.area_km2, args.views));
-    let summary = rehearse::write(&out, &settings, &progress)?;
+    let summary = synth::write(&out, &settings, &progress)?;
     drop(stages);
     let text = format!(
         "{} photos of {} things, {} of them moving, in {} triangles; {} sparse points, each in {:.1} views\n\n\

@@ -8,7 +8,7 @@ use std::path::Path;
 use std::process::{Command, Output};
 
 use city::{CitySettings, Layout, Traffic};
-use dataset::rehearse::{self, Settings};
+use dataset::synth::{self, Settings};
 use serde_json::Value;
 
 /// The program in a folder with these words, not yet run.
@@ -59,5 +59,5 @@ pub(crate) fn small(views: u32, width: u32, height: u32) -> Settings {
 
 /// Writes the capture of a small city into the folder `city`.
 pub(crate) fn city(folder: &Path, views: u32, width: u32, height: u32) {
-    rehearse::write(&folder.join("city"), &small(views, width, height), &|_, _, _| ()).unwrap();
+    synth::write(&folder.join("city"), &small(views, width, height), &|_, _, _| ()).unwrap();
 }

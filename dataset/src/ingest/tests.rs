@@ -7,7 +7,7 @@ use store::Store;
 use super::*;
 use crate::lens::ideal_pinhole;
 use crate::photo::tests::{encoded, texture};
-use crate::windows::{Common, WindowReader};
+use crate::windows::{SharedTileCache, WindowReader};
 
 const WIDTH: u32 = 150;
 const HEIGHT: u32 = 100;
@@ -179,8 +179,8 @@ fn tiles_are_read_once_by_all_who_share_them_and_never_kept_damaged() {
     // Ranges are not checked against the artefact's name, tiles against their own checksum.
     capture.views.push(View { mips: vec![store.put(bytes).unwrap()], ..capture.views[0].clone() });
     let capture = Arc::new(capture);
-    let common = Arc::new(Common::keeping(1 << 20));
-    let reader = || WindowReader::sharing(Arc::clone(&common), Arc::clone(&capture), store.clone(), 1 << 20);
+    let common = Arc::new(SharedTileCache::new(1 << 20));
+    let reader = || WindowReader::with_shared_tiles(Arc::clone(&common), Arc::clone(&capture), store.clone(), 1 << 20);
     let whole = whole(&capture.views[0].camera);
     let [corner, right] = [Rect { width: 70, height: 70, ..whole }, Rect { x: 64, width: 80, height: 64, ..whole }];
     let first = reader();
@@ -234,11 +234,11 @@ fn what_is_expected_is_there_when_it_is_asked_for() {
     let reader = WindowReader::new(Arc::clone(&capture), store.clone(), 1 << 20);
     for (i, &rect) in rects.iter().enumerate() {
         let view = i as u32 % 3;
-        reader.expect(view, 0, rect);
+        reader.prefetch(view, 0, rect);
         // Again, and what cannot be had: neither is anybody's trouble.
-        reader.expect(view, 0, rect);
-        reader.expect(3, 0, rect);
-        reader.expect(99, 0, rect);
+        reader.prefetch(view, 0, rect);
+        reader.prefetch(3, 0, rect);
+        reader.prefetch(99, 0, rect);
         assert_eq!(*reader.window(view, 0, rect).unwrap(), *plain.window(view, 0, rect).unwrap());
     }
     assert!(reader.window(3, 0, rects[0]).is_err() && reader.window(99, 0, rects[0]).is_err());
@@ -247,7 +247,7 @@ fn what_is_expected_is_there_when_it_is_asked_for() {
     assert!(stats.expected > 0 && stats.expected + stats.misses >= 40, "{stats:?}");
     assert!(stats.bytes_used > 0 && stats.bytes_used < stats.bytes_read, "{stats:?}");
     // Where there is no room, nothing is fetched to be thrown away.
-    plain.expect(0, 0, rects[0]);
+    plain.prefetch(0, 0, rects[0]);
     assert_eq!(plain.stats().expected, 0);
 }
 

@@ -9,7 +9,7 @@ use super::*;
 mod formats;
 mod reprojection;
 
-use crate::rehearse::{self, Settings};
+use crate::synth::{self, Settings};
 
 fn city() -> tempfile::TempDir {
     city_of(24)
@@ -20,7 +20,7 @@ fn city_of(views: u32) -> tempfile::TempDir {
     // Nothing moves, so that photos have no masks.
     let city = CitySettings { traffic: Traffic::None, ..CitySettings::default() };
     let settings = Settings { city, views, width: 48, height: 32, ..Settings::default() };
-    rehearse::write(folder.path(), &settings, &|_, _, _| ()).unwrap();
+    synth::write(folder.path(), &settings, &|_, _, _| ()).unwrap();
     folder
 }
 

@@ -8,7 +8,7 @@ use city::{CitySettings, Traffic};
 use dataset::ingest;
 use dataset::mips;
 use dataset::open::{self, OpenOptions};
-use dataset::rehearse::{self, Settings};
+use dataset::synth::{self, Settings};
 use glam::Vec3;
 use image::{DynamicImage, ImageFormat, Rgb, RgbImage, Rgba, RgbaImage};
 use scene::frame;
@@ -187,7 +187,7 @@ impl Corpus {
         let folder = tempfile::tempdir().expect("a folder");
         let city = CitySettings { traffic: Traffic::None, ..CitySettings::default() };
         let settings = Settings { city, views: 24, width: 48, height: 32, ..Settings::default() };
-        rehearse::write(folder.path(), &settings, &|_, _, _| ()).expect("a city");
+        synth::write(folder.path(), &settings, &|_, _, _| ()).expect("a city");
         for (name, codec) in ["cameras", "images", "points3D"].into_iter().zip(&colmap_binary()) {
             let bytes = fs::read(folder.path().join(format!("sparse/0/{name}.bin"))).expect("the city has it");
             self.plain(&format!("city {name}.bin"), bytes, codec);

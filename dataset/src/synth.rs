@@ -140,7 +140,7 @@ pub struct Summary {
 
 /// Why there is no rehearsal.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum RehearseError {
+pub enum SynthError {
     /// A setting is out of range, or the folder is not free.
     #[error(transparent)]
     BadInput(#[from] BadInput),
@@ -156,7 +156,7 @@ pub type Progress<'a> = &'a (dyn Fn(&'static str, usize, usize) + Sync);
 ///
 /// # Errors
 /// Settings out of range, or a folder or file that cannot be written.
-pub fn write(out: &Path, settings: &Settings, progress: Progress) -> Result<Summary, RehearseError> {
+pub fn write(out: &Path, settings: &Settings, progress: Progress) -> Result<Summary, SynthError> {
     settings.check()?;
     manifest::claim(out, settings)?;
     let city = City::generate(&settings.city)?;
@@ -199,7 +199,7 @@ pub fn write(out: &Path, settings: &Settings, progress: Progress) -> Result<Summ
 ///
 /// # Errors
 /// As those of [`write`].
-pub fn replace(out: &Path, settings: &Settings, progress: Progress) -> Result<Summary, RehearseError> {
+pub fn replace(out: &Path, settings: &Settings, progress: Progress) -> Result<Summary, SynthError> {
     settings.check()?;
     manifest::forget(out, settings)?;
     write(out, settings, progress)

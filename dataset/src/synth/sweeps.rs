@@ -18,7 +18,7 @@ use serde_json::json;
 use store::file::{SaveError, save};
 
 use super::views::Station;
-use super::{Progress, RehearseError, Settings, impossible, make};
+use super::{Progress, SynthError, Settings, impossible, make};
 
 /// Writes `lidar/` and `radar/`, as far as they are asked for.
 pub(super) fn write(
@@ -28,7 +28,7 @@ pub(super) fn write(
     stations: &[Station],
     settings: &Settings,
     progress: Progress,
-) -> Result<(), RehearseError> {
+) -> Result<(), SynthError> {
     let seed = settings.city.seed;
     if settings.lidar {
         let lidar = Lidar { seed, ..Lidar::default() };
@@ -37,7 +37,7 @@ pub(super) fn write(
             let sweep = sweep.map_err(|e: SenseError| impossible(&e))?;
             let read: Vec<&Return> = sweep.returns.iter().filter(|point| !point.lost).collect();
             save_points(folder, station, &read)?;
-            Ok::<_, RehearseError>(read.len())
+            Ok::<_, SynthError>(read.len())
         };
         sense("lidar", &lidar.mount, out, legs, stations, settings, progress, &turn)?;
     }
@@ -55,7 +55,7 @@ pub(super) fn write(
 }
 
 /// Measures at a station, writes what was measured into a folder, and says how much it was.
-type Measure<'a> = &'a (dyn Fn(&Station, &Rigid, &Motion, &Path) -> Result<usize, RehearseError> + Sync);
+type Measure<'a> = &'a (dyn Fn(&Station, &Rigid, &Motion, &Path) -> Result<usize, SynthError> + Sync);
 
 /// Measures at all stations where the sensor is not silent, and writes when and where that was.
 fn sense(
@@ -67,11 +67,11 @@ fn sense(
     settings: &Settings,
     progress: Progress,
     measure: Measure,
-) -> Result<(), RehearseError> {
+) -> Result<(), SynthError> {
     let folder = out.join(what);
     make(&folder)?;
     let done = AtomicUsize::new(0);
-    let one = |station: &Station| -> Result<Option<String>, RehearseError> {
+    let one = |station: &Station| -> Result<Option<String>, SynthError> {
         progress(what, done.fetch_add(1, Ordering::Relaxed) + 1, stations.len());
         let place = legs.get(station.leg).and_then(|leg| carried(leg, mount, station.seconds));
         let Some((pose, motion)) = place.filter(|_| !faults::is_silent(&settings.faults, what, station.seconds)) else {

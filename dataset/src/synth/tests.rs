@@ -177,7 +177,7 @@ fn settings_out_of_range_are_refused_before_anything_is_made() {
         Settings { city: CitySettings { area_km2: 26.0, ..small().city }, ..small() },
     ] {
         let refusal = write(&out, &wrong, &|_, _, _| ()).unwrap_err();
-        assert!(matches!(refusal, RehearseError::BadInput(_)) && !refusal.to_string().contains('\n'), "{refusal}");
+        assert!(matches!(refusal, SynthError::BadInput(_)) && !refusal.to_string().contains('\n'), "{refusal}");
         assert!(!out.exists());
     }
 }

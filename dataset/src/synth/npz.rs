@@ -14,7 +14,7 @@ use store::file::{SaveError, save};
 use zip::write::SimpleFileOptions;
 use zip::{CompressionMethod, DateTime, ZipWriter};
 
-use super::{Progress, RehearseError, impossible, make};
+use super::{Progress, SynthError, impossible, make};
 
 /// A place of which voxels are asked for.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
@@ -54,14 +54,14 @@ const VOXELS_AT_ONCE: f64 = 2e8;
 /// Writes the whole city in blocks, `occupancy/X_Y.npz` where X and Y count blocks from the south-west: semantic (u8),
 /// instance (u32), each by z, y, x; origin (f64, the lowest corner), voxel (f64, its side), both metres; world_from_grid
 /// (f64, 4 × 4): here the identity.
-pub(super) fn blocks(out: &Path, city: &City, voxel: f64, progress: Progress) -> Result<(), RehearseError> {
+pub(super) fn blocks(out: &Path, city: &City, voxel: f64, progress: Progress) -> Result<(), SynthError> {
     let folder = out.join("occupancy");
     make(&folder)?;
     let side = (city.extent_metres / BLOCK).ceil().max(1.0) as usize;
     let (low, high) = heights(city);
     let corner = |i: usize| -0.5 * city.extent_metres + i as f64 * BLOCK;
     let done = AtomicUsize::new(0);
-    let one = |&(x, y): &(usize, usize)| -> Result<(), RehearseError> {
+    let one = |&(x, y): &(usize, usize)| -> Result<(), SynthError> {
         let from = DVec3::new(corner(x), corner(y), low);
         let grid = Grid::of_block(from, DVec3::new(corner(x + 1), corner(y + 1), high), voxel);
         let filled = grid.and_then(|grid| voxels(city, 0.0, &grid)).map_err(|e: GridError| impossible(&e))?;
@@ -82,7 +82,7 @@ pub(super) fn blocks(out: &Path, city: &City, voxel: f64, progress: Progress) ->
 
 /// Writes the voxels around each place, `occupancy/around_N.npz` in the order of the places: as blocks, and
 /// world_from_grid (f64, 4 × 4), in whose axes the origin is.
-pub(super) fn around(out: &Path, city: &City, voxel: f64, places: &[Around]) -> Result<(), RehearseError> {
+pub(super) fn around(out: &Path, city: &City, voxel: f64, places: &[Around]) -> Result<(), SynthError> {
     let folder = out.join("occupancy");
     make(&folder)?;
     for (i, place) in places.iter().enumerate() {

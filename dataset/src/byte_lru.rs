@@ -6,13 +6,13 @@ use lru::LruCache;
 
 /// Values by key; where they come to more than so many bytes together, the least recently used goes first.
 #[derive(Debug)]
-pub struct Bounded<K: Hash + Eq, V> {
+pub struct ByteLru<K: Hash + Eq, V> {
     all: LruCache<K, (usize, V)>,
     bytes: usize,
     limit: usize,
 }
 
-impl<K: Hash + Eq, V> Bounded<K, V> {
+impl<K: Hash + Eq, V> ByteLru<K, V> {
     /// Nothing yet, and never more than `limit` bytes.
     pub fn new(limit: usize) -> Self {
         Self { all: LruCache::unbounded(), bytes: 0, limit }
@@ -59,7 +59,7 @@ mod tests {
 
     #[test]
     fn the_least_recently_used_goes_first() {
-        let mut kept = Bounded::new(100);
+        let mut kept = ByteLru::new(100);
         kept.put('a', 1, 40);
         kept.put('b', 2, 40);
         assert_eq!(kept.get(&'a'), Some(&1));

@@ -15,7 +15,7 @@ use image::{Rgb, RgbImage};
 use rayon::prelude::*;
 
 use super::views::views;
-use super::{Progress, RehearseError, Settings, impossible};
+use super::{Progress, SynthError, Settings, impossible};
 
 /// Tiles in a row.
 const COLUMNS: u32 = 6;
@@ -28,7 +28,7 @@ const CAPTION: u32 = 12;
 ///
 /// # Errors
 /// Settings out of range.
-pub fn gallery(settings: &Settings, progress: Progress) -> Result<RgbImage, RehearseError> {
+pub fn gallery(settings: &Settings, progress: Progress) -> Result<RgbImage, SynthError> {
     settings.check()?;
     let (mut tiles, total) = (Vec::new(), 2 * Layout::ALL.len() + 8 + Kind::ALL.len());
     let add = |tiles: &mut Vec<(String, RgbImage)>, name: String, tile| {
@@ -66,20 +66,20 @@ pub fn gallery(settings: &Settings, progress: Progress) -> Result<RgbImage, Rehe
     Ok(sheet(settings, &tiles))
 }
 
-fn take(world: &World, shot: &Shot, faults: &[Fault]) -> Result<Frame, RehearseError> {
+fn take(world: &World, shot: &Shot, faults: &[Fault]) -> Result<Frame, SynthError> {
     let options = Options { samples: 3, faults: faults.to_vec(), ..Options::default() };
     Ok(frame(world, shot, &options).map_err(|e| impossible(&e))?)
 }
 
 /// The city from a corner, all of it.
-fn above(city: &City, settings: &Settings) -> Result<Shot, RehearseError> {
+fn above(city: &City, settings: &Settings) -> Result<Shot, SynthError> {
     let lens = pinhole(settings.width, settings.height, 60.0).map_err(|e| impossible(&e))?;
     let from = city.extent_metres * DVec3::new(-0.62, -0.62, 0.6);
     Ok(Shot::new("above".into(), "above", 5.0, looking(lens, from, -from.with_z(from.z * 1.08), DVec3::Z)))
 }
 
 /// Ahead from a car, where of some places along all streets the most goes on.
-fn street(world: &World, settings: &Settings) -> Result<Shot, RehearseError> {
+fn street(world: &World, settings: &Settings) -> Result<Shot, SynthError> {
     let city = world.city();
     let mut rig = Rig { width: settings.width, height: settings.height, fleet: true, ..Rig::default() };
     rig.cameras.truncate(1);
@@ -91,7 +91,7 @@ fn street(world: &World, settings: &Settings) -> Result<Shot, RehearseError> {
     let tried: Vec<&Shot> = inside.iter().copied().step_by(inside.len().div_ceil(PLACES).max(1)).collect();
     let lens = pinhole(96, 54, 80.0).map_err(|e| impossible(&e))?;
     let sketch = Options { samples: 1, corners: false, ..Options::default() };
-    let life = |shot: &&Shot| -> Result<f64, RehearseError> {
+    let life = |shot: &&Shot| -> Result<f64, SynthError> {
         let mut small = (*shot).clone();
         small.camera.pinhole = lens;
         Ok(liveliness(&frame(world, &small, &sketch).map_err(|e| impossible(&e))?))
@@ -126,7 +126,7 @@ fn spoilt(shot: &Shot, faults: &[Fault]) -> Shot {
 }
 
 /// The shot with the highest gain of two minutes at the left, with the lowest at the right.
-fn drift(world: &World, shot: &Shot, faults: &[Fault]) -> Result<RgbImage, RehearseError> {
+fn drift(world: &World, shot: &Shot, faults: &[Fault]) -> Result<RgbImage, SynthError> {
     let later = (0..120).map(|i| Shot { seconds: shot.seconds + f64::from(i), ..shot.clone() }).collect();
     let gains: Vec<f32> = faults::spoil_shots(later, faults).iter().map(|shot| shot.exposure).collect();
     let with = |exposure: Option<f32>| {
@@ -142,7 +142,7 @@ fn drift(world: &World, shot: &Shot, faults: &[Fault]) -> Result<RgbImage, Rehea
 }
 
 /// What the reported camera would see, over what the true one saw.
-fn ghost(world: &World, shot: &Shot, faults: &[Fault]) -> Result<RgbImage, RehearseError> {
+fn ghost(world: &World, shot: &Shot, faults: &[Fault]) -> Result<RgbImage, SynthError> {
     let spoilt = spoilt(shot, faults);
     let seen = take(world, &spoilt, &[])?;
     let told = take(world, &Shot { camera: spoilt.reported, ..spoilt }, &[])?;
@@ -191,7 +191,7 @@ fn labels(frame: &Frame) -> [(&'static str, RgbImage); 8] {
 }
 
 /// The city from straight above with the places of cameras: white those that are kept, red those that are lost.
-fn map(world: &World, settings: &Settings, faults: &[Fault]) -> Result<RgbImage, RehearseError> {
+fn map(world: &World, settings: &Settings, faults: &[Fault]) -> Result<RgbImage, SynthError> {
     let lens = pinhole(settings.width, settings.height, 60.0).map_err(|e| impossible(&e))?;
     let height = 0.6 * world.city().extent_metres * lens.fx / f64::from(lens.height.min(lens.width));
     let nadir = looking(lens, DVec3::Z * height * 1.2, DVec3::NEG_Z, DVec3::Y);

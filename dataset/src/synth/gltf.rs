@@ -16,7 +16,7 @@ use scene::BadInput;
 use serde_json::{Value, json};
 use store::file::save;
 
-use super::RehearseError;
+use super::SynthError;
 use super::cameras::ORIGIN;
 
 const FLOAT: u32 = 5126;
@@ -25,7 +25,7 @@ const ARRAY_BUFFER: u32 = 34962;
 const ELEMENT_ARRAY_BUFFER: u32 = 34963;
 
 /// Writes `city.glb`.
-pub(super) fn write(out: &Path, city: &City) -> Result<(), RehearseError> {
+pub(super) fn write(out: &Path, city: &City) -> Result<(), SynthError> {
     let path = out.join("city.glb");
     // lengths in the file have 32 bits: found out before anything is built
     let size = |mesh: &Mesh| 20 * mesh.positions.len() as u64 + 12 * mesh.triangles.len() as u64;

@@ -9,7 +9,7 @@ use scene::BadInput;
 use serde_json::{Value, json};
 use store::file::{SaveError, save};
 
-use super::{RehearseError, Settings, Summary, make};
+use super::{SynthError, Settings, Summary, make};
 
 const NAME: &str = "manifest.json";
 /// Everything else that a rehearsal writes.
@@ -34,7 +34,7 @@ const FILES: [&str; 6] =
 
 /// Makes the folder, and says in it what is being made. A folder that has anything else in it is refused: nothing of
 /// anybody's is overwritten, and no photo of another city stays between the new ones.
-pub(super) fn claim(out: &Path, settings: &Settings) -> Result<(), RehearseError> {
+pub(super) fn claim(out: &Path, settings: &Settings) -> Result<(), SynthError> {
     make(out)?;
     let is_empty = fs::read_dir(out).map_err(|e| SaveError::new(out, &e))?.next().is_none();
     if !is_empty && made_with(out) != Some(json!(settings)) {

@@ -13,7 +13,7 @@ use rayon::prelude::*;
 use store::file::{SaveError, save};
 
 use super::scene_files::Instances;
-use super::{Progress, RehearseError, Settings, city_moves, impossible, make, truth};
+use super::{Progress, SynthError, Settings, city_moves, impossible, make, truth};
 
 /// Pixels of photos that are in the making at once.
 const PIXELS_AT_ONCE: usize = 1 << 23;
@@ -51,7 +51,7 @@ pub(super) fn take(
     shots: &[Shot],
     settings: &Settings,
     progress: Progress,
-) -> Result<Taken, RehearseError> {
+) -> Result<Taken, SynthError> {
     let masks = city_moves(world.city());
     make(&out.join("images"))?;
     if masks {
@@ -68,7 +68,7 @@ pub(super) fn take(
     let instances = Instances::new(world.city());
     let mut all = Taken { seeds: Vec::with_capacity(shots.len()), boxes: Vec::with_capacity(shots.len()) };
     for (start, chunk) in shots.chunks(chunk).enumerate().map(|(i, shots)| (i * chunk, shots)) {
-        let one = |(i, shot): (usize, &Shot)| -> Result<(Vec<Seed>, String), RehearseError> {
+        let one = |(i, shot): (usize, &Shot)| -> Result<(Vec<Seed>, String), SynthError> {
             let taken = frame(world, shot, &options).map_err(|e| impossible(&e))?;
             let name = format!("{}.png", shot.name);
             png(&out.join("images").join(&name), &taken.rgb, &taken, ColorType::Rgb8)?;
