@@ -2,6 +2,8 @@
 
 mod bench;
 mod cluster;
+#[cfg(test)]
+mod reference;
 mod sweep;
 mod synth;
 
