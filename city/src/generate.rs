@@ -14,6 +14,7 @@ use crate::materials;
 use crate::parcels::{Parcel, Placement, upright};
 use crate::props::Prop;
 use crate::random::Random;
+use crate::lattice::lay_roads;
 use crate::roads::Roads;
 use crate::settings::CitySettings;
 use crate::terrain::Terrain;
@@ -31,7 +32,7 @@ impl City {
         let random = Random::new(settings.seed);
         let plain_edge = if settings.plain > 0.0 { (settings.plain - 0.5) * extent } else { f64::NEG_INFINITY };
         let terrain = Terrain::new(&random, settings.layout, 0.5 * extent, plain_edge);
-        let plan = Plan { settings: *settings, roads: Roads::new(settings, &random), terrain, random };
+        let plan = Plan { settings: *settings, roads: lay_roads(settings, &random), terrain, random };
         let deck = Deck::new(&plan.roads, &plan.terrain);
         let (materials, texts) = materials::table();
         let streets = traffic::free_lanes(&plan.roads, &plan.terrain, deck.as_ref());

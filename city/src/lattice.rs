@@ -7,9 +7,27 @@ use crate::random::Random;
 use crate::roads::{Block, Edge, Quarter, RoadKind, Roads, STEP};
 use crate::settings::{CitySettings, Layout};
 
+/// Cities narrower than this have no room for three alleys to a cell, nor, unless compact, for bends, metres.
+const NARROW_METRES: f64 = 130.0;
+/// Shortest span of lattice lines that a deck with its ramps fits on in a compact city, metres.
+const MIN_DECK_SPAN: f64 = 128.0;
+
+/// Lays out the road network of a city.
+pub(crate) fn lay_roads(settings: &CitySettings, random: &Random) -> Roads {
+    let mut lattice = Lattice::new(settings, random);
+    let mut roads = lattice.cut();
+    for index in 0..roads.edges.len() {
+        let kind = roads.kind_of(index);
+        roads.edges[index] = kind.map(|kind| Edge { profile: kind.profile(), path: Vec::new() });
+    }
+    lattice.draw(&mut roads);
+    roads
+}
+
 /// The lattice before and after it is bent.
-pub(crate) struct Lattice {
+struct Lattice {
     layout: Layout,
+    is_compact: bool,
     xs: Vec<f64>,
     ys: Vec<f64>,
     fine: usize,
@@ -30,18 +48,30 @@ struct Bend {
 }
 
 impl Lattice {
-    pub(crate) fn new(settings: &CitySettings, random: &Random) -> Self {
+    fn new(settings: &CitySettings, random: &Random) -> Self {
         let mut random = random.fork(0x40AD);
         let layout = settings.layout;
         let extent = settings.extent_metres();
         let half = 0.5 * extent;
         // a strip beside a wide plain has no room for bends and alleys
-        let narrow = (1.0 - settings.plain) * extent < 130.0;
-        let bends = if narrow { Vec::new() } else { bends(layout, extent, &mut random) };
+        let width = (1.0 - settings.plain) * extent;
+        let is_narrow = width < NARROW_METRES;
+        let is_compact = settings.is_compact();
+        let bends = match (is_compact, is_narrow) {
+            (true, _) => compact_bends(layout, width, &mut random),
+            (false, true) => Vec::new(),
+            (false, false) => bends(layout, extent, &mut random),
+        };
         let reach = |shift_y: bool| bends.iter().filter(|b| b.shift_y == shift_y).map(|b| b.amplitude).sum::<f64>();
-        let border = RoadKind::Street.profile().front() + 0.5;
+        let outer = if is_compact { RoadKind::Lane } else { RoadKind::Street };
+        let border = outer.profile().front() + 0.5;
         let (reach_x, reach_y) = (reach(false) + border, reach(true) + border);
-        let fine = if !narrow && matches!(layout, Layout::Alley | Layout::Mixed) { 3 } else { 1 };
+        let fine = match layout {
+            Layout::Alley | Layout::Mixed if !is_narrow => 3,
+            // a cell of 30 m has room for one alley
+            Layout::Alley if is_compact => 2,
+            _ => 1,
+        };
         let [wide, tall] = match layout {
             Layout::CurvedCorridor => [84.0, 72.0],
             Layout::Winding => [100.0, 84.0],
@@ -55,11 +85,21 @@ impl Lattice {
         }
         let west = -half + settings.plain * extent;
         let decked = matches!(layout, Layout::Deck | Layout::Mixed);
-        let xs = lines([west + reach_x, half - reach_x], wide, fine, jitter, &mut random, &|_, _| false);
-        let deck = |line: usize, main: usize| decked && line == main / 2;
-        let ys = lines([-half + reach_y, half - reach_y], tall, fine, jitter, &mut random, &deck);
+        // the road on a main line, which alleys keep clear of
+        let main_road = if is_compact && layout == Layout::Alley { RoadKind::Lane } else { RoadKind::Street };
+        let no_deck = |_: usize, _: usize| main_road;
+        let deck = |line: usize, main: usize| {
+            if decked && line == main / 2 { RoadKind::Boulevard } else { main_road }
+        };
+        // a compact city keeps two rows (see `CitySettings::is_compact`), a mixed one two columns where they fit
+        let min_rows = if is_compact { 2 } else { 1 };
+        let min_columns = if is_compact && !is_narrow && layout == Layout::Mixed { 2 } else { 1 };
+        let x_span = [west + reach_x, half - reach_x];
+        let xs = Spacing { pitch: wide, min_cells: min_columns, fine, jitter }.lines(x_span, &mut random, &no_deck);
+        let y_span = [-half + reach_y, half - reach_y];
+        let ys = Spacing { pitch: tall, min_cells: min_rows, fine, jitter }.lines(y_span, &mut random, &deck);
         let region = [&xs, &ys].map(|l| (((l.len() - 1) / fine) as f64 / 3.0).clamp(1.0, 4.0).floor());
-        Self { layout, xs, ys, fine, bends, random, region }
+        Self { layout, is_compact, xs, ys, fine, bends, random, region }
     }
 
     /// The layout of a main cell.
@@ -74,14 +114,23 @@ impl Lattice {
     }
 
     /// Quarters, some of them joined, and blocks.
-    pub(crate) fn cut(&mut self) -> Roads {
+    fn cut(&mut self) -> Roads {
         let fine = self.fine;
         let cells = [self.xs.len() - 1, self.ys.len() - 1];
         let (columns, rows) = (cells[0] / fine, cells[1] / fine);
         let decked = matches!(self.layout, Layout::Deck | Layout::Mixed);
-        let deck = (decked && rows > 1).then_some((rows / 2) * fine);
-        let mut roads =
-            Roads { cells, fine, edges: Vec::new(), nodes: Vec::new(), quarters: Vec::new(), blocks: Vec::new(), deck };
+        let is_long = !self.is_compact || self.xs[cells[0]] - self.xs[0] >= MIN_DECK_SPAN;
+        let deck = (decked && is_long && rows > 1).then_some((rows / 2) * fine);
+        let mut roads = Roads {
+            cells,
+            fine,
+            edges: Vec::new(),
+            nodes: Vec::new(),
+            quarters: Vec::new(),
+            blocks: Vec::new(),
+            deck,
+            is_compact: self.is_compact,
+        };
         roads.edges = vec![None; cells[0] * (cells[1] + 1) + (cells[0] + 1) * cells[1]];
         for row in 0..rows {
             let mut i = 0;
@@ -156,7 +205,7 @@ impl Lattice {
     }
 
     /// Lays centre lines through the lattice, cut back at crossings.
-    pub(crate) fn draw(&self, roads: &mut Roads) {
+    fn draw(&self, roads: &mut Roads) {
         let place = |i: usize, j: usize| self.bend(self.xs[i], self.ys[j]);
         let [nx, ny] = roads.cells;
         roads.nodes = (0..=ny).flat_map(|j| (0..=nx).map(move |i| (i, j))).map(|(i, j)| place(i, j)).collect();
@@ -208,18 +257,45 @@ impl Lattice {
     }
 }
 
-/// Shifts whose slopes stay under 0.75 (one direction only) or 0.45 (both).
-fn bends(layout: Layout, extent: f64, random: &mut Random) -> Vec<Bend> {
-    let mut bend = |layout: Layout, shift_y: bool, length: f64, slope: f64| {
+impl Bend {
+    /// A bend of this wavelength (metres) and steepest slope, at a random phase.
+    fn new(layout: Layout, shift_y: bool, length: f64, slope: f64, random: &mut Random) -> Self {
         let wave = std::f64::consts::TAU / length;
-        Bend {
-            layout,
-            shift_y,
-            amplitude: slope / wave,
-            wave,
-            phase: f64::from(random.range(0.0, std::f32::consts::TAU)),
-        }
-    };
+        let phase = f64::from(random.range(0.0, std::f32::consts::TAU));
+        Self { layout, shift_y, amplitude: slope / wave, wave, phase }
+    }
+}
+
+/// The bends of a compact city: shorter waves than those of [`bends`], so that a street of 60 m shows one, and with less
+/// amplitude, because the bends take their reach from the blocks.
+fn compact_bends(layout: Layout, width: f64, random: &mut Random) -> Vec<Bend> {
+    let mut bend =
+        |layout: Layout, shift_y: bool, length: f64, slope: f64| Bend::new(layout, shift_y, length, slope, random);
+    use Layout::{Alley, CurvedCorridor, Winding};
+    match layout {
+        Layout::Grid | Layout::Deck => Vec::new(),
+        Alley => vec![bend(Alley, true, 87.0, 0.12), bend(Alley, false, 71.0, 0.1)],
+        CurvedCorridor => vec![bend(CurvedCorridor, true, (0.9 * width).clamp(80.0, 200.0), 0.4)],
+        Winding => vec![
+            bend(Winding, true, (1.1 * width).clamp(90.0, 170.0), 0.22),
+            bend(Winding, false, (0.9 * width).clamp(75.0, 150.0), 0.16),
+        ],
+        // two rows of one cell each, without winding streets and alleys
+        Layout::Mixed if width < NARROW_METRES => vec![bend(CurvedCorridor, true, 90.0, 0.3)],
+        Layout::Mixed => vec![
+            bend(CurvedCorridor, true, 110.0, 0.25),
+            bend(Winding, true, 110.0, 0.2),
+            bend(Winding, false, 100.0, 0.2),
+            bend(Alley, true, 87.0, 0.1),
+            bend(Alley, false, 71.0, 0.1),
+        ],
+    }
+}
+
+/// Bends whose slopes stay under 0.75 (one direction only) or 0.45 (both).
+fn bends(layout: Layout, extent: f64, random: &mut Random) -> Vec<Bend> {
+    let mut bend =
+        |layout: Layout, shift_y: bool, length: f64, slope: f64| Bend::new(layout, shift_y, length, slope, random);
     use Layout::{CurvedCorridor, Winding};
     match layout {
         Layout::Grid | Layout::Deck => Vec::new(),
@@ -251,35 +327,44 @@ fn bends(layout: Layout, extent: f64, random: &mut Random) -> Vec<Bend> {
     }
 }
 
-/// Lattice lines from one end to the other, main cells about `pitch` wide and `fine` lines to each; the lines between main
-/// ones divide what the main roads (`broad` at a boulevard) leave.
-fn lines(
-    [from, to]: [f64; 2],
+/// How lattice lines are spaced along one axis.
+struct Spacing {
+    /// Width of a main cell, about, metres.
     pitch: f64,
+    min_cells: usize,
+    /// Fine cells to a main cell.
     fine: usize,
+    /// Share by which the width of a main cell varies.
     jitter: f64,
-    random: &mut Random,
-    broad: &dyn Fn(usize, usize) -> bool,
-) -> Vec<f64> {
-    let main = (((to - from) / pitch).round() as usize).max(1);
-    let shares: Vec<f64> = (0..main).map(|_| 1.0 + jitter * f64::from(random.range(-1.0, 1.0))).collect();
-    let scale = (to - from) / shares.iter().sum::<f64>();
-    let beside = |line: usize| {
-        let kind = if broad(line, main) { RoadKind::Boulevard } else { RoadKind::Street };
-        kind.profile().front() - RoadKind::Alley.profile().front()
-    };
-    let mut lines = vec![from];
-    let mut at = from;
-    for (k, share) in shares.into_iter().enumerate() {
-        let (low, high) = (at + beside(k), at + share * scale - beside(k + 1));
-        for part in 1..fine {
-            let uneven = 0.15 * f64::from(random.range(-1.0, 1.0));
-            lines.push(low + (high - low) * (part as f64 + uneven) / fine as f64);
+}
+
+impl Spacing {
+    /// Lattice lines from one end to the other. Fine lines divide the width that the fronts of the main roads leave;
+    /// `main_road(line, cells)` is the kind of road on a main line.
+    fn lines(
+        &self,
+        [from, to]: [f64; 2],
+        random: &mut Random,
+        main_road: &dyn Fn(usize, usize) -> RoadKind,
+    ) -> Vec<f64> {
+        let Self { pitch, min_cells, fine, jitter } = *self;
+        let main = (((to - from) / pitch).round() as usize).max(min_cells);
+        let shares: Vec<f64> = (0..main).map(|_| 1.0 + jitter * f64::from(random.range(-1.0, 1.0))).collect();
+        let scale = (to - from) / shares.iter().sum::<f64>();
+        let inset = |line: usize| main_road(line, main).profile().front() - RoadKind::Alley.profile().front();
+        let mut lines = vec![from];
+        let mut at = from;
+        for (k, share) in shares.into_iter().enumerate() {
+            let (low, high) = (at + inset(k), at + share * scale - inset(k + 1));
+            for part in 1..fine {
+                let uneven = 0.15 * f64::from(random.range(-1.0, 1.0));
+                lines.push(low + (high - low) * (part as f64 + uneven) / fine as f64);
+            }
+            at += share * scale;
+            lines.push(at);
         }
-        at += share * scale;
-        lines.push(at);
+        lines
     }
-    lines
 }
 
 /// A road as seen from one of its ends.

@@ -95,6 +95,8 @@ impl<'a> Parcel<'a> {
         let layout = roads.quarters[roads.blocks[block].quarter].layout;
         let mut random = random.fork(0xB10C).fork(block as u64);
         let used = match (layout, random.unit()) {
+            // a compact city has too few blocks to give one away
+            _ if roads.is_compact => Use::Houses,
             (Layout::CurvedCorridor, _) => Use::Houses,
             (Layout::Alley, u) if u < 0.05 => Use::Square,
             (Layout::Alley, _) => Use::Houses,
@@ -163,7 +165,12 @@ impl<'a> Parcel<'a> {
             return;
         }
         let outline: Vec<DVec2> = self.roads.ring(&self.walk, &Profile::front).0.iter().map(|p| p.at).collect();
-        for (line, profile) in self.sides(&Profile::front) {
+        let mut sides = self.sides(&Profile::front);
+        if self.roads.is_compact {
+            // blocks are not deep enough for houses on all sides: those on the widest road come first
+            sides.sort_by(|a, b| b.1.front().total_cmp(&a.1.front()));
+        }
+        for (line, profile) in sides {
             self.row(&line, &profile, &outline);
         }
     }
@@ -172,6 +179,8 @@ impl<'a> Parcel<'a> {
         let unit = self.random.unit();
         match (self.layout, profile.kind) {
             (Layout::Winding, _) => HouseKind::Villa,
+            // back lanes get the shallowest houses
+            (_, RoadKind::Lane) if self.roads.is_compact => HouseKind::Old,
             (Layout::Alley, _) => HouseKind::Old,
             (Layout::CurvedCorridor, _) => HouseKind::Tall,
             (Layout::Deck, RoadKind::Boulevard) if unit < 0.35 => HouseKind::Tower,

@@ -13,9 +13,7 @@
 
 use glam::DVec2;
 
-use crate::lattice::Lattice;
-use crate::random::Random;
-use crate::settings::{CitySettings, Layout};
+use crate::settings::Layout;
 
 /// What a road is like across. Metres.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -115,6 +113,8 @@ pub(crate) struct Roads {
     pub(crate) blocks: Vec<Block>,
     /// The horizontal line that the deck runs over.
     pub(crate) deck: Option<usize>,
+    /// The city is compact: roads at its edge are lanes (see [`crate::CitySettings::is_compact`]).
+    pub(crate) is_compact: bool,
 }
 
 /// Points of a rounded corner between the roads that meet in it, without its ends: odd, so that one is the middle.
@@ -133,17 +133,6 @@ pub(crate) struct RingPoint {
 }
 
 impl Roads {
-    pub(crate) fn new(settings: &CitySettings, random: &Random) -> Self {
-        let mut lattice = Lattice::new(settings, random);
-        let mut roads = lattice.cut();
-        for index in 0..roads.edges.len() {
-            let kind = roads.kind_of(index);
-            roads.edges[index] = kind.map(|kind| Edge { profile: kind.profile(), path: Vec::new() });
-        }
-        lattice.draw(&mut roads);
-        roads
-    }
-
     pub(crate) fn node(&self, i: usize, j: usize) -> usize {
         i + j * (self.cells[0] + 1)
     }
@@ -202,7 +191,7 @@ impl Roads {
     }
 
     /// What road an edge is, if it is one: none inside a block.
-    fn kind_of(&self, index: usize) -> Option<RoadKind> {
+    pub(crate) fn kind_of(&self, index: usize) -> Option<RoadKind> {
         let horizontals = self.cells[0] * (self.cells[1] + 1);
         let line =
             if index < horizontals { index / self.cells[0] } else { (index - horizontals) % (self.cells[0] + 1) };
@@ -217,7 +206,7 @@ impl Roads {
             return Some(RoadKind::Boulevard);
         }
         let [Some(a), Some(b)] = sides.map(|s| s.map(|b| self.quarters[self.blocks[b].quarter].layout)) else {
-            return Some(RoadKind::Street);
+            return Some(if self.is_compact { RoadKind::Lane } else { RoadKind::Street });
         };
         Some(match (a, b) {
             (Layout::Alley, Layout::Alley) => RoadKind::Lane,
@@ -321,12 +310,15 @@ impl Roads {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::lattice::lay_roads;
+    use crate::random::Random;
+    use crate::settings::CitySettings;
 
     #[test]
     fn blocks_tile_the_lattice_and_every_road_leads_somewhere() {
         for &layout in Layout::ALL {
             let settings = CitySettings { layout, area_km2: 0.6, ..CitySettings::default() };
-            let roads = Roads::new(&settings, &Random::new(5));
+            let roads = lay_roads(&settings, &Random::new(5));
             let area = |l: &[usize; 4]| (l[1] - l[0]) * (l[3] - l[2]);
             assert_eq!(roads.blocks.iter().map(|b| area(&b.lines)).sum::<usize>(), roads.cells[0] * roads.cells[1]);
             for node in 0..roads.nodes.len() {
@@ -343,7 +335,7 @@ mod tests {
     #[test]
     fn opposite_sides_of_a_block_have_as_many_points_and_rings_nest() {
         let settings = CitySettings { layout: Layout::Mixed, area_km2: 0.6, ..CitySettings::default() };
-        let roads = Roads::new(&settings, &Random::new(6));
+        let roads = lay_roads(&settings, &Random::new(6));
         let area = |ring: &[RingPoint]| {
             let pairs = (0..ring.len()).map(|k| (ring[k].at, ring[(k + 1) % ring.len()].at));
             0.5 * pairs.map(|(a, b)| a.perp_dot(b)).sum::<f64>()

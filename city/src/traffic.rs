@@ -184,22 +184,23 @@ pub(crate) fn vehicles(
     let Some(level) = level(traffic).filter(|_| has_round(quarter)) else { return Vec::new() };
     let points = lane(roads, quarter.lines, terrain);
     let pace = if matches!(quarter.layout, Layout::Alley | Layout::Winding) { 0.6 } else { 1.0 };
-    drive(&points, &level, pace, &mut random)
+    // rounds of a compact city are short: light traffic could be none
+    drive(&points, &level, pace, usize::from(roads.is_compact), &mut random)
 }
 
 /// The vehicles on the deck.
 pub(crate) fn deck_vehicles(deck: &Deck, traffic: Traffic, random: &Random) -> Vec<Mover> {
     let Some(level) = level(traffic) else { return Vec::new() };
     // ramps bend upwards: all points stay
-    drive(&deck.round(), &level, 1.0, &mut random.fork(0xDEC4))
+    drive(&deck.round(), &level, 1.0, 0, &mut random.fork(0xDEC4))
 }
 
 /// Vehicles one after another on a round, with a factor on their speed. Buses and lorries do not drive: they would swing into
 /// the other lane at corners.
-fn drive(points: &[DVec3], level: &Level, pace: f64, random: &mut Random) -> Vec<Mover> {
+fn drive(points: &[DVec3], level: &Level, pace: f64, min_count: usize, random: &mut Random) -> Vec<Mover> {
     let speed = pace * f64::from(random.range(level.speed[0], level.speed[1]));
     let round = Round::new(points, leaning(points), speed);
-    let count = (round.whole / level.headway + f64::from(random.unit())) as usize;
+    let count = ((round.whole / level.headway + f64::from(random.unit())) as usize).max(min_count);
     let starts = round.starts(count, 0.25, random);
     starts
         .into_iter()
@@ -282,11 +283,18 @@ pub(crate) fn free_lanes(roads: &Roads, terrain: &Terrain, deck: Option<&Deck>) 
     for row in (1..rows).step_by(2) {
         let lines = [0, roads.cells[0], row * roads.fine, (row + 1) * roads.fine];
         lanes.push(close(lane(roads, lines, terrain)));
-        let mut quarters = roads.quarters.iter().filter(|q| q.row == row);
+        // in a compact city a row may be one quarter, which has been driven around
+        let mut quarters = roads.quarters.iter().filter(|q| q.row == row && !(roads.is_compact && q.lines == lines));
         while let Some(quarter) = quarters.next() {
             lanes.push(close(lane(roads, quarter.lines, terrain)));
             quarters.next();
         }
+    }
+    if roads.is_compact {
+        // the outer lane of the roads at the edge, counter-clockwise, so that every road is driven
+        let mut ring = roads.ring(&roads.outside(), &|p| p.lane).0;
+        ring.reverse();
+        lanes.push(close(thin(ring.iter().map(|p| terrain.at(p.at)).collect())));
     }
     lanes.extend(deck.into_iter().flat_map(|deck| [deck.lane(LANES[0], true), deck.lane(LANES[0], false)]));
     lanes.extend(alleys(roads, terrain));
