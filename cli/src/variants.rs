@@ -30,15 +30,15 @@ pub(crate) const VARIANTS: [Variant; 7] = [
     },
     Variant {
         name: "by-the-clock",
-        about: "finer pixels after fixed shares of the steps, not once the error has come down to what they show (train/src/need.rs)",
-        recipe: |recipe| Recipe { closer_at: 0.0, ..recipe },
+        about: "finer pixels after fixed shares of the steps, not once the error has come down to what they show (train/src/coarse_to_fine.rs)",
+        recipe: |recipe| Recipe { detail_factor: 0.0, ..recipe },
     },
     Variant {
         name: "all-at-once",
         about: "all splats within a tenth of the steps, as fast as doubling goes; without a growth schedule (Taming 3DGS, Mallick et al. 2024)",
         recipe: |recipe| {
             // Worth is judged over a long growth: here it would only cut the short one off.
-            let growth = Growth { from: 0.0, until: 0.1, at_most: 1.0, worth_db: 0.0, ..recipe.growth };
+            let growth = Growth { from: 0.0, until: 0.1, max_growth_share: 1.0, worth_db: 0.0, ..recipe.growth };
             Recipe { growth, ..recipe }
         },
     },
@@ -49,7 +49,7 @@ pub(crate) const VARIANTS: [Variant; 7] = [
     },
     Variant {
         name: "all-growth",
-        about: "growth to the budget, whatever it brings; without its early end (train/src/need.rs)",
+        about: "growth to the budget, whatever it brings; without its early end (train/src/coarse_to_fine.rs)",
         recipe: |recipe| Recipe { growth: Growth { worth_db: 0.0, ..recipe.growth }, ..recipe },
     },
     Variant {

@@ -1,5 +1,5 @@
-//! A training of fixed size on one thread, for counting its instructions: `.ci/check-instructions.sh` runs it under valgrind.
-//! Prints the instruction set that the kernels run on.
+//! Trains a fixed job on one thread, for counting instructions: `.ci/check-instructions.sh` runs it under valgrind.
+//! Prints the instruction set of the kernels.
 
 use std::sync::Arc;
 
@@ -28,7 +28,7 @@ fn main() {
     println!("{}", Isa::detect().name());
     let pool = rayon::ThreadPoolBuilder::new().num_threads(1).use_current_thread().build().expect("one thread");
     let splats = pool.install(steps);
-    assert!(splats.len() as u64 > SPLATS, "growth is part of what is counted");
+    assert!(splats.len() as u64 > SPLATS, "the count must include densification");
 }
 
 fn steps() -> Splats {
@@ -62,7 +62,7 @@ fn steps() -> Splats {
     train(job, &mut |_| Flow::Continue).expect("the views see the splats")
 }
 
-/// On a ring around the origin, looking at it.
+/// A camera on a ring around the origin, looking at it.
 fn view(n: u32) -> TrainView {
     let (sin, cos) = (f64::from(n) / f64::from(VIEWS) * std::f64::consts::TAU).sin_cos();
     let centre = DVec3::new(5.0 * cos, 5.0 * sin, 0.5);
@@ -75,14 +75,14 @@ fn view(n: u32) -> TrainView {
     TrainView { view: n, mip: 0, rect: camera.full(), camera }
 }
 
-/// Coloured splats of SH degree 3 in a ball of so many times 1.2 metres, the nearer two thirds of it empty if it is a large one.
+/// Coloured splats of SH degree 3 in a ball of `radius` times 1.2 m. If `radius` is above 1, its inner part is empty.
 fn cloud(key: u64, radius: f32) -> Splats {
     let mut splats = Splats::new(3);
-    let mut of = 0;
+    let mut next = 0;
     while (splats.len() as u64) < SPLATS {
-        let row = of;
+        let row = next;
         let number = |k: u64| random::uniform(key, 32 * row + k);
-        of += 1;
+        next += 1;
         let position = (Vec3::new(number(0), number(1), number(2)) * 2.0 - 1.0) * radius;
         if radius > 1.0 && position.length() < 2.0 {
             continue;

@@ -1,25 +1,25 @@
-//! Exposures of views: what they make of a drawn picture, the gradient of that, and how they are trained.
+//! Applies per-view exposures to renders, computes their gradients and trains them with Adam.
 //!
-//! They are trained once, where the whole scene is (the root of a tree), and given to all others as they are, so that
-//! neighbouring blocks agree on colours. Splats and exposures know colours only up to a common transform: the mean of all
-//! exposures is kept at the identity, and so a held-out view, drawn without one, shows the mean exposure.
+//! Exposures are trained once, in the block that covers the whole scene (the root of the tree), and stay fixed in all others, so that
+//! neighbouring blocks agree on colours. Splats and exposures determine colours only up to a common transform. That freedom is removed by
+//! keeping the mean of all exposures at the identity. A held-out view is rendered without one and shows the mean exposure.
 
 use std::collections::BTreeSet;
 
 use rayon::prelude::*;
 use scene::{Exposure, Exposures};
 
-use crate::TrainView;
+use crate::view::TrainView;
 
 const BETA1: f32 = 0.9;
 const BETA2: f32 = 0.999;
 const EPSILON: f32 = 1e-15;
-/// Pixels of a parallel job; their sums are added in order.
+/// Pixels per parallel job. The jobs' sums are added in order, for determinism.
 const CHUNK: usize = 1 << 14;
-/// Pixels whose sums are kept side by side, so that they need not wait for each other.
+/// Independent partial sums, for instruction-level parallelism.
 const LANES: usize = 16;
 
-/// A picture (three planes) as the view's photo shows it, into `out`.
+/// Applies an exposure to a render (three planes) and writes the result to `out`.
 pub fn expose(exposure: &Exposure, colour: &[f32], out: &mut Vec<f32>) {
     out.resize(colour.len(), 0.0);
     let [red, green, blue] = planes(colour);
@@ -29,7 +29,7 @@ pub fn expose(exposure: &Exposure, colour: &[f32], out: &mut Vec<f32>) {
     }
 }
 
-/// Turns the loss's gradient by the exposed picture into that by the drawn `colour`, in place, and returns that by the
+/// ViewOrder the loss's gradient by the exposed picture into that by the drawn `colour`, in place, and returns that by the
 /// exposure. Pixels that do not count have no gradient, and so no say.
 pub fn expose_backward(exposure: &Exposure, colour: &[f32], gradient: &mut [f32]) -> [[f32; 4]; 3] {
     let [red, green, blue] = planes(colour);
@@ -82,23 +82,24 @@ fn chunk_backward(exposure: &Exposure, colour: [&[f32]; 3], gradient: [&mut [f32
     sums.map(|row| row.map(|lanes| lanes.iter().map(|&sum| f64::from(sum)).sum()))
 }
 
-/// How much a change of the drawn picture changes the exposed one, as a factor of its square, mean over directions of colour.
+/// Mean factor, over colour directions, by which the exposure scales the square of a change of the render.
 pub(crate) fn square_gain(exposure: &Exposure) -> f32 {
     exposure.0.iter().flat_map(|row| &row[..3]).map(|value| value * value).sum::<f32>() / 3.0
 }
 
-/// Exposures under training, each with its own Adam: a view's steps are those that drew it.
+/// Exposures in training, each with its own Adam state. A view's step count is the number of times that it was rendered.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ExposureTraining {
-    /// In order.
+    /// Ascending.
     pub(crate) views: Vec<u32>,
-    /// Of each view: steps, and exposure, first and second moments, as rows of twelve.
+    /// Adam steps of each view.
     pub(crate) steps: Vec<u32>,
+    /// Exposure, first and second moment of each view, in rows of twelve.
     pub(crate) values: [Vec<[f32; 12]>; 3],
 }
 
 impl ExposureTraining {
-    /// All at the identity.
+    /// Identity exposures of all views.
     pub fn new(views: &[TrainView]) -> Self {
         let views: BTreeSet<u32> = views.iter().map(|view| view.view).collect();
         let rows = |row: [f32; 12]| vec![row; views.len()];
@@ -111,12 +112,13 @@ impl ExposureTraining {
         self.views.binary_search(&view).ok().map(|at| Exposure(rows(&self.values[0][at])))
     }
 
-    /// As they are now.
+    /// The current exposures.
     pub fn exposures(&self) -> Exposures {
         self.views.iter().zip(&self.values[0]).map(|(&view, row)| (view, Exposure(rows(row)))).collect()
     }
 
-    /// A step of `rate` down the gradient of one view's exposure; all then move by as much as keeps their mean the identity.
+    /// One Adam step with learning rate `rate` on the exposure of one view. Then shifts all exposures so that their mean stays
+    /// the identity.
     pub fn step(&mut self, view: u32, gradient: &[[f32; 4]; 3], rate: f32) {
         let (Ok(at), true) =
             (self.views.binary_search(&view), gradient.iter().flatten().all(|value| value.is_finite()))
@@ -156,7 +158,7 @@ mod tests {
     use scene::{Camera, Pinhole, Pixels, Rect, Rigid};
 
     use super::*;
-    use crate::loss::Photometric;
+    use crate::loss::PhotometricLoss;
     use crate::random::uniform;
 
     fn exposure(key: u64) -> Exposure {
@@ -166,7 +168,7 @@ mod tests {
     }
 
     #[test]
-    fn gradients_agree_with_differences() {
+    fn gradients_agree_with_finite_differences() {
         // A size that is no multiple of the lanes, of more than one chunk.
         let (width, height) = (131usize, 127usize);
         let area = width * height;
@@ -176,7 +178,7 @@ mod tests {
         let rgb = (0..3 * area).map(|i| (255.0 * uniform(2, i as u64)) as u8).collect();
         let photo = Pixels { width: width as u32, height: height as u32, rgb, mask: Some(mask) };
         let weights: Vec<f32> = photo.mask.iter().flatten().map(|&mask| f32::from(mask) / 255.0).collect();
-        // A quadratic loss, in f64, so that differences are exact: half the squared error of what counts.
+        // A quadratic loss, in f64, so that differences are exact: half the weighted squared error.
         let loss = |exposure: &[[f64; 4]; 3], colour: &[f64]| -> f64 {
             let shown = |r: usize, i: usize| {
                 let [a, b, c, add] = exposure[r];
@@ -194,13 +196,13 @@ mod tests {
         let by_exposure = expose_backward(&exposure, &colour, &mut gradient);
 
         let exact = exposure.0.map(|row| row.map(f64::from));
-        let drawn: Vec<f64> = colour.iter().map(|&value| f64::from(value)).collect();
+        let rendered: Vec<f64> = colour.iter().map(|&value| f64::from(value)).collect();
         for r in 0..3 {
             for c in 0..4 {
                 let at = |step: f64| {
                     let mut moved = exact;
                     moved[r][c] += step;
-                    loss(&moved, &drawn)
+                    loss(&moved, &rendered)
                 };
                 let slope = (at(1e-3) - at(-1e-3)) / 2e-3;
                 let found = f64::from(by_exposure[r][c]);
@@ -209,7 +211,7 @@ mod tests {
         }
         for i in [0, 57, area - 40, 2 * area + 1, 3 * area - 40, 99, 100, 130] {
             let at = |step: f64| {
-                let mut moved = drawn.clone();
+                let mut moved = rendered.clone();
                 moved[i] += step;
                 loss(&exact, &moved)
             };
@@ -218,20 +220,20 @@ mod tests {
             assert!(i % area % width < 100 || gradient[i] == 0.0, "{i} is under the mask");
         }
 
-        // And what is under the mask has no say through the real loss either.
+        // Masked pixels do not affect the gradient through the real loss either.
         let by = |photo: &Pixels, colour: &[f32]| {
             let (mut exposed, mut gradient) = (Vec::new(), Vec::new());
             expose(&exposure, colour, &mut exposed);
-            Photometric::new(Isa::detect(), 0.2).evaluate(&exposed, photo, &weights, &mut gradient);
+            PhotometricLoss::new(Isa::detect(), 0.2).evaluate(&exposed, photo, &weights, &mut gradient);
             expose_backward(&exposure, colour, &mut gradient)
         };
         let hidden = |i: usize| i % area % width >= 100;
         let other: Vec<f32> = (0..3 * area).map(|i| if hidden(i) { 0.3 } else { colour[i] }).collect();
         let mut other_photo = photo.clone();
         (0..3 * area).filter(|&i| hidden(i)).for_each(|i| other_photo.rgb[i] = 9);
-        let said = by(&photo, &colour);
-        assert!(said.iter().flatten().all(|value| value.abs() > 0.0));
-        assert_eq!(said, by(&other_photo, &other));
+        let expected = by(&photo, &colour);
+        assert!(expected.iter().flatten().all(|value| value.abs() > 0.0));
+        assert_eq!(expected, by(&other_photo, &other));
     }
 
     fn views(of: &[u32]) -> Vec<TrainView> {
@@ -243,12 +245,12 @@ mod tests {
     }
 
     #[test]
-    fn the_mean_stays_the_identity() {
+    fn mean_exposure_stays_the_identity() {
         let mut training = ExposureTraining::new(&views(&[9, 2, 5, 5]));
         assert_eq!(training.views, [2, 5, 9]);
         for step in 0..300u64 {
             let view = [2, 5, 9, 4][step as usize % 4];
-            // All want to be brighter, view 2 the most.
+            // All gradients brighten, that of view 2 the most.
             let gradient = [0, 1, 2].map(|r| [0, 1, 2, 3].map(|c| uniform(step, 4 * r + c) - 1.2));
             training.step(view, &gradient, if view == 2 { 0.02 } else { 0.01 });
         }
@@ -265,7 +267,7 @@ mod tests {
     }
 
     #[test]
-    fn squares_grow_by_the_square_of_the_gain() {
+    fn square_gain_is_the_square_of_the_gain() {
         assert_eq!(square_gain(&Exposure::IDENTITY), 1.0);
         assert_eq!(square_gain(&Exposure(Exposure::IDENTITY.0.map(|row| row.map(|v| 2.0 * v)))), 4.0);
     }

@@ -1,15 +1,17 @@
-//! The first splats: one for every sparse point, as large as the gap to its neighbours, and a backdrop behind them.
+//! Initialises splats from sparse points, and a backdrop sphere for the sky and the distance.
 
 use glam::{DVec3, Vec3};
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
 use scene::{SparsePoints, Splat, Splats};
 
-use crate::{TrainView, WindowSource, morton};
+use crate::morton;
+use crate::source::{self, WindowSource};
+use crate::view::TrainView;
 
-/// Neighbours whose mean distance gives a splat its size, as in 3DGS.
+/// Number of neighbours whose mean distance is a splat's size, as in 3DGS.
 const NEIGHBOURS: usize = 3;
 
-/// Round splats at `points` with `opacity`; sizes stay within `bounds` (metres).
+/// Isotropic splats at `points` with opacity `opacity`, sizes clamped to `bounds` (metres).
 pub fn from_points(points: &SparsePoints, sh_degree: u8, opacity: f32, bounds: [f32; 2]) -> Splats {
     let mut splats = Splats::new(sh_degree);
     if points.is_empty() {
@@ -17,10 +19,10 @@ pub fn from_points(points: &SparsePoints, sh_degree: u8, opacity: f32, bounds: [
     }
     let positions: Vec<[f64; 3]> = points.positions.iter().map(|p| p.to_array()).collect();
     let Ok(tree) = ImmutableKdTree::<f64, 3>::new_from_slice(&positions) else { return splats };
-    let wanted = std::num::NonZero::new(NEIGHBOURS + 1).expect("four is not zero");
+    let count = std::num::NonZero::new(NEIGHBOURS + 1).expect("four is not zero");
     for (position, colour) in positions.iter().zip(&points.colours) {
-        let near = tree.query(position).nearest_n::<SquaredEuclidean<f64>>(wanted).execute();
-        // The nearest is the point itself.
+        let near = tree.query(position).nearest_n::<SquaredEuclidean<f64>>(count).execute();
+        // The nearest neighbour is the point itself.
         let gaps: Vec<f64> = near.iter().skip(1).map(|n| n.distance.sqrt()).collect();
         let gap = gaps.iter().sum::<f64>() / gaps.len().max(1) as f64;
         let size = (gap as f32).clamp(bounds[0], bounds[1]);
@@ -31,31 +33,31 @@ pub fn from_points(points: &SparsePoints, sh_degree: u8, opacity: f32, bounds: [
     splats
 }
 
-/// Rows of at most `most` of some places, in growing order: evenly along a Morton curve, so that dense places stay denser.
-pub fn thinned(places: &[DVec3], most: usize) -> Vec<usize> {
-    let n = places.len();
-    if n <= most {
+/// Indices of at count `count` points, ascending, evenly spaced along a Morton curve, so that relative density is kept.
+pub fn subsample(points: &[DVec3], count: usize) -> Vec<usize> {
+    let n = points.len();
+    if n <= count {
         return (0..n).collect();
     }
-    let axis = |k: usize| -> Vec<f32> { places.iter().map(|p| p[k] as f32).collect() };
+    let axis = |k: usize| -> Vec<f32> { points.iter().map(|p| p[k] as f32).collect() };
     let [x, y, z] = [0, 1, 2].map(axis);
     let order = morton::order([&x, &y, &z]);
-    let mut rows: Vec<usize> = (0..most).map(|i| order[i * n / most] as usize).collect();
+    let mut rows: Vec<usize> = (0..count).map(|i| order[i * n / count] as usize).collect();
     rows.sort_unstable();
     rows
 }
 
-/// Splats of a backdrop; 6° apart.
+/// Number of splats of a backdrop, which are 6° apart.
 const BACKDROP: usize = 1024;
 
-/// Standard deviation of a backdrop's splats at this distance.
+/// Standard deviation of the splats of a backdrop of this radius, metres.
 pub fn backdrop_size_metres(radius_metres: f64) -> f64 {
     radius_metres * (4.0 * std::f64::consts::PI / BACKDROP as f64).sqrt() * 0.6
 }
 
-/// A sphere of opaque splats around everything, wherever a view looks, coloured by what the views show in each direction: the sky, and whatever
-/// else no point was found on. It gives every ray something to end in, so that near splats are not stretched to fill
-/// the distance. `centre` and `radius_metres` should enclose cameras and points with room to spare.
+/// A sphere of opaque splats around the scene, coloured by the mean of what the views show in each direction: the sky and
+/// everything without sparse points. Every ray then ends at a splat, so near splats are not stretched to fill the distance.
+/// The sphere of `centre` and `radius_metres` must enclose all cameras and points. Directions that no view covers get no splats.
 ///
 /// # Errors
 /// A view that cannot be read.
@@ -66,7 +68,7 @@ pub fn backdrop(
     centre: DVec3,
     radius_metres: f64,
 ) -> Result<Splats, String> {
-    // A Fibonacci lattice: turn by the golden angle, equal steps in height.
+    // Fibonacci lattice: steps of the golden angle in azimuth, equal steps in height.
     let golden = std::f64::consts::PI * (3.0 - 5f64.sqrt());
     let directions: Vec<[f64; 3]> = (0..BACKDROP)
         .map(|i| {
@@ -80,7 +82,7 @@ pub fn backdrop(
     let mut sums = vec![[0.0f64; 4]; BACKDROP];
     let coarsest = views.iter().filter_map(|view| Some((view.view, (0..=8).rev().find_map(|c| view.at(c))?)));
     let windows = coarsest.clone().map(|(view, (mip, rect, _))| (view, mip, rect));
-    for ((_, (_, _, camera)), photo) in coarsest.zip(crate::source::each(source, windows)) {
+    for ((_, (_, _, camera)), photo) in coarsest.zip(source::each(source, windows)) {
         let photo = photo?;
         let area = photo.area();
         let world_from_camera = camera.camera_from_world.rotation.inverse();
@@ -103,15 +105,16 @@ pub fn backdrop(
         t.iter_mut().zip(s).for_each(|(t, s)| *t += s);
         t
     });
-    // Neighbours on the lattice are 3.5 / sqrt(n) apart; what nobody sees, nor anything beside it, needs no splat.
-    let beside = (1.5 * 3.5 / (BACKDROP as f64).sqrt()).cos();
+    // Neighbours on the lattice are 3.5 / sqrt(n) apart. Directions without a visible one within 1.5 times that get no splat.
+    let min_cosine = (1.5 * 3.5 / (BACKDROP as f64).sqrt()).cos();
     let cosine = |a: &[f64; 3], b: &[f64; 3]| a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
-    let seen: Vec<&[f64; 3]> = directions.iter().zip(&sums).filter(|(_, sum)| sum[3] > 0.0).map(|(d, _)| d).collect();
-    let shown = |direction: &[f64; 3]| seen.iter().any(|other| cosine(direction, other) > beside);
+    let visible: Vec<&[f64; 3]> =
+        directions.iter().zip(&sums).filter(|(_, sum)| sum[3] > 0.0).map(|(d, _)| d).collect();
+    let is_near_visible = |direction: &[f64; 3]| visible.iter().any(|other| cosine(direction, other) > min_cosine);
     let size = backdrop_size_metres(radius_metres);
     let mut splats = Splats::new(sh_degree);
-    for (direction, sum) in directions.iter().zip(&sums).filter(|(direction, _)| shown(direction)) {
-        // At the rim: what all views show on average.
+    for (direction, sum) in directions.iter().zip(&sums).filter(|(direction, _)| is_near_visible(direction)) {
+        // Directions at the rim take the mean colour of all views.
         let sum = if sum[3] > 0.0 { sum } else { &total };
         let colour = Vec3::from_array([0, 1, 2].map(|c| (sum[c] / sum[3].max(1.0)) as f32));
         let mean = centre + DVec3::from_array(*direction) * radius_metres;
@@ -125,17 +128,17 @@ mod tests {
     use super::*;
 
     #[test]
-    fn thinning_keeps_shares_of_places() {
+    fn subsampling_keeps_the_density() {
         // Three quarters of the points stand at x = 0 .. 1, one quarter at 100 .. 101.
         let at = |i: usize| {
             DVec3::new(if i.is_multiple_of(4) { 100.0 } else { 0.0 }, 0.0, 0.0) + DVec3::splat(i as f64 / 4e3)
         };
-        let places: Vec<DVec3> = (0..4000).map(at).collect();
-        let rows = thinned(&places, 400);
+        let points: Vec<DVec3> = (0..4000).map(at).collect();
+        let rows = subsample(&points, 400);
         assert!(rows.len() == 400 && rows.windows(2).all(|w| w[0] < w[1]));
-        let far = rows.iter().filter(|&&i| places[i].x > 50.0).count();
+        let far = rows.iter().filter(|&&i| points[i].x > 50.0).count();
         assert!((99..=101).contains(&far), "{far}");
-        assert_eq!(thinned(&places, 5000).len(), 4000);
-        assert_eq!(thinned(&[], 3), Vec::<usize>::new());
+        assert_eq!(subsample(&points, 5000).len(), 4000);
+        assert_eq!(subsample(&[], 3), Vec::<usize>::new());
     }
 }

@@ -1,27 +1,36 @@
-//! Trains the splats of one block: losses, optimiser, growth, and the metrics that judge the result.
+//! Trains the splats of one block: losses, optimiser, densification, pruning and image metrics.
 //!
-//! Architecture invariant: no files, no network, no clock. Pixels come through [`WindowSource`]; randomness is counter-based
-//! ([`random`]), so the same job gives the same splats whatever the number of threads.
+//! Architecture invariant: no files, no network, no clock. Pixels come through [`WindowSource`]. Random numbers are counter-based
+//! ([`random`]), so a job gives the same splats for any number of threads.
 
-pub mod blur;
 pub mod checkpoint;
+pub mod coarse_to_fine;
+mod device;
+mod error;
 pub mod exposure;
 pub mod growth;
 pub mod importance;
 pub mod init;
+mod job;
 pub mod loss;
+pub mod low_pass;
 pub mod metrics;
 mod morton;
-pub mod need;
 pub mod optimiser;
 pub mod prune;
 pub mod random;
-mod side;
-pub mod sight;
+mod recipe;
 pub mod source;
-pub mod trainer;
+mod trainer;
+mod view;
+pub mod visibility;
 
 pub use checkpoint::State;
-pub use side::{Backend, MOST_VIEWS_PER_STEP};
+pub use device::Backend;
+pub use device::step::MAX_VIEWS_PER_STEP;
+pub use error::TrainError;
+pub use job::{Flow, Job};
+pub use recipe::Recipe;
 pub use source::WindowSource;
-pub use trainer::{Flow, Job, Progress, Recipe, TrainError, TrainView, train, train_on};
+pub use trainer::{Progress, train, train_from};
+pub use view::TrainView;

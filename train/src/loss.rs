@@ -1,8 +1,8 @@
-//! The photometric loss (1-λ)·L1 + λ·(1-SSIM) of a frame against a photo, and its gradient.
+//! The photometric loss (1-λ)·L1 + λ·D-SSIM, with D-SSIM = 1 - SSIM, of a frame against a photo, and its gradient.
 //!
 //! SSIM (Wang et al. 2004) with an 11×11 Gaussian window of σ = 1.5 and zero padding, as 3DGS computes it. The window is
-//! separable, and both passes stream rows through a ring of eleven, so that no more than a few rows are in cache:
-//! forward smooths (x, y, x², y², xy), backward smooths the three derivatives of SSIM.
+//! separable. Both passes stream rows through a ring buffer of eleven rows, which stays in cache: the forward pass smooths
+//! (x, y, x², y², xy), the backward pass the three derivatives of SSIM.
 
 use rayon::prelude::*;
 use render::cpu::Isa;
@@ -10,49 +10,50 @@ use render::cpu::simd::{LANES, Lanes};
 use render::kernel;
 use scene::Pixels;
 
-/// Taps of the window.
+/// Taps of the window along one axis.
 const TAPS: usize = 11;
-/// Rows or columns beyond a pixel that its window reaches.
-const REACH: usize = TAPS / 2;
+/// Radius of the window, pixels.
+const RADIUS: usize = TAPS / 2;
 /// exp(-d² / (2·1.5²)) for d = 5, 4, … 0, normalised so that the eleven taps sum to one.
-const WINDOW: [f32; REACH + 1] = [0.001_028_38, 0.007_598_758, 0.036_000_773, 0.109_360_69, 0.213_005_54, 0.266_011_72];
-/// Stabilisers for values in 0..1.
+const WINDOW: [f32; RADIUS + 1] =
+    [0.001_028_38, 0.007_598_758, 0.036_000_773, 0.109_360_69, 0.213_005_54, 0.266_011_72];
+/// SSIM's stabilisers for values in 0..1.
 const C1: f32 = 0.01 * 0.01;
 const C2: f32 = 0.03 * 0.03;
-/// Rows of a parallel job; each reads ten more.
+/// Rows of a parallel job, which also reads five rows on either side.
 const BAND: usize = 64;
 
-/// The loss with its buffers.
+/// The photometric loss with its buffers.
 #[derive(Debug)]
-pub struct Photometric {
+pub struct PhotometricLoss {
     isa: Isa,
-    /// Weight of 1 - SSIM.
+    /// Weight λ of D-SSIM.
     pub lambda: f32,
     /// dSSIM/dμ, dSSIM/dE[x²], dSSIM/dE[xy]; three colour planes each.
     partials: [Vec<f32>; 3],
 }
 
-/// What the loss was.
+/// The value of the loss.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub struct Value {
+pub struct LossValue {
     /// Weighted mean absolute difference.
     pub l1: f64,
     /// Weighted mean SSIM.
     pub ssim: f64,
-    /// The loss.
+    /// The loss: (1-λ)·L1 + λ·(1 - SSIM).
     pub total: f64,
 }
 
-impl Photometric {
-    /// With λ, on an instruction set.
+impl PhotometricLoss {
+    /// A loss with weight `lambda` of D-SSIM, computed with instruction set `isa`.
     pub fn new(isa: Isa, lambda: f32) -> Self {
         Self { isa, lambda, partials: Default::default() }
     }
 
-    /// The loss of `colour` (three planes) against `photo`, and its gradient into `gradient` (three planes). `weights`
-    /// (one plane) say how much each pixel counts; empty means all alike. The loss is a weighted mean, so that its
-    /// scale does not depend on the size of the window.
-    pub fn evaluate(&mut self, colour: &[f32], photo: &Pixels, weights: &[f32], gradient: &mut Vec<f32>) -> Value {
+    /// Computes the loss of `colour` (three planes) against `photo` and writes its gradient with respect to `colour` to `gradient`
+    /// (three planes). `weights` (one plane, or empty for all ones) are the pixel weights. Photo pixels under the mask are treated as
+    /// outside the image. The loss is a weighted mean, so its scale does not depend on the size of the window.
+    pub fn evaluate(&mut self, colour: &[f32], photo: &Pixels, weights: &[f32], gradient: &mut Vec<f32>) -> LossValue {
         let (width, height) = (photo.width as usize, photo.height as usize);
         let area = width * height;
         assert!(colour.len() == 3 * area && (weights.is_empty() || weights.len() == area));
@@ -62,7 +63,7 @@ impl Photometric {
             if weights.is_empty() { area as f64 } else { weights.iter().map(|&w| f64::from(w)).sum() };
         if total_weight <= 0.0 {
             gradient.fill(0.0);
-            return Value::default();
+            return LossValue::default();
         }
         let norm = 1.0 / (3.0 * total_weight);
 
@@ -102,25 +103,25 @@ impl Photometric {
             gradient_rows(isa, x, y, weights, mask, width, first_row, partials, scale, out);
         });
         let total = (1.0 - f64::from(self.lambda)) * l1 + f64::from(self.lambda) * (1.0 - ssim);
-        Value { l1, ssim, total }
+        LossValue { l1, ssim, total }
     }
 }
 
-/// A ring of eleven horizontally smoothed rows of `N` quantities.
-struct Ring<const N: usize> {
+/// A ring buffer of eleven horizontally smoothed rows of `N` quantities.
+struct RowRing<const N: usize> {
     rows: Vec<f32>,
     stride: usize,
     /// Unsmoothed rows of each quantity, with zeros on both sides.
     raw: [Vec<f32>; N],
 }
 
-/// Zeros before a raw row: the reach, rounded up to a full vector so that stores stay simple.
-const LEFT: usize = LANES;
+/// Zeros before a raw row: the radius, rounded up to a full vector.
+const LEFT_PADDING: usize = LANES;
 
-impl<const N: usize> Ring<N> {
+impl<const N: usize> RowRing<N> {
     fn new(width: usize) -> Self {
         let stride = width.next_multiple_of(LANES);
-        let raw = std::array::from_fn(|_| vec![0.0; LEFT + stride + LANES]);
+        let raw = std::array::from_fn(|_| vec![0.0; LEFT_PADDING + stride + LANES]);
         Self { rows: vec![0.0; TAPS * N * stride], stride, raw }
     }
 
@@ -136,10 +137,10 @@ impl<const N: usize> Ring<N> {
         for (q, raw) in self.raw.iter().enumerate() {
             let at = (row % TAPS * N + q) * self.stride;
             for (n, out) in self.rows[at..at + self.stride].chunks_exact_mut(LANES).enumerate() {
-                let i = LEFT + n * LANES;
-                let mut sum = lanes::<L>(raw, i) * L::splat(WINDOW[REACH]);
-                for (t, tap) in WINDOW[..REACH].iter().enumerate() {
-                    let d = REACH - t;
+                let i = LEFT_PADDING + n * LANES;
+                let mut sum = lanes::<L>(raw, i) * L::splat(WINDOW[RADIUS]);
+                for (t, tap) in WINDOW[..RADIUS].iter().enumerate() {
+                    let d = RADIUS - t;
                     sum = (lanes::<L>(raw, i - d) + lanes::<L>(raw, i + d)).fma(L::splat(*tap), sum);
                 }
                 sum.store(out.try_into().expect("sixteen lanes"));
@@ -147,14 +148,14 @@ impl<const N: usize> Ring<N> {
         }
     }
 
-    /// The vertically smoothed quantities of `row` at column `i`; rows `row - 5 ..= row + 5` must be in the ring.
+    /// The vertically smoothed quantities of `row` at column `i`; rows `row - 5 ..= row + 5` must be in the buffer.
     #[inline(always)]
     fn column<L: Lanes>(&self, row: usize, i: usize) -> [L; N] {
         let mut out = [L::zero(); N];
         for (q, out) in out.iter_mut().enumerate() {
-            let mut sum = lanes::<L>(&self.rows, self.at(row, q, i)) * L::splat(WINDOW[REACH]);
-            for (t, tap) in WINDOW[..REACH].iter().enumerate() {
-                let d = REACH - t;
+            let mut sum = lanes::<L>(&self.rows, self.at(row, q, i)) * L::splat(WINDOW[RADIUS]);
+            for (t, tap) in WINDOW[..RADIUS].iter().enumerate() {
+                let d = RADIUS - t;
                 let above = lanes::<L>(&self.rows, self.at(row - d, q, i));
                 let below = lanes::<L>(&self.rows, self.at(row + d, q, i));
                 sum = (above + below).fma(L::splat(*tap), sum);
@@ -164,7 +165,7 @@ impl<const N: usize> Ring<N> {
         out
     }
 
-    /// Where a smoothed value lies.
+    /// Index of a smoothed value.
     #[inline(always)]
     fn at(&self, row: usize, quantity: usize, i: usize) -> usize {
         (row % TAPS * N + quantity) * self.stride + i
@@ -198,23 +199,23 @@ fn ssim_rows_lanes<L: Lanes>(
     let height = x.len() / width;
     let rows = partials[0].len() / width;
     let [out_mu, out_xx, out_xy] = partials;
-    let mut ring = Ring::<5>::new(width);
+    let mut ring = RowRing::<5>::new(width);
     let (one, two) = (L::splat(1.0), L::splat(2.0));
     let (c1, c2) = (L::splat(C1), L::splat(C2));
-    // Ring rows are numbered from `first_row - REACH`, as row 0.
-    for r in 0..rows + 2 * REACH {
-        let image_row = (first_row + r).checked_sub(REACH).filter(|&row| row < height);
+    // Rows of the ring are numbered from `first_row - RADIUS`, as row 0.
+    for r in 0..rows + 2 * RADIUS {
+        let image_row = (first_row + r).checked_sub(RADIUS).filter(|&row| row < height);
         if let Some(row) = image_row {
             let (x, y) = (&x[row * width..(row + 1) * width], &y[row * width..(row + 1) * width]);
             let [rx, ry, rxx, ryy, rxy] = &mut ring.raw;
-            let range = LEFT..LEFT + width;
+            let range = LEFT_PADDING..LEFT_PADDING + width;
             let (rx, ry) = (&mut rx[range.clone()], &mut ry[range.clone()]);
             let (rxx, ryy, rxy) = (&mut rxx[range.clone()], &mut ryy[range.clone()], &mut rxy[range]);
             for i in 0..width {
                 let (x, y) = (x[i], f32::from(y[i]) * (1.0 / 255.0));
                 (rx[i], ry[i], rxx[i], ryy[i], rxy[i]) = (x, y, x * x, y * y, x * y);
             }
-            // Hidden pixels are to SSIM what lies outside the image: zero in both.
+            // SSIM treats masked pixels like those outside the image: zero in both images.
             if let Some(mask) = mask.get(row * width..(row + 1) * width) {
                 for i in (0..width).filter(|&i| mask[i] < 128) {
                     (rx[i], ry[i], rxx[i], ryy[i], rxy[i]) = (0.0, 0.0, 0.0, 0.0, 0.0);
@@ -224,11 +225,11 @@ fn ssim_rows_lanes<L: Lanes>(
         } else {
             ring.clear(r);
         }
-        let Some(out_row) = r.checked_sub(2 * REACH) else { continue };
+        let Some(out_row) = r.checked_sub(2 * RADIUS) else { continue };
         let row = first_row + out_row;
         let mut row_sums = [L::zero(); 2];
         for i in (0..width).step_by(LANES) {
-            let [mx, my, exx, eyy, exy] = ring.column::<L>(out_row + REACH, i);
+            let [mx, my, exx, eyy, exy] = ring.column::<L>(out_row + RADIUS, i);
             let (mxx, myy, mxy) = (mx * mx, my * my, mx * my);
             let a1 = two.fma(mxy, c1);
             let a2 = two.fma(exy - mxy, c2);
@@ -285,21 +286,21 @@ fn gradient_rows_lanes<L: Lanes>(
 ) {
     let height = x.len() / width;
     let rows = out.len() / width;
-    let mut ring = Ring::<3>::new(width);
-    for r in 0..rows + 2 * REACH {
-        let image_row = (first_row + r).checked_sub(REACH).filter(|&row| row < height);
+    let mut ring = RowRing::<3>::new(width);
+    for r in 0..rows + 2 * RADIUS {
+        let image_row = (first_row + r).checked_sub(RADIUS).filter(|&row| row < height);
         if let Some(row) = image_row {
             for (raw, partial) in ring.raw.iter_mut().zip(partials) {
-                raw[LEFT..LEFT + width].copy_from_slice(&partial[row * width..(row + 1) * width]);
+                raw[LEFT_PADDING..LEFT_PADDING + width].copy_from_slice(&partial[row * width..(row + 1) * width]);
             }
             ring.smooth::<L>(r);
         } else {
             ring.clear(r);
         }
-        let Some(out_row) = r.checked_sub(2 * REACH) else { continue };
+        let Some(out_row) = r.checked_sub(2 * RADIUS) else { continue };
         let row = first_row + out_row;
         for i in (0..width).step_by(LANES) {
-            let [d_mu, d_xx, d_xy] = ring.column::<L>(out_row + REACH, i);
+            let [d_mu, d_xx, d_xy] = ring.column::<L>(out_row + RADIUS, i);
             let at = row * width + i;
             let end = (row + 1) * width;
             let x = L::load_from(&x[..end], at, 0.0);
@@ -387,7 +388,7 @@ mod tests {
         let expected = naive(&exact, &photo, &weights, 0.2);
         for isa in Isa::available() {
             let mut gradient = Vec::new();
-            let value = Photometric::new(isa, 0.2).evaluate(&x, &photo, &weights, &mut gradient);
+            let value = PhotometricLoss::new(isa, 0.2).evaluate(&x, &photo, &weights, &mut gradient);
             assert!((value.total - expected).abs() < 1e-5, "{} against {expected}", value.total);
             for i in [0, 5, 300, area - 1, area + 640, 3 * area - 1] {
                 let step = 1e-5;

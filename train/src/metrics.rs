@@ -1,16 +1,16 @@
-//! How far a render is from a photo: PSNR, SSIM and SSIMULACRA2.
+//! Image metrics of a render against a photo: PSNR, colour-corrected PSNR, SSIM and SSIMULACRA2.
 //!
 //! Images are planes of sRGB values in 0..1: all red, all green, all blue, each `width · height`, rows from the top.
-//! Sums are in f64 and in a fixed order, so a figure does not depend on the number of threads.
+//! Sums are in f64 and in a fixed order, so results do not depend on the number of threads.
 
 use glam::{DMat3, DVec3};
 use rayon::prelude::*;
 use ssimulacra2::{ColorPrimaries, Rgb, TransferCharacteristic, compute_frame_ssimulacra2};
 
-/// PSNR of identical images is infinite; reports say this instead, in dB.
-pub const PSNR_OF_EQUALS: f64 = 100.0;
-/// The shortest image side that SSIMULACRA2 is defined for, pixels.
-pub const SSIMULACRA2_SIDE: usize = 8;
+/// Upper bound of reported PSNR, dB: that of identical images is infinite.
+pub const MAX_PSNR_DB: f64 = 100.0;
+/// Smallest image side for which SSIMULACRA2 is defined, pixels.
+pub const SSIMULACRA2_MIN_SIDE: usize = 8;
 
 const RADIUS: usize = 5;
 const SIGMA: f64 = 1.5;
@@ -18,8 +18,8 @@ const C1: f64 = 0.01 * 0.01;
 const C2: f64 = 0.03 * 0.03;
 
 /// Peak signal-to-noise ratio in dB: `-10 log10` of the mean squared error over channels and pixels, at most
-/// [`PSNR_OF_EQUALS`]. Where a mask (`width · height`, 255 = use, 0 = leave out) is given, only its pixels count;
-/// `None` when none is left.
+/// [`MAX_PSNR_DB`]. With a mask (`width · height`, 255 = use, 0 = leave out) only its pixels
+/// count; `None` if none is left.
 ///
 /// # Panics
 /// If the images differ in length or the mask is not a third of it.
@@ -35,13 +35,16 @@ pub fn psnr(a: &[f32], b: &[f32], mask: Option<&[u8]>) -> Option<f64> {
             count += 1;
         }
     }
-    (count > 0).then(|| (-10.0 * (sum / count as f64).log10()).min(PSNR_OF_EQUALS))
+    (count > 0).then(|| (-10.0 * (sum / count as f64).log10()).min(MAX_PSNR_DB))
 }
 
-/// Colour-corrected PSNR, dB: as [`psnr`], after the affine transform of the render's colours (three by three, and an offset)
-/// that comes nearest to the photo in squared error over the pixels that count, clamped to 0..1. It forgives what a view's
-/// exposure and white balance do to all of its pixels and nothing else, as papers with appearance models measure it.
-/// Where colours do not determine the transform, the smallest serves.
+/// Colour-corrected PSNR in dB: [`psnr`] after the affine colour transform of the render (3×3 matrix and offset) that
+/// minimises the squared error to the photo over the pixels that the mask leaves. The corrected render is clamped to 0..1.
+/// This removes one exposure and white balance per view and nothing else, as papers with appearance models report it.
+///
+/// The fit starts from the identity: colour directions in which the render does not vary (grey or single-colour images, a few
+/// pixels) keep it. The clamped render without a fit is taken where it is nearer to the photo, so for photos in 0..1 the
+/// result is never below [`psnr`] of the same pixels, clamped or not.
 ///
 /// # Panics
 /// As [`psnr`].
@@ -50,30 +53,69 @@ pub fn colour_corrected_psnr(render: &[f32], photo: &[f32], mask: Option<&[u8]>)
     let area = render.len() / 3;
     assert!(mask.is_none_or(|m| m.len() == area), "a mask of the image's size");
     let pixels = || (0..area).filter(|&i| mask.is_none_or(|m| m[i] >= 128));
-    let at = |image: &[f32], i: usize| [0, 1, 2].map(|c| f64::from(image[c * area + i]));
-    let (mut count, mut means) = (0.0, [[0.0; 3]; 2]);
+    let at = |image: &[f32], i: usize| DVec3::from_array([0, 1, 2].map(|c| f64::from(image[c * area + i])));
+    let (mut count, mut sums) = (0.0, [DVec3::ZERO; 2]);
     for i in pixels() {
         count += 1.0;
-        for (mean, image) in means.iter_mut().zip([render, photo]) {
-            mean.iter_mut().zip(at(image, i)).for_each(|(mean, value)| *mean += value);
+        sums = [sums[0] + at(render, i), sums[1] + at(photo, i)];
+    }
+    let [mean_render, mean_photo] = sums.map(|sum| sum / f64::max(count, 1.0));
+    // Least squares about the means: transform = 1 + change, with (Σ r rᵀ) changeᵀ = Σ r (p - r)ᵀ.
+    let (mut rr, mut rd) = (DMat3::ZERO, DMat3::ZERO);
+    for i in pixels() {
+        let r = at(render, i) - mean_render;
+        let d = at(photo, i) - mean_photo - r;
+        rr += DMat3::from_cols(r * r.x, r * r.y, r * r.z);
+        rd += DMat3::from_cols(r * d.x, r * d.y, r * d.z);
+    }
+    let transform = DMat3::IDENTITY + (pseudo_inverse(rr) * rd).transpose();
+    let clamped: Vec<f32> = render.iter().map(|value| value.clamp(0.0, 1.0)).collect();
+    let mut corrected = clamped.clone();
+    for i in pixels() {
+        let colour = mean_photo + transform * (at(render, i) - mean_render);
+        (0..3).for_each(|c| corrected[c * area + i] = colour[c].clamp(0.0, 1.0) as f32);
+    }
+    Some(psnr(&corrected, photo, mask)?.max(psnr(&clamped, photo, mask)?))
+}
+
+/// Eigenvalues of a colour covariance below this share of its trace count as zero. Rounding to f32 leaves about 1e-14 in a
+/// direction without variation.
+const MIN_EIGENVALUE_SHARE: f64 = 1e-10;
+
+/// Moore-Penrose inverse of a symmetric positive semidefinite matrix.
+fn pseudo_inverse(matrix: DMat3) -> DMat3 {
+    let (values, vectors) = symmetric_eigen(matrix);
+    let least = MIN_EIGENVALUE_SHARE * (values[0] + values[1] + values[2]);
+    let mut inverse = DMat3::ZERO;
+    for (value, v) in values.into_iter().zip([vectors.x_axis, vectors.y_axis, vectors.z_axis]) {
+        if value > least {
+            inverse += DMat3::from_cols(v * v.x, v * v.y, v * v.z) * (1.0 / value);
         }
     }
-    let [mean_render, mean_photo] = means.map(|sums| DVec3::from_array(sums) / f64::max(count, 1.0));
-    // About the means: photo = transform · render, (Σ r rᵀ) transformᵀ = Σ r pᵀ.
-    let (mut rr, mut rp) = (DMat3::ZERO, DMat3::ZERO);
-    for i in pixels() {
-        let (r, p) = (DVec3::from_array(at(render, i)) - mean_render, DVec3::from_array(at(photo, i)) - mean_photo);
-        rr += DMat3::from_cols(r * r.x, r * r.y, r * r.z);
-        rp += DMat3::from_cols(r * p.x, r * p.y, r * p.z);
+    inverse
+}
+
+/// Eigenvalues and eigenvectors (columns) of a symmetric matrix by cyclic Jacobi rotations (Golub and Van Loan, 8.5).
+fn symmetric_eigen(matrix: DMat3) -> ([f64; 3], DMat3) {
+    /// Convergence is quadratic: a 3×3 matrix takes at most about six sweeps.
+    const SWEEPS: usize = 12;
+    let (mut diagonal, mut vectors) = (matrix, DMat3::IDENTITY);
+    for (p, q) in [(0, 1), (0, 2), (1, 2)].repeat(SWEEPS) {
+        let off = diagonal.col(q)[p];
+        if off == 0.0 {
+            continue;
+        }
+        let theta = (diagonal.col(q)[q] - diagonal.col(p)[p]) / (2.0 * off);
+        let tan = theta.signum() / (theta.abs() + theta.hypot(1.0));
+        let cos = 1.0 / tan.hypot(1.0);
+        let mut rotation = DMat3::IDENTITY;
+        (rotation.col_mut(p)[p], rotation.col_mut(q)[q]) = (cos, cos);
+        (rotation.col_mut(q)[p], rotation.col_mut(p)[q]) = (tan * cos, -tan * cos);
+        diagonal = rotation.transpose() * diagonal * rotation;
+        (diagonal.col_mut(q)[p], diagonal.col_mut(p)[q]) = (0.0, 0.0);
+        vectors *= rotation;
     }
-    let least = 1e-9 * (rr.col(0)[0] + rr.col(1)[1] + rr.col(2)[2]) + 1e-9;
-    let transform = ((rr + DMat3::from_diagonal(DVec3::splat(least))).inverse() * rp).transpose();
-    let mut corrected = render.to_vec();
-    for i in pixels() {
-        let shown = mean_photo + transform * (DVec3::from_array(at(render, i)) - mean_render);
-        (0..3).for_each(|c| corrected[c * area + i] = shown[c].clamp(0.0, 1.0) as f32);
-    }
-    psnr(&corrected, photo, mask)
+    ([0, 1, 2].map(|k| diagonal.col(k)[k]), vectors)
 }
 
 /// Structural similarity (Wang et al. 2004): 11×11 Gaussian window with σ = 1.5, K1 = 0.01, K2 = 0.03, range 1, the mean
@@ -136,8 +178,8 @@ fn blur(plane: &[f64], width: usize, height: usize) -> Vec<f64> {
     both
 }
 
-/// SSIMULACRA2 of a render against its photo: a perceptual measure that needs no download. 100 is identical, 90 hard to
-/// tell apart, 70 high, 50 medium, 30 low quality, below 0 very bad. `None` where a side is under [`SSIMULACRA2_SIDE`].
+/// SSIMULACRA2 of a render against its photo: a perceptual metric without a neural network. 100 is identical, 90 hard to
+/// tell apart, 70 high, 50 medium, 30 low quality, below 0 very bad. `None` where a side is under [`SSIMULACRA2_MIN_SIDE`].
 /// Source: Sneyers, "SSIMULACRA 2" (Cloudinary, 2023), as ported by the rust-av project.
 ///
 /// # Panics
@@ -145,7 +187,7 @@ fn blur(plane: &[f64], width: usize, height: usize) -> Vec<f64> {
 pub fn ssimulacra2(photo: &[f32], render: &[f32], width: usize, height: usize) -> Option<f64> {
     let area = width * height;
     assert!(photo.len() == 3 * area && render.len() == 3 * area, "three planes each");
-    if width.min(height) < SSIMULACRA2_SIDE {
+    if width.min(height) < SSIMULACRA2_MIN_SIDE {
         return None;
     }
     let image = |planes: &[f32]| {
@@ -176,7 +218,7 @@ mod tests {
         let a = picture(20, 10, 0.0);
         let b: Vec<f32> = a.iter().map(|v| v + 0.1).collect();
         assert!((psnr(&a, &b, None).unwrap() - 20.0).abs() < 1e-4);
-        assert_eq!(psnr(&a, &a, None), Some(PSNR_OF_EQUALS));
+        assert_eq!(psnr(&a, &a, None), Some(MAX_PSNR_DB));
     }
 
     #[test]
@@ -192,8 +234,103 @@ mod tests {
         assert_eq!(psnr(&a, &b, Some(&[0; 4])), None);
     }
 
+    /// Noise of this amplitude, uniform, mean zero.
+    fn noise(i: usize, amplitude: f32) -> f32 {
+        amplitude * (((i * 2_654_435_761) % 1009) as f32 / 504.5 - 1.0)
+    }
+
+    /// The same plane three times.
+    fn grey(plane: impl Iterator<Item = f32>) -> Vec<f32> {
+        plane.collect::<Vec<_>>().repeat(3)
+    }
+
     #[test]
-    fn correction_forgives_a_views_exposure_and_nothing_else() {
+    fn colour_correction_of_grey_images_is_never_below_psnr() {
+        let area = 40 * 30;
+        let photo = grey(picture(40, 30, 0.0).into_iter().take(area));
+        let render: Vec<f32> = photo.iter().enumerate().map(|(i, v)| v + noise(i, 0.08)).collect();
+        let grey_noise = grey((0..area).map(|i| photo[i] + noise(i, 0.08)));
+        for render in [render, grey_noise] {
+            let plain = psnr(&render, &photo, None).unwrap();
+            let corrected = colour_corrected_psnr(&render, &photo, None).unwrap();
+            assert!((25.0..28.0).contains(&plain), "{plain}");
+            assert!(corrected >= plain && corrected < plain + 6.0, "{plain} {corrected}");
+        }
+    }
+
+    #[test]
+    fn colour_correction_recovers_gain_and_offset_of_grey_renders() {
+        let photo = grey(picture(40, 30, 0.0).into_iter().take(40 * 30));
+        for (gain, offset) in [(1.0, 0.0), (0.7, 0.1), (1.3, -0.2), (0.02, 0.4)] {
+            let render: Vec<f32> = photo.iter().map(|v| gain * v + offset).collect();
+            let corrected = colour_corrected_psnr(&render, &photo, None).unwrap();
+            assert!(corrected > 80.0, "{gain} {offset}: {corrected}");
+        }
+    }
+
+    #[test]
+    fn colour_correction_of_a_single_colour_photo_is_exact() {
+        let area = 40 * 30;
+        let photo = [[0.2; 1200], [0.5; 1200], [0.9; 1200]].concat();
+        let renders = [picture(40, 30, 0.0), grey(picture(40, 30, 0.0).into_iter().take(area)), vec![0.4; 3 * area]];
+        for render in renders {
+            let corrected = colour_corrected_psnr(&render, &photo, None).unwrap();
+            assert!(corrected > 80.0, "{corrected}");
+        }
+    }
+
+    #[test]
+    fn colour_correction_of_two_pixels_is_exact_or_the_mean() {
+        let area = 40 * 30;
+        let (render, photo) = (picture(40, 30, 0.0), picture(40, 30, 0.9));
+        for (a, b) in [(0, 1), (17, 900), (600, 1199)] {
+            let mut mask = vec![0; area];
+            (mask[a], mask[b]) = (255, 255);
+            // Two different colours determine an affine map.
+            let corrected = colour_corrected_psnr(&render, &photo, Some(&mask)).unwrap();
+            assert!(corrected > 80.0, "{a} {b}: {corrected}");
+            // Two equal ones only an offset.
+            let flat = vec![0.5; 3 * area];
+            let [plain, corrected] =
+                [psnr, colour_corrected_psnr].map(|measure| measure(&flat, &photo, Some(&mask)).unwrap());
+            assert!(corrected.is_finite() && corrected >= plain, "{a} {b}: {plain} {corrected}");
+        }
+    }
+
+    #[test]
+    fn colour_correction_is_never_below_psnr_of_the_clamped_render() {
+        let photo = picture(40, 30, 0.0);
+        // Far out of range where the photo is brightest: a fit of unclamped values would dim all others.
+        let glare = |v: &f32| if *v > 0.85 { 9.0 } else { *v };
+        let render: Vec<f32> = photo.iter().map(glare).collect();
+        let clamped: Vec<f32> = render.iter().map(|v| v.clamp(0.0, 1.0)).collect();
+        let corrected = colour_corrected_psnr(&render, &photo, None).unwrap();
+        assert!(corrected >= psnr(&clamped, &photo, None).unwrap(), "{corrected}");
+        // Values that are not finite spoil the fit, not the other pixels' figure.
+        let mut mask = vec![255; 40 * 30];
+        mask[7] = 0;
+        let mut broken = picture(40, 30, 0.0);
+        broken[7] = f32::NAN;
+        assert!(colour_corrected_psnr(&broken, &photo, Some(&mask)).unwrap() > 80.0);
+    }
+
+    #[test]
+    fn the_pseudo_inverse_inverts_the_range() {
+        let rank_three = DMat3::from_cols_array(&[4.0, 1.0, 0.5, 1.0, 3.0, -0.2, 0.5, -0.2, 2.0]);
+        let difference = pseudo_inverse(rank_three) - rank_three.inverse();
+        assert!(difference.to_cols_array().iter().all(|v| v.abs() < 1e-14), "{difference}");
+        let (a, b) = (DVec3::new(1.0, 1.0, 1.0), DVec3::new(0.3, -0.2, 0.9));
+        let outer = |v: DVec3| DMat3::from_cols(v * v.x, v * v.y, v * v.z);
+        for deficient in [DMat3::ZERO, outer(a), outer(a) * 1e6, outer(a) + outer(b)] {
+            let inverse = pseudo_inverse(deficient);
+            let again = deficient * inverse * deficient - deficient;
+            assert!(again.to_cols_array().iter().all(|v| v.abs() < 1e-8), "{deficient}: {again}");
+            assert!(inverse.to_cols_array().iter().all(|v| v.abs() < 1e2), "{inverse}");
+        }
+    }
+
+    #[test]
+    fn colour_correction_removes_exposure_and_nothing_else() {
         let render = picture(40, 30, 0.0);
         let area = 40 * 30;
         let exposed = |i: usize| {
@@ -203,20 +340,20 @@ mod tests {
         let mut photo: Vec<f32> = (0..3 * area).map(exposed).collect();
         assert!(psnr(&render, &photo, None).unwrap() < 20.0);
         assert!(colour_corrected_psnr(&render, &photo, None).unwrap() > 80.0);
-        // What the mask hides has no say in the transform.
+        // Masked pixels do not affect the fit.
         let mask: Vec<u8> = (0..area).map(|i| if i % 40 < 35 { 255 } else { 0 }).collect();
         (0..3 * area).filter(|i| i % 40 >= 35).for_each(|i| photo[i] = 1.0);
         assert!(colour_corrected_psnr(&render, &photo, Some(&mask)).unwrap() > 80.0);
         assert!(colour_corrected_psnr(&render, &photo, None).unwrap() < 30.0);
         assert_eq!(colour_corrected_psnr(&render, &photo, Some(&vec![0; area])), None);
-        // An error that no transform of colours explains stays, and no view gets worse.
+        // Noise cannot be corrected, and the fit makes no view worse.
         let noisy: Vec<f32> = (render.iter().enumerate())
             .map(|(i, v)| v + 0.1 * (((i * 2_654_435_761) % 1009) as f32 / 504.5 - 1.0))
             .collect();
         let (plain, corrected) =
             (psnr(&render, &noisy, None).unwrap(), colour_corrected_psnr(&render, &noisy, None).unwrap());
         assert!(corrected >= plain && corrected < plain + 0.3, "{plain} {corrected}");
-        // One colour only: its nearest is the photo's mean.
+        // A single colour is mapped to the photo's mean.
         let grey = colour_corrected_psnr(&vec![0.2; 3 * area], &vec![0.7; 3 * area], None).unwrap();
         assert!(grey > 80.0, "{grey}");
     }
@@ -257,7 +394,7 @@ mod tests {
     }
 
     #[test]
-    fn ssim_is_its_definition() {
+    fn ssim_agrees_with_its_definition() {
         for (width, height) in [(1, 1), (3, 17), (24, 13)] {
             let (a, b) = (picture(width, height, 0.0), picture(width, height, 0.7));
             let (fast, slow) = (ssim(&a, &b, width, height), ssim_by_definition(&a, &b, width, height));
@@ -279,7 +416,7 @@ mod tests {
     }
 
     #[test]
-    fn ssimulacra2_orders_damage() {
+    fn ssimulacra2_falls_with_noise() {
         let (width, height) = (64, 48);
         let photo = picture(width, height, 0.0);
         let damaged = |by: f32| -> Vec<f32> {

@@ -1,6 +1,6 @@
-//! Order along a Morton curve: what is near in space comes near in the order.
+//! Sorts points along a Morton curve, so that neighbours in space are near each other in memory.
 
-/// Rows of three columns of coordinates along a Morton curve through them: 10 bits an axis of their bounding box.
+/// Row indices of three coordinate columns, sorted along a Morton curve with 10 bits per axis.
 pub(crate) fn order(columns: [&[f32]; 3]) -> Vec<u32> {
     let n = columns[0].len();
     let spread = |v: u32| {
@@ -16,7 +16,7 @@ pub(crate) fn order(columns: [&[f32]; 3]) -> Vec<u32> {
         if sorted.is_empty() {
             return Vec::new();
         }
-        // The middle 98 %: a few far ones must not squeeze the rest into one cell.
+        // Scale to the middle 98 %, so that outliers do not squeeze the rest into one cell.
         let (low, high) = (n / 100, n - 1 - n / 100);
         let low = *sorted.select_nth_unstable_by(low, f32::total_cmp).1;
         let high = *sorted.select_nth_unstable_by(high, f32::total_cmp).1;

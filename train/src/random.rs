@@ -1,8 +1,8 @@
-//! Counter-based random numbers: a value is a pure function of its key, so no order of execution can change it.
+//! Counter-based random numbers: a value is a pure function of key and counter, independent of the order of execution.
 
 pub use scene::random::{bits, uniform};
 
-/// A permutation of `0 .. n` (Fisher and Yates).
+/// A random permutation of `0 .. n` (Fisher-Yates).
 pub fn shuffle(key: u64, n: usize) -> Vec<u32> {
     let mut order: Vec<u32> = (0..n as u32).collect();
     for i in (1..n).rev() {

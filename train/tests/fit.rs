@@ -1,21 +1,21 @@
-//! Training from end to end on a scene of a few hundred splats, whose photos the renderer itself takes.
+//! Trains from end to end on a scene of a few hundred splats, with photos rendered from the ground ground_truth.
 
-mod ring;
+mod common;
 
 use std::sync::{Arc, Mutex};
 
+use common::*;
 use glam::Vec3;
 use render::Options;
 use render::cpu::Renderer;
-use ring::*;
 use scene::{Exposure, Exposures, Pixels, Rect, Splat, Splats, column};
 use train::{Backend, Flow, Job, Recipe, State, TrainError, TrainView, WindowSource, metrics, random, train};
 
 #[test]
-fn perturbed_points_are_fitted_beyond_30_db() {
-    let truth = cloud(1, 200, 0.8);
-    let photos = photos(&truth);
-    let initial = perturbed(&truth);
+fn perturbed_points_reach_30_db() {
+    let ground_truth = cloud(1, 200, 0.8);
+    let photos = photos(&ground_truth);
+    let initial = perturbed(&ground_truth);
     let before = psnr(&initial, &photos, |_| true);
     let mut losses = Vec::new();
     let mut report = |mut p: train::Progress| {
@@ -26,7 +26,7 @@ fn perturbed_points_are_fitted_beyond_30_db() {
     let fitted = Setup { steps: 600, ..Setup::new(initial, &photos) }.try_run(&|_| true, &mut report).unwrap();
     let after = psnr(&fitted, &photos, |_| true);
     println!("{before:.2} dB before, {after:.2} dB after, {} splats", fitted.len());
-    assert!(before < 22.0, "the start must not be the solution: {before}");
+    assert!(before < 22.0, "the initial splats must not fit already: {before}");
     assert!(after > 30.0, "{after}");
     let mean = |losses: &[f64]| losses.iter().sum::<f64>() / losses.len() as f64;
     assert!(mean(&losses[588..]) < 0.3 * mean(&losses[..12]));
@@ -34,17 +34,17 @@ fn perturbed_points_are_fitted_beyond_30_db() {
 }
 
 #[test]
-fn threads_do_not_change_a_bit() {
-    let truth = cloud(2, 150, 0.8);
-    let photos = photos(&truth);
+fn result_does_not_depend_on_threads() {
+    let ground_truth = cloud(2, 150, 0.8);
+    let photos = photos(&ground_truth);
     let context = cloud(3, 40, 0.5);
     let run = |threads: usize| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-        let setup = Setup { context: Some(&context), budget: 250, ..Setup::new(perturbed(&truth), &photos) };
+        let setup = Setup { context: Some(&context), budget: 250, ..Setup::new(perturbed(&ground_truth), &photos) };
         pool.install(|| setup.run())
     };
     let one = run(1);
-    assert!(one.len() > 200, "growth must have happened");
+    assert!(one.len() > 200, "densification must add splats");
     for threads in [2, 5] {
         let many = run(threads);
         assert_eq!(one.len(), many.len());
@@ -53,7 +53,7 @@ fn threads_do_not_change_a_bit() {
     }
 }
 
-/// Masks out the right third; what is under the mask becomes `content(i)`.
+/// Masks the right third and sets the masked pixels to `content(i)`.
 fn masked(photos: &Photos, content: impl Fn(usize) -> u8) -> Photos {
     let mut out = photos.clone();
     let hidden = |i: usize| i % AREA % WIDTH as usize >= 43;
@@ -66,15 +66,16 @@ fn masked(photos: &Photos, content: impl Fn(usize) -> u8) -> Photos {
     out
 }
 
-/// What two contents under a mask make of the same start, and without a mask.
+/// The largest difference between the results for two contents of the masked pixels, with the mask and without it.
 fn mask_differences(recipe: &Recipe) -> (f32, f32) {
-    let truth = cloud(4, 120, 0.8);
-    let photos = photos(&truth);
+    let ground_truth = cloud(4, 120, 0.8);
+    let photos = photos(&ground_truth);
     let black = masked(&photos, |_| 0);
     let noise = masked(&photos, |i| random::bits(8, i as u64) as u8);
     let bare = |photos: &Photos| Photos(photos.0.iter().map(|p| Pixels { mask: None, ..p.clone() }).collect());
-    let run =
-        |photos: &Photos| Setup { steps: 60, recipe: recipe.clone(), ..Setup::new(perturbed(&truth), photos) }.run();
+    let run = |photos: &Photos| {
+        Setup { steps: 60, recipe: recipe.clone(), ..Setup::new(perturbed(&ground_truth), photos) }.run()
+    };
     let largest = |a: &Splats, b: &Splats| {
         let pairs = a.columns().iter().flatten().zip(b.columns().iter().flatten());
         pairs.map(|(a, b)| (a - b).abs()).fold(0.0, f32::max)
@@ -84,25 +85,25 @@ fn mask_differences(recipe: &Recipe) -> (f32, f32) {
 }
 
 #[test]
-fn what_is_under_a_mask_does_not_matter_to_l1() {
+fn masked_pixels_do_not_affect_l1() {
     let (with, without) = mask_differences(&Recipe { lambda: 0.0, coarse: Vec::new(), ..no_growth() });
     assert_eq!(with, 0.0);
-    assert!(without > 0.1, "without the mask it must matter: {without}");
+    assert!(without > 0.1, "the pixels must matter without the mask: {without}");
 }
 
 #[test]
-fn what_is_under_a_mask_does_not_matter_at_all() {
-    // SSIM windows reach five pixels: they must not carry hidden pixels over the mask's edge.
+fn masked_pixels_do_not_affect_the_loss() {
+    // SSIM windows have a radius of five pixels and must not carry masked pixels over the mask's edge.
     let (with, without) = mask_differences(&no_growth());
-    assert!(without > 0.1, "without the mask it must matter: {without}");
-    assert_eq!(with, 0.0, "hidden pixels moved parameters by up to this");
+    assert!(without > 0.1, "the pixels must matter without the mask: {without}");
+    assert_eq!(with, 0.0, "masked pixels changed parameters");
 }
 
 #[test]
-fn broken_numbers_at_the_start_are_survived() {
-    let truth = cloud(5, 150, 0.8);
-    let photos = photos(&truth);
-    let good = perturbed(&truth);
+fn non_finite_initial_splats_are_removed() {
+    let ground_truth = cloud(5, 150, 0.8);
+    let photos = photos(&ground_truth);
+    let good = perturbed(&ground_truth);
     let wanted = [
         column::MEAN,
         column::MEAN + 2,
@@ -113,7 +114,7 @@ fn broken_numbers_at_the_start_are_survived() {
         column::SH,
         column::SH + 5,
     ];
-    // As if the broken rows had never been there.
+    // The same splats without the broken rows.
     let without = good.filter(|i| i % 16 != 7 || i / 16 >= wanted.len());
     assert_eq!(without.len(), good.len() - wanted.len());
     let healthy = psnr(&Setup { budget: good.len(), ..Setup::new(without, &photos) }.run(), &photos, |_| true);
@@ -129,19 +130,18 @@ fn broken_numbers_at_the_start_are_survived() {
         };
         let fitted = Setup::new(initial, &photos).try_run(&|_| true, &mut report).unwrap();
         let after = psnr(&fitted, &photos, |_| true);
-        println!("{value}: {after:.2} dB instead of {healthy:.2}, {skipped} steps left out, {} splats", fitted.len());
-        assert!(all_finite(&fitted), "{value}: broken rows are left");
+        println!("{value}: {after:.2} dB instead of {healthy:.2}, {skipped} steps skipped, {} splats", fitted.len());
+        assert!(all_finite(&fitted), "{value}: broken rows remain");
         assert!(after > healthy - 1.0, "{value}: {after} dB instead of {healthy}");
-        // A row that makes the image infinite costs the steps up to the first refinement, no more.
-        assert!(skipped == 0, "{value}: {skipped} steps were left out");
+        assert!(skipped == 0, "{value}: {skipped} steps were skipped");
     }
 }
 
 #[test]
 fn growth_meets_the_budget() {
-    let truth = cloud(6, 200, 0.8);
-    let photos = photos(&truth);
-    let initial = perturbed(&truth).filter(|i| i % 3 == 0);
+    let ground_truth = cloud(6, 200, 0.8);
+    let photos = photos(&ground_truth);
+    let initial = perturbed(&ground_truth).filter(|i| i % 3 == 0);
     for budget in [67, 100, 200, 300] {
         let setup = Setup { budget, steps: 600, ..Setup::new(initial.clone(), &photos) };
         let fitted = setup.run();
@@ -152,11 +152,11 @@ fn growth_meets_the_budget() {
 }
 
 #[test]
-fn only_what_counts_counts_against_the_budget() {
-    let truth = cloud(6, 200, 0.8);
-    let photos = photos(&truth);
+fn only_counted_splats_use_the_budget() {
+    let ground_truth = cloud(6, 200, 0.8);
+    let photos = photos(&ground_truth);
     let core = |p: Vec3| p.x < 0.0;
-    let setup = Setup { budget: 160, steps: 600, ..Setup::new(perturbed(&truth), &photos) };
+    let setup = Setup { budget: 160, steps: 600, ..Setup::new(perturbed(&ground_truth), &photos) };
     let fitted = setup.try_run(&core, &mut |_| Flow::Continue).unwrap();
     let inside = (0..fitted.len()).filter(|&i| core(fitted.mean(i))).count();
     println!("{inside} inside, {} in all", fitted.len());
@@ -166,38 +166,39 @@ fn only_what_counts_counts_against_the_budget() {
 
 #[test]
 fn more_splats_fit_better() {
-    let truth = cloud(6, 200, 0.8);
-    let photos = photos(&truth);
-    let initial = perturbed(&truth).filter(|i| i % 4 == 0);
+    let ground_truth = cloud(6, 200, 0.8);
+    let photos = photos(&ground_truth);
+    let initial = perturbed(&ground_truth).filter(|i| i % 4 == 0);
     let run =
         |budget| psnr(&Setup { budget, steps: 400, ..Setup::new(initial.clone(), &photos) }.run(), &photos, |_| true);
     let (few, many) = (run(50), run(200));
     assert!(many > few + 1.0, "{many} dB with four times the splats, {few} dB without");
 }
 
-/// Splats on one side of the plane x = 0, with a gap.
-fn side(splats: &Splats, sign: f32) -> Splats {
+/// The splats on one side of the plane x = 0, with a gap.
+fn half(splats: &Splats, sign: f32) -> Splats {
     splats.filter(|i| splats.mean(i).x * sign > 0.15)
 }
 
-/// Share of each pixel, over all views, that `own` explains when it is drawn with `context`.
-fn shares(own: &Splats, context: &Splats) -> Vec<f32> {
+/// The alpha that `own` contributes to each pixel, over all views, in front of `context`.
+fn trainable_alpha(own: &Splats, context: &Splats) -> Vec<f32> {
     let options = Options { sh_degree: 1, extras: true, ..Options::default() };
-    let draw = |view: &TrainView| Renderer::default().forward(own, Some(context), &view.camera, &options).own.clone();
+    let draw = |view: &TrainView| {
+        Renderer::default().forward(own, Some(context), &view.camera, &options).trainable_alpha.clone()
+    };
     views().iter().flat_map(draw).collect()
 }
 
 #[test]
-fn splats_that_explain_nothing_keep_every_bit() {
-    let truth = cloud(7, 160, 0.8);
-    let photos = photos(&truth);
-    // In the core: what is to be trained. Behind the cameras, far above: never in view. In the middle of an opaque ball
-    // of context: in view, but hidden in every pixel.
-    let mut initial = perturbed(&side(&truth, -1.0));
+fn invisible_splats_keep_every_bit() {
+    let ground_truth = cloud(7, 160, 0.8);
+    let photos = photos(&ground_truth);
+    // Splats to train; one far above the cameras, never in view; one inside an opaque ball of context, in view but occluded.
+    let mut initial = perturbed(&half(&ground_truth, -1.0));
     let trained = initial.len();
     initial.push(&Splat::round(Vec3::new(0.0, 0.0, 40.0), -2.0, Vec3::X, 0.5));
     initial.push(&Splat::round(Vec3::new(0.7, 0.0, 0.0), -5.0, Vec3::Y, 0.9));
-    let mut ball = side(&truth, 1.0);
+    let mut ball = half(&ground_truth, 1.0);
     for _ in 0..4 {
         ball.push(&Splat::round(Vec3::new(0.7, 0.0, 0.0), -1.5, Vec3::splat(0.5), 0.995));
     }
@@ -208,25 +209,25 @@ fn splats_that_explain_nothing_keep_every_bit() {
         ball.push(&Splat::round(Vec3::new(0.7, 0.0, 0.0) + layer * direction, -1.6, Vec3::splat(0.4), 0.995));
     }
     assert!(shell.len() < ball.len());
-    let weight = |i: u32| shares(&initial.select(&[i]), &ball).iter().sum::<f32>();
-    assert_eq!((weight(trained as u32), weight(trained as u32 + 1)), (0.0, 0.0), "the test's splats must be hidden");
+    let weight = |i: u32| trainable_alpha(&initial.select(&[i]), &ball).iter().sum::<f32>();
+    assert_eq!((weight(trained as u32), weight(trained as u32 + 1)), (0.0, 0.0), "the two splats must be invisible");
     assert!(weight(0) > 1.0);
 
     let setup = Setup { context: Some(&ball), steps: 120, recipe: no_growth(), ..Setup::new(initial.clone(), &photos) };
     let fitted = setup.run();
     assert_eq!(fitted.len(), initial.len());
     for i in trained..trained + 2 {
-        assert_eq!(fitted.get(i), initial.get(i), "splat {i} explains nothing and must not move");
+        assert_eq!(fitted.get(i), initial.get(i), "splat {i} is invisible and must not change");
     }
     let moved = (0..trained).filter(|&i| fitted.get(i) != initial.get(i)).count();
     assert!(moved * 10 > trained * 9, "only {moved} of {trained} splats were trained");
 }
 
 #[test]
-fn a_block_does_not_repair_its_neighbours_region() {
-    // The photos show on the right something else than the context draws there: the neighbour's error, not ours.
-    let truth = cloud(8, 300, 0.97);
-    let (left, right) = (side(&truth, -1.0), side(&truth, 1.0));
+fn blocks_do_not_correct_their_neighbours_region() {
+    // On the right the photos disagree with the context: an error of the neighbour, not of this block.
+    let ground_truth = cloud(8, 300, 0.97);
+    let (left, right) = (half(&ground_truth, -1.0), half(&ground_truth, 1.0));
     let mut elsewhere = right.clone();
     for k in 0..3 {
         elsewhere.columns_mut()[column::SH + k].iter_mut().for_each(|v| *v = 1.2 - *v);
@@ -239,29 +240,30 @@ fn a_block_does_not_repair_its_neighbours_region() {
     let (agreeing, contradicting) = (with(&right), with(&elsewhere));
     let run = |photos: &Photos, context: Option<&Splats>| {
         let budget = 2 * left.len();
-        // Enough for a block without context to spread over a third of what is not its own.
+        // Enough steps for a block without context to spread over a third of the neighbour's region.
         Setup { context, budget, steps: 150, ..Setup::new(perturbed(&left), photos) }.run()
     };
-    // Pixels of the neighbour: opaque there, and none of the block's true splats shows.
-    let mut theirs = shares(&left, &right);
-    for (share, other) in theirs.iter_mut().zip(shares(&right, &left)) {
+    // Pixels of the neighbour: opaque there and free of the block's ground ground_truth.
+    let mut theirs = trainable_alpha(&left, &right);
+    for (share, other) in theirs.iter_mut().zip(trainable_alpha(&right, &left)) {
         *share = if *share < 0.003 && other > 0.9 { 1.0 } else { 0.0 };
     }
     let count = theirs.iter().sum::<f32>();
     assert!(count > 500.0, "{count}");
-    let spill = |own: &Splats| shares(own, &right).iter().zip(&theirs).map(|(s, t)| s * t).sum::<f32>() / count;
+    let spill =
+        |own: &Splats| trainable_alpha(own, &right).iter().zip(&theirs).map(|(s, t)| s * t).sum::<f32>() / count;
 
-    let quiet = spill(&run(&agreeing, Some(&right)));
-    let provoked = spill(&run(&contradicting, Some(&right)));
+    let agreed = spill(&run(&agreeing, Some(&right)));
+    let disagreed = spill(&run(&contradicting, Some(&right)));
     let unguarded = spill(&run(&contradicting, None));
     println!(
-        "own share of the neighbour's pixels: {quiet:.4} in peace, {provoked:.4} provoked, {unguarded:.4} without context"
+        "alpha in the neighbour's pixels: {agreed:.4} if photos agree, {disagreed:.4} if not, {unguarded:.4} without context"
     );
-    assert!(unguarded > 0.1, "without a context the block must try to repair: {unguarded}");
-    assert!(provoked < 0.1 * unguarded, "{provoked} of the neighbour's pixels are the block's");
+    assert!(unguarded > 0.1, "without a context the block must spread: {unguarded}");
+    assert!(disagreed < 0.1 * unguarded, "alpha of {disagreed} in the neighbour's pixels");
 }
 
-/// Each photo as much brighter or darker as said.
+/// Multiplies each photo by its gain.
 fn exposed(photos: &Photos, gains: &[f32]) -> Photos {
     let mut out = photos.clone();
     for (photo, gain) in out.0.iter_mut().zip(gains) {
@@ -270,20 +272,20 @@ fn exposed(photos: &Photos, gains: &[f32]) -> Photos {
     out
 }
 
-/// From 0.6 to 1; of the mean, which is where the gauge puts it.
+/// Gains from 0.6 to 1.
 fn gains() -> Vec<f32> {
     (0..12).map(|view| 0.6 + 0.4 * random::uniform(41, view)).collect()
 }
 
 #[test]
-fn exposures_are_found_and_the_mean_is_what_is_shown() {
-    let (truth, gains) = (cloud(10, 200, 0.8), gains());
+fn exposures_are_recovered_relative_to_their_mean() {
+    let (ground_truth, gains) = (cloud(10, 200, 0.8), gains());
     let mean = gains.iter().sum::<f32>() / gains.len() as f32;
-    let given = photos(&truth);
+    let given = photos(&ground_truth);
     let shown = exposed(&given, &gains);
     let all_alike = exposed(&given, &[mean; 12]);
     let run = |trains_exposures| {
-        let setup = Setup { trains_exposures, steps: 600, ..Setup::new(perturbed(&truth), &shown) };
+        let setup = Setup { trains_exposures, steps: 600, ..Setup::new(perturbed(&ground_truth), &shown) };
         setup.try_run_on(None, &|_| true, &mut |_| Flow::Continue).unwrap()
     };
     let ((without, none), (with, exposures)) = (run(false), run(true));
@@ -299,16 +301,16 @@ fn exposures_are_found_and_the_mean_is_what_is_shown() {
 }
 
 #[test]
-fn given_exposures_are_used_and_stay() {
-    let (truth, gains) = (cloud(11, 150, 0.8), gains());
-    let shown = exposed(&photos(&truth), &gains);
+fn fixed_exposures_are_applied() {
+    let (ground_truth, gains) = (cloud(11, 150, 0.8), gains());
+    let shown = exposed(&photos(&ground_truth), &gains);
     let grey = |gain: f32| Exposure(Exposure::IDENTITY.0.map(|row| row.map(|value| gain * value)));
-    // View 11 has none, and so is shown as it is.
+    // View 11 has no exposure and is rendered as it is.
     let given: Exposures = (0..11).map(|view| (view, grey(gains[view as usize]))).collect();
     let of_most = |photos: &Photos| Photos(photos.0.iter().take(11).cloned().collect());
-    let run = |exposures| Setup { exposures, ..Setup::new(truth.clone(), &shown) }.run();
+    let run = |exposures| Setup { exposures, ..Setup::new(ground_truth.clone(), &shown) }.run();
     let [with, without] = [run(Some(&given)), run(None)].map(|splats| {
-        let photos = of_most(&photos(&truth));
+        let photos = of_most(&photos(&ground_truth));
         let views = views();
         let of = |(view, photo): (&TrainView, &Pixels)| {
             let expected: Vec<f32> = photo.rgb.iter().map(|&b| f32::from(b) / 255.0).collect();
@@ -322,9 +324,10 @@ fn given_exposures_are_used_and_stay() {
 
 #[test]
 fn exposures_do_not_depend_on_threads_or_interruptions() {
-    let (truth, gains) = (cloud(12, 120, 0.8), gains());
-    let shown = exposed(&photos(&truth), &gains);
-    let setup = || Setup { trains_exposures: true, budget: 200, steps: 120, ..Setup::new(perturbed(&truth), &shown) };
+    let (ground_truth, gains) = (cloud(12, 120, 0.8), gains());
+    let shown = exposed(&photos(&ground_truth), &gains);
+    let setup =
+        || Setup { trains_exposures: true, budget: 200, steps: 120, ..Setup::new(perturbed(&ground_truth), &shown) };
     let run = |threads: usize, from: Option<State>, until: u32| {
         let mut left = None;
         let mut report = |mut now: train::Progress| {
@@ -335,38 +338,43 @@ fn exposures_do_not_depend_on_threads_or_interruptions() {
         let done = pool.install(|| setup().try_run_on(from, &|_| true, &mut report)).unwrap();
         (done, left)
     };
-    let calm = run(1, None, u32::MAX).0;
-    assert!(calm.1.as_ref().unwrap().iter().any(|(_, exposure)| *exposure != Exposure::IDENTITY));
-    assert!(calm == run(2, None, u32::MAX).0, "two threads give another result");
-    // Within an epoch, after some growth.
+    let uninterrupted = run(1, None, u32::MAX).0;
+    assert!(uninterrupted.1.as_ref().unwrap().iter().any(|(_, exposure)| *exposure != Exposure::IDENTITY));
+    assert!(uninterrupted == run(2, None, u32::MAX).0, "two threads give another result");
+    // In the middle of an epoch, after some densification.
     let left = run(2, None, 67).1.unwrap();
-    assert!(calm == run(1, Some(State::from_frame(&left).unwrap()), u32::MAX).0, "an interruption shows");
+    assert!(
+        uninterrupted == run(1, Some(State::from_frame(&left).unwrap()), u32::MAX).0,
+        "a resumed run gives another result"
+    );
 }
 
 #[test]
-fn a_report_can_stop_and_errors_say_why() {
-    let truth = cloud(9, 60, 0.8);
-    let photos = photos(&truth);
+fn reports_can_stop_training_and_errors_name_the_cause() {
+    let ground_truth = cloud(9, 60, 0.8);
+    let photos = photos(&ground_truth);
     let mut calls = 0;
     let mut report = |p: train::Progress| {
         calls += 1;
         assert_eq!(p.step, calls);
         if p.step == 10 { Flow::Stop } else { Flow::Continue }
     };
-    assert!(Setup::new(perturbed(&truth), &photos).try_run(&|_| true, &mut report).is_ok());
+    assert!(Setup::new(perturbed(&ground_truth), &photos).try_run(&|_| true, &mut report).is_ok());
     assert_eq!(calls, 10);
 
     let run =
         |initial: Splats, photos: &Photos| Setup::new(initial, photos).try_run(&|_| true, &mut |_| Flow::Continue);
     let missing = Photos(photos.0[..6].to_vec());
-    assert!(matches!(run(perturbed(&truth), &missing), Err(TrainError::Source(line)) if line.contains("is missing")));
+    assert!(
+        matches!(run(perturbed(&ground_truth), &missing), Err(TrainError::Source(line)) if line.contains("is missing"))
+    );
     assert_eq!(run(Splats::new(1), &photos), Err(TrainError::Empty(0)));
-    let mut transparent = perturbed(&truth);
+    let mut transparent = perturbed(&ground_truth);
     transparent.columns_mut()[column::OPACITY].fill(-12.0);
     // At the first refinement.
     assert!(matches!(run(transparent, &photos), Err(TrainError::Empty(10..=50))));
     let job = Job {
-        initial: perturbed(&truth),
+        initial: perturbed(&ground_truth),
         context: None,
         views: &[],
         counts: &|_| true,
@@ -385,10 +393,10 @@ fn a_report_can_stop_and_errors_say_why() {
     assert_eq!(train(job, &mut |_| Flow::Continue), Err(TrainError::NoViews));
 }
 
-/// Photos that note which views were announced and which asked for.
-struct Heard<'a>(&'a Photos, Mutex<[Vec<u32>; 2]>);
+/// Photos that record which views were announced and which were read.
+struct Recorder<'a>(&'a Photos, Mutex<[Vec<u32>; 2]>);
 
-impl WindowSource for Heard<'_> {
+impl WindowSource for Recorder<'_> {
     fn window(&self, view: u32, mip: u8, rect: Rect) -> Result<Arc<Pixels>, String> {
         self.1.lock().unwrap()[1].push(view);
         self.0.window(view, mip, rect)
@@ -399,18 +407,18 @@ impl WindowSource for Heard<'_> {
     }
 }
 
-/// However a training goes, hardly a window is announced that nobody asks for: each of them may be a download.
+/// Few windows are announced that are never read, as each may be a download.
 #[test]
-fn what_is_announced_is_asked_for() {
-    let truth = cloud(1, 60, 0.8);
-    let (photos, views) = (photos(&truth), views());
+fn announced_windows_are_read() {
+    let ground_truth = cloud(1, 60, 0.8);
+    let (photos, views) = (photos(&ground_truth), views());
     for (views_per_step, worth_db) in [(1, 0.0), (1, 1e6), (5, 0.0), (5, 1e6)] {
-        let source = Heard(&photos, Mutex::default());
+        let source = Recorder(&photos, Mutex::default());
         let mut recipe = Recipe { views_per_step, coarse: Vec::new(), ..Recipe::default() };
         recipe.growth.worth_db = worth_db;
         let mut steps = 0;
         let job = Job {
-            initial: perturbed(&truth),
+            initial: perturbed(&ground_truth),
             context: None,
             views: &views,
             counts: &|_| true,
@@ -430,12 +438,16 @@ fn what_is_announced_is_asked_for() {
             steps += now.views as usize;
             Flow::Continue
         });
-        trained.expect("training goes well");
-        let [told, asked] = source.1.into_inner().unwrap();
-        println!("{views_per_step} a step, growth worth {worth_db} dB: {} told, {} asked for", told.len(), asked.len());
-        assert_eq!(asked.len(), steps);
-        assert_eq!(steps < 600, worth_db > 0.0, "growth that never pays ends early");
-        // Those first asked for are not told; those told when growth ended are not asked for.
-        assert!(told.len().abs_diff(asked.len()) <= 16 && told.len() + 16 > asked.len());
+        trained.expect("training succeeds");
+        let [announced, read] = source.1.into_inner().unwrap();
+        println!(
+            "{views_per_step} a step, growth worth {worth_db} dB: {} announced, {} read",
+            announced.len(),
+            read.len()
+        );
+        assert_eq!(read.len(), steps);
+        assert_eq!(steps < 600, worth_db > 0.0, "growth without gain ends early");
+        // The first windows are read without announcement. Those announced when growth ends are never read.
+        assert!(announced.len().abs_diff(read.len()) <= 16 && announced.len() + 16 > read.len());
     }
 }

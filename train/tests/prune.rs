@@ -1,4 +1,4 @@
-//! Pruning on a scene of a few hundred splats, whose photos the renderer itself takes.
+//! Prunes a scene of a few hundred splats, with photos rendered from the ground ground_truth.
 
 use std::sync::Arc;
 
@@ -19,7 +19,7 @@ struct Photos(Vec<Arc<Pixels>>);
 impl WindowSource for Photos {
     fn window(&self, view: u32, mip: u8, rect: Rect) -> Result<Arc<Pixels>, String> {
         let whole = Rect { x: 0, y: 0, width: WIDTH, height: HEIGHT };
-        assert_eq!((mip, rect), (0, whole), "pruning looks at the windows that it is given");
+        assert_eq!((mip, rect), (0, whole), "pruning reads the windows of the job");
         self.0.get(view as usize).cloned().ok_or_else(|| format!("view {view} is missing"))
     }
 }
@@ -51,13 +51,13 @@ fn cloud(key: u64, count: usize, opacity: f32) -> Splats {
     splats
 }
 
-/// What stands there, a little off, so that there is an error to compare with; and beside it half as many that hardly show.
-fn bloated(truth: &Splats) -> Splats {
-    let mut splats = truth.clone();
+/// The ground ground_truth with perturbed colours, so that its PSNR is finite, plus half as many nearly transparent splats.
+fn with_faint_splats(ground_truth: &Splats) -> Splats {
+    let mut splats = ground_truth.clone();
     for (i, value) in splats.columns_mut()[column::SH].iter_mut().enumerate() {
         *value += 2.0 * (random::uniform(77, i as u64) - 0.5);
     }
-    splats.append(&cloud(78, truth.len() / 2, 0.01));
+    splats.append(&cloud(78, ground_truth.len() / 2, 0.01));
     splats
 }
 
@@ -72,13 +72,13 @@ fn photos(splats: &Splats) -> Photos {
     Photos(views().iter().map(|view| Arc::new(photo(view))).collect())
 }
 
-/// Mean over the views, by the crate's measure of reports.
+/// Mean PSNR over the views.
 fn psnr(splats: &Splats, photos: &Photos) -> f64 {
     let views = views();
     let of = |(view, photo): (&TrainView, &Arc<Pixels>)| {
-        let truth: Vec<f32> = photo.rgb.iter().map(|&b| f32::from(b) / 255.0).collect();
+        let ground_truth: Vec<f32> = photo.rgb.iter().map(|&b| f32::from(b) / 255.0).collect();
         let shown: Vec<f32> = render(splats, None, view).iter().map(|v| v.clamp(0.0, 1.0)).collect();
-        metrics::psnr(&shown, &truth, photo.mask.as_deref()).unwrap_or(0.0)
+        metrics::psnr(&shown, &ground_truth, photo.mask.as_deref()).unwrap_or(0.0)
     };
     views.iter().zip(&photos.0).map(of).sum::<f64>() / views.len() as f64
 }
@@ -100,7 +100,7 @@ fn with_job<R>(
         counts,
         keeps: &|_| true,
         budget: initial.len(),
-        // Enough for every round: shorter jobs cut less often.
+        // Enough for all rounds: shorter jobs have fewer.
         steps: 1400,
         antialiased: false,
         seed: 3,
@@ -115,53 +115,53 @@ fn with_job<R>(
 
 fn prune(initial: &Splats, photos: &Photos, counts: Predicate, tolerance_db: f64) -> (Splats, Pruned) {
     with_job(initial, None, photos, counts, |job| {
-        within_tolerance(job, &Pruning::within(tolerance_db), &mut |_| Flow::Continue).expect("pruning goes well")
+        within_tolerance(job, &Pruning::within(tolerance_db), &mut |_| Flow::Continue).expect("pruning succeeds")
     })
 }
 
 #[test]
-fn what_hardly_shows_goes_and_the_tolerance_holds() {
-    let truth = cloud(1, 120, 0.8);
-    let photos = photos(&truth);
-    let model = bloated(&truth);
-    let (pruned, said) = prune(&model, &photos, &|_| true, 0.1);
+fn faint_splats_are_removed_within_the_tolerance() {
+    let ground_truth = cloud(1, 120, 0.8);
+    let photos = photos(&ground_truth);
+    let model = with_faint_splats(&ground_truth);
+    let (pruned, outcome) = prune(&model, &photos, &|_| true, 0.1);
     let (before, after) = (psnr(&model, &photos), psnr(&pruned, &photos));
     println!("{} splats at {before:.2} dB, {} at {after:.2}", model.len(), pruned.len());
     assert!(before < 40.0 && after >= before - 0.1 - 1e-6, "{before} {after}");
-    assert!((said.psnr[0] - before).abs() < 1e-4 && (said.psnr[1] - after).abs() < 1e-4, "{said:?}");
-    assert_eq!(said.splats, [model.len(), pruned.len()]);
-    // The faint third goes, and much of what stands there does not.
-    assert!(pruned.len() <= truth.len() && pruned.len() > truth.len() / 4, "{}", pruned.len());
+    assert!((outcome.psnr[0] - before).abs() < 1e-4 && (outcome.psnr[1] - after).abs() < 1e-4, "{outcome:?}");
+    assert_eq!(outcome.splats, [model.len(), pruned.len()]);
+    // The faint third is removed and most of the ground ground_truth is kept.
+    assert!(pruned.len() <= ground_truth.len() && pruned.len() > ground_truth.len() / 4, "{}", pruned.len());
     let (more, _) = prune(&model, &photos, &|_| true, 1.0);
     assert!(more.len() < pruned.len(), "a wider tolerance allows fewer splats: {}", more.len());
 }
 
 #[test]
-fn threads_do_not_change_a_bit() {
-    let truth = cloud(2, 80, 0.8);
-    let photos = photos(&truth);
+fn result_does_not_depend_on_threads() {
+    let ground_truth = cloud(2, 80, 0.8);
+    let photos = photos(&ground_truth);
     let run = |threads: usize| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-        pool.install(|| prune(&bloated(&truth), &photos, &|_| true, 0.2).0)
+        pool.install(|| prune(&with_faint_splats(&ground_truth), &photos, &|_| true, 0.2).0)
     };
     assert!(run(1) == run(3));
 }
 
 #[test]
-fn only_what_counts_is_cut() {
-    let truth = cloud(3, 100, 0.8);
-    let photos = photos(&truth);
-    let model = bloated(&truth);
+fn only_counted_splats_are_removed() {
+    let ground_truth = cloud(3, 100, 0.8);
+    let photos = photos(&ground_truth);
+    let model = with_faint_splats(&ground_truth);
     let left = |splats: &Splats| (0..splats.len()).filter(|&i| splats.mean(i).x < 0.0).count();
-    let (pruned, said) = prune(&model, &photos, &|p| p.x >= 0.0, 0.2);
-    // Healing moves splats by a small part of their size: hardly one crosses the border.
+    let (pruned, outcome) = prune(&model, &photos, &|p| p.x >= 0.0, 0.2);
+    // Recovery moves splats by a small part of their size, so hardly any crosses the border.
     assert!(left(&pruned).abs_diff(left(&model)) <= 2, "{} {}", left(&pruned), left(&model));
-    assert!(said.splats[1] + 10 < said.splats[0], "{said:?}");
+    assert!(outcome.splats[1] + 10 < outcome.splats[0], "{outcome:?}");
 }
 
 #[test]
-fn a_hole_before_the_context_is_seen() {
-    // Green splats before a red context, photos all green: without them it is red, and not their pixel any more.
+fn holes_in_front_of_the_context_count_as_error() {
+    // Green splats in front of a red context, and green photos. Where they are removed the pixel is red and no longer theirs.
     let mut green = Splats::new(0);
     let mut red = Splats::new(0);
     for i in 0..60 {
@@ -173,64 +173,64 @@ fn a_hole_before_the_context_is_seen() {
     let shell = green.len();
     green.append(&cloud(9, 20, 0.01).with_sh_degree(0));
     let photos = photos(&green);
-    let (pruned, said) = with_job(&green, Some(&red), &photos, &|_| true, |job| {
+    let (pruned, outcome) = with_job(&green, Some(&red), &photos, &|_| true, |job| {
         within_tolerance(job, &Pruning::within(0.1), &mut |_| Flow::Continue).unwrap()
     });
     let worst = |splats: &Splats| {
         let red_at = |view| render(splats, Some(&red), view)[..AREA].iter().filter(|v| **v > 0.6).count();
         views().iter().map(red_at).max().unwrap_or(0)
     };
-    assert!(said.splats[1] <= shell, "what is hidden goes: {said:?}");
-    assert!(worst(&Splats::new(0)) > 100, "the context alone must show");
+    assert!(outcome.splats[1] <= shell, "invisible splats are removed: {outcome:?}");
+    assert!(worst(&Splats::new(0)) > 100, "the context alone must be visible");
     assert!(worst(&pruned) <= worst(&green) + 10, "{} of {}", worst(&pruned), worst(&green));
 }
 
 #[test]
-fn pixels_under_a_mask_protect_nothing() {
-    let truth = cloud(4, 80, 0.8);
-    let mut photos = photos(&truth);
+fn masked_pixels_protect_no_splats() {
+    let ground_truth = cloud(4, 80, 0.8);
+    let mut photos = photos(&ground_truth);
     let masked = |photo: &Arc<Pixels>| {
-        // Everything but a corner.
+        // Masks all but the left columns.
         let mask = (0..AREA).map(|i| if i % WIDTH as usize > 20 { 0 } else { 255 }).collect();
         Arc::new(Pixels { mask: Some(mask), ..Pixels::clone(photo) })
     };
-    let (whole, _) = prune(&bloated(&truth), &photos, &|_| true, 0.1);
+    let (whole, _) = prune(&with_faint_splats(&ground_truth), &photos, &|_| true, 0.1);
     photos.0 = photos.0.iter().map(masked).collect();
-    let model = bloated(&truth);
-    let (corner, said) = prune(&model, &photos, &|_| true, 0.1);
+    let model = with_faint_splats(&ground_truth);
+    let (corner, outcome) = prune(&model, &photos, &|_| true, 0.1);
     assert!(corner.len() < whole.len(), "{} {}", corner.len(), whole.len());
-    assert!((said.psnr[0] - psnr(&model, &photos)).abs() < 1e-4);
+    assert!((outcome.psnr[0] - psnr(&model, &photos)).abs() < 1e-4);
 }
 
 #[test]
-fn a_share_is_kept_and_the_strongest() {
-    let truth = cloud(6, 60, 0.8);
-    let photos = photos(&truth);
-    let model = bloated(&truth);
-    let (kept, said) = with_job(&model, None, &photos, &|_| true, |job| {
+fn the_most_important_share_is_kept() {
+    let ground_truth = cloud(6, 60, 0.8);
+    let photos = photos(&ground_truth);
+    let model = with_faint_splats(&ground_truth);
+    let (kept, outcome) = with_job(&model, None, &photos, &|_| true, |job| {
         to_share(job, &Pruning::within(0.1), 2.0 / 3.0, &mut |_| Flow::Continue).unwrap()
     });
-    assert_eq!((kept.len(), said.splats), (60, [90, 60]));
-    assert!(kept.col(column::OPACITY).iter().all(|logit| *logit > 0.0), "the faint ones went");
+    assert_eq!((kept.len(), outcome.splats), (60, [90, 60]));
+    assert!(kept.col(column::OPACITY).iter().all(|logit| *logit > 0.0), "the faint splats are removed");
 
     let importance: Vec<f64> = (0..10).map(|i| f64::from(i % 5)).collect();
     let few = keep(&cloud(7, 10, 0.5), &importance, 0.5, &|_| true);
     let all = cloud(7, 10, 0.5);
-    assert_eq!(few, all.select(&[2, 3, 4, 8, 9]), "of equals the earlier stay, rows keep their order");
+    assert_eq!(few, all.select(&[2, 3, 4, 8, 9]), "earlier rows win ties, rows keep their order");
     assert_eq!(keep(&all, &importance, 1.0, &|_| true), all);
     assert!(keep(&all, &importance, 0.0, &|_| true).is_empty());
 }
 
 #[test]
-fn stopping_leaves_what_was_reached_and_errors_are_said() {
-    let truth = cloud(8, 60, 0.8);
-    let photos = photos(&truth);
-    let model = bloated(&truth);
+fn stopping_returns_the_last_kept_splats_and_errors_are_reported() {
+    let ground_truth = cloud(8, 60, 0.8);
+    let photos = photos(&ground_truth);
+    let model = with_faint_splats(&ground_truth);
     let pruning = Pruning::within(0.1);
-    let (stopped, said) = with_job(&model, None, &photos, &|_| true, |job| {
+    let (stopped, outcome) = with_job(&model, None, &photos, &|_| true, |job| {
         within_tolerance(job, &pruning, &mut |now| if now.step == 3 { Flow::Stop } else { Flow::Continue }).unwrap()
     });
-    assert!(stopped == model && said.rounds == 0, "the first round was not finished");
+    assert!(stopped == model && outcome.rounds == 0, "the first round was not finished");
     let failed = with_job(&model, None, &photos, &|_| true, |job| {
         within_tolerance(Job { views: &[], ..job }, &pruning, &mut |_| Flow::Continue).unwrap_err()
     });

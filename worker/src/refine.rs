@@ -7,8 +7,8 @@
 
 use glam::Vec3;
 use scene::Splats;
-use train::importance::Views;
-use train::{TrainError, TrainView, blur};
+use train::importance::EvaluationViews;
+use train::{TrainError, TrainView, low_pass};
 
 /// Windows looked at, at most.
 const WINDOWS: usize = 16;
@@ -20,10 +20,10 @@ pub(crate) type Start = (Splats, Option<Splats>);
 ///
 /// # Errors
 /// A window that cannot be read.
-pub(crate) fn residual(all: Views, splats: &Splats) -> Result<Option<f64>, TrainError> {
+pub(crate) fn residual(all: EvaluationViews, splats: &Splats) -> Result<Option<f64>, TrainError> {
     let some = all.some(WINDOWS);
-    let judge = Views { views: &some, ..all };
-    judge.residual(splats, &judge.shares(splats)?)
+    let judge = EvaluationViews { views: &some, ..all };
+    judge.residual(splats, &judge.ownership_weights(splats)?)
 }
 
 /// As [`residual`], of those splats that the block owns, in what the windows show of them.
@@ -31,7 +31,7 @@ pub(crate) fn residual(all: Views, splats: &Splats) -> Result<Option<f64>, Train
 /// # Errors
 /// A window that cannot be read.
 pub(crate) fn residual_of_core(
-    around: Views,
+    around: EvaluationViews,
     splats: &Splats,
     owns: &(dyn Fn(Vec3) -> bool + Sync),
 ) -> Result<Option<f64>, TrainError> {
@@ -39,7 +39,7 @@ pub(crate) fn residual_of_core(
     let core = splats.filter(|i| inside[i]);
     let mut rest = splats.filter(|i| !inside[i]);
     around.context.iter().for_each(|context| rest.append(context));
-    if core.is_empty() { Ok(None) } else { residual(Views { context: Some(&rest), ..around }, &core) }
+    if core.is_empty() { Ok(None) } else { residual(EvaluationViews { context: Some(&rest), ..around }, &core) }
 }
 
 /// The windows as the parent's resolution has them, where they have one.
@@ -47,11 +47,11 @@ pub(crate) fn coarser(views: &[TrainView]) -> Vec<TrainView> {
     views.iter().map(|view| view.at(1).map_or(*view, |(mip, rect, _)| TrainView { mip, rect, ..*view })).collect()
 }
 
-/// A start on some windows as one on others: what pixels hide of a splat's size depends on theirs (see [`blur`]).
+/// A start on some windows as one on others: what pixels hide of a splat's size depends on theirs (see [`low_pass`]).
 pub(crate) fn moved((splats, context): Start, from: &[TrainView], to: &[TrainView]) -> Start {
     let again = |mut splats: Splats| {
-        blur::to_full_images(&mut splats, from);
-        blur::from_full_images(&mut splats, to);
+        low_pass::to_full_resolution(&mut splats, from);
+        low_pass::from_full_resolution(&mut splats, to);
         splats
     };
     (again(splats), context.map(again))

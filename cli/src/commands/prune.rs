@@ -12,7 +12,7 @@ use scene::{BadInput, Capture, Exposures, Splats, column};
 use serde::Serialize;
 use store::BlockingStore;
 use tempfile::TempDir;
-use train::importance::{self, Order, Shares, Views};
+use train::importance::{self, Order, OwnershipWeights, EvaluationViews};
 use train::prune::{self, PruneProgress, Pruned, Pruning};
 use train::{Backend, Flow, Job, Recipe, TrainError, TrainView};
 
@@ -171,12 +171,12 @@ impl Photos {
 
     /// Mean PSNR over views, as `plat eval` measures it: held-out views have no exposure.
     fn psnr(&self, model: &Model, splats: &Splats, views: &[TrainView]) -> Result<f64, Failure> {
-        self.judged(model, views).psnr(splats, &Shares::default()).map_err(failed)
+        self.judged(model, views).psnr(splats, &OwnershipWeights::default()).map_err(failed)
     }
 
-    fn judged<'a>(&'a self, model: &'a Model, views: &'a [TrainView]) -> Views<'a> {
+    fn judged<'a>(&'a self, model: &'a Model, views: &'a [TrainView]) -> EvaluationViews<'a> {
         let (antialiased, exposures) = (model.antialiased, self.exposures(model));
-        Views { views, context: None, antialiased, exposures, source: &self.reader }
+        EvaluationViews { views, context: None, antialiased, exposures, source: &self.reader }
     }
 
     fn exposures<'a>(&self, model: &'a Model) -> Option<&'a Exposures> {
@@ -217,7 +217,7 @@ impl Photos {
         };
         let progress = output.progress("pruning", 1000);
         let mut report = |now: PruneProgress| {
-            progress.at(1000 * u64::from(now.step) / u64::from(now.steps), format!("{} splats", now.healing.count()));
+            progress.at(1000 * u64::from(now.step) / u64::from(now.steps), format!("{} splats", now.recovery.count()));
             Flow::Continue
         };
         let pruned = match share {
@@ -305,7 +305,7 @@ pub(crate) fn bench(args: &BenchPruneArgs, output: &Output) -> Result<(), Failur
         let pruning = Pruning {
             order,
             rounds: args.rounds.unwrap_or(standard.rounds),
-            healing: args.healing.unwrap_or(standard.healing),
+            recovery_share: args.healing.unwrap_or(standard.recovery_share),
             drop_db: args.drop_db.unwrap_or(standard.drop_db),
             ..standard
         };

@@ -1,5 +1,5 @@
-//! A scene of a few hundred splats in a ring of cameras, whose photos the renderer itself takes, and jobs that train it.
-#![allow(dead_code, unreachable_pub)] // Each file of tests uses a part.
+//! A test scene of a few hundred splats in a ring of cameras, with photos rendered from the ground truth, and jobs that train it.
+#![allow(dead_code, unreachable_pub)] // Each test file uses a part.
 
 use std::sync::Arc;
 
@@ -8,7 +8,7 @@ use render::Options;
 use render::cpu::Renderer;
 use scene::splats::SH_C0;
 use scene::{Camera, Exposures, Pinhole, Pixels, Rect, Rigid, Splat, Splats};
-use train::{Backend, Flow, Job, Recipe, State, TrainError, TrainView, WindowSource, metrics, random, train_on};
+use train::{Backend, Flow, Job, Recipe, State, TrainError, TrainView, WindowSource, metrics, random, train_from};
 
 pub const WIDTH: u32 = 64;
 pub const HEIGHT: u32 = 48;
@@ -74,7 +74,7 @@ pub fn cloud(key: u64, count: usize, opacity: f32) -> Splats {
     splats
 }
 
-/// As a sparse cloud knows them: places a little off, round, all of one size and opacity, colours half grey.
+/// Initial splats as from a sparse cloud: displaced means, isotropic, of one size and opacity, colours half grey.
 pub fn perturbed(splats: &Splats) -> Splats {
     let mut out = Splats::new(splats.sh_degree());
     for i in 0..splats.len() {
@@ -97,7 +97,7 @@ pub fn photos(splats: &Splats) -> Photos {
     Photos(views().iter().map(photo).collect())
 }
 
-/// Mean PSNR over the views, where `mask` (a function of the pixel) lets it count.
+/// Mean PSNR over the views on the pixels for which `used` is true.
 pub fn psnr(splats: &Splats, photos: &Photos, used: impl Fn(usize) -> bool) -> f64 {
     let mask: Vec<u8> = (0..AREA).map(|i| if used(i) { 255 } else { 0 }).collect();
     let views = views();
@@ -123,7 +123,7 @@ pub struct Setup<'a> {
 }
 
 impl<'a> Setup<'a> {
-    /// No growth, no context.
+    /// A job whose budget is the number of initial splats, without context.
     pub fn new(initial: Splats, photos: &'a Photos) -> Self {
         let budget = initial.len();
         let (exposures, trains_exposures) = (None, false);
@@ -133,7 +133,7 @@ impl<'a> Setup<'a> {
     }
 
     pub fn run(self) -> Splats {
-        self.try_run(&|_| true, &mut |_| Flow::Continue).expect("training goes well")
+        self.try_run(&|_| true, &mut |_| Flow::Continue).expect("training succeeds")
     }
 
     pub fn try_run(
@@ -168,11 +168,11 @@ impl<'a> Setup<'a> {
             source: self.photos,
             backend: &self.backend,
         };
-        train_on(job, from, report)
+        train_from(job, from, report)
     }
 }
 
-/// A recipe that neither adds nor removes splats, so that rows keep their places.
+/// A recipe without densification, so that rows keep their order.
 pub fn no_growth() -> Recipe {
     let mut recipe = Recipe::default();
     recipe.growth = recipe.growth.none();

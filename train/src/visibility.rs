@@ -1,31 +1,31 @@
-//! Which windows show which splats, and how finely: all splats against all windows.
+//! Finds the windows that each splat is visible in, and the finest pixel that covers it.
 
 use rayon::prelude::*;
 use scene::{Splats, column};
 
-use crate::TrainView;
+use crate::view::TrainView;
 
-/// Splats that are looked at together: their numbers stay in the first cache while the windows go by.
+/// Splats per parallel job: their means stay in the L1 cache while all windows are tested.
 const CHUNK: usize = 1024;
 
-/// The finest pixel that falls on a splat.
+/// The finest pixel at a splat's centre over all windows.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Finest {
-    /// Its area there, square metres; infinite where no window shows the splat's centre.
+pub struct FinestPixel {
+    /// Area of the pixel at the splat's depth, m². Infinite where no window contains the splat's centre.
     pub area: f32,
-    /// How much of that area is its mip's: the rest is a pixel of the full image.
-    pub coarser: f32,
+    /// Share of that area beyond a pixel of mip 0: 1 - 4^-mip.
+    pub coarse_share: f32,
 }
 
-impl Finest {
-    /// Does any window show the splat's centre?
-    pub fn is_seen(&self) -> bool {
+impl FinestPixel {
+    /// True if any window contains the splat's centre.
+    pub fn is_visible(&self) -> bool {
         self.area < f32::INFINITY
     }
 }
 
-/// Of every splat, the finest pixel in any of the windows, each grown by `margin` of its size on every side.
-pub fn finest(splats: &Splats, views: &[TrainView], margin: f32) -> Vec<Finest> {
+/// For every splat, the finest pixel over the windows, each enlarged by `margin` times its size on every side.
+pub fn finest_pixels(splats: &Splats, views: &[TrainView], margin: f32) -> Vec<FinestPixel> {
     let windows: Vec<Window> = views.iter().map(|view| Window::of(view, margin)).collect();
     let columns = splats.columns();
     let mean = [column::MEAN, column::MEAN + 1, column::MEAN + 2].map(|c| columns[c].as_slice());
@@ -33,24 +33,24 @@ pub fn finest(splats: &Splats, views: &[TrainView], margin: f32) -> Vec<Finest> 
     chunks
         .flat_map_iter(|chunk| {
             let rows = chunk * CHUNK..splats.len().min((chunk + 1) * CHUNK);
-            let (mut area, mut coarser) = (vec![f32::INFINITY; rows.len()], vec![0.0; rows.len()]);
+            let (mut area, mut coarse_share) = (vec![f32::INFINITY; rows.len()], vec![0.0; rows.len()]);
             for window in &windows {
-                window.look(mean.map(|column| &column[rows.clone()]), &mut area, &mut coarser);
+                window.update(mean.map(|column| &column[rows.clone()]), &mut area, &mut coarse_share);
             }
-            area.into_iter().zip(coarser).map(|(area, coarser)| Finest { area, coarser })
+            area.into_iter().zip(coarse_share).map(|(area, coarse_share)| FinestPixel { area, coarse_share })
         })
         .collect()
 }
 
-/// A window as sides to be on: a place is in it where its depth and four sums are positive.
+/// A window's camera in f32, prepared for the inside test.
 struct Window {
     centre: [f32; 3],
-    /// Camera axes from world axes, by rows.
+    /// Rows are the camera's axes in world coordinates.
     rotation: [[f32; 3]; 3],
     focal: [f32; 2],
-    /// Left and right, top and bottom edge, from the principal point, pixels.
+    /// Left and right, top and bottom edge, in pixels from the principal point.
     edges: [[f32; 2]; 2],
-    coarser: f32,
+    coarse_share: f32,
 }
 
 impl Window {
@@ -66,17 +66,17 @@ impl Window {
             rotation: [0, 1, 2].map(|row| rotation.row(row).as_vec3().to_array()),
             focal: [k.fx as f32, k.fy as f32],
             edges: [edges(k.width, k.cx), edges(k.height, k.cy)],
-            coarser: 1.0 - 0.25f32.powi(i32::from(view.mip)),
+            coarse_share: 1.0 - 0.25f32.powi(i32::from(view.mip)),
         }
     }
 
-    /// Where its pixel is the finest so far, notes it. No branches: the compiler takes several places at once.
-    fn look(&self, [x, y, z]: [&[f32]; 3], area: &mut [f32], coarser: &mut [f32]) {
+    /// Updates the splats at which this window's pixel is the finest so far. Branch-free, so that the compiler vectorises it.
+    fn update(&self, [x, y, z]: [&[f32]; 3], area: &mut [f32], coarse_share: &mut [f32]) {
         let [cx, cy, cz] = self.centre;
         let [right, down, forward] = self.rotation;
         let [[left_edge, right_edge], [top_edge, bottom_edge]] = self.edges;
         let per_depth = 1.0 / (self.focal[0] * self.focal[1]);
-        for ((((&x, &y), &z), area), coarser) in x.iter().zip(y).zip(z).zip(area).zip(coarser) {
+        for ((((&x, &y), &z), area), coarse_share) in x.iter().zip(y).zip(z).zip(area).zip(coarse_share) {
             let (x, y, z) = (x - cx, y - cy, z - cz);
             let along = |axis: [f32; 3]| axis[0] * x + axis[1] * y + axis[2] * z;
             let (u, v, depth) = (self.focal[0] * along(right), self.focal[1] * along(down), along(forward));
@@ -88,7 +88,7 @@ impl Window {
             let here = depth * depth * per_depth;
             let finer = inside & (here < *area);
             *area = if finer { here } else { *area };
-            *coarser = if finer { self.coarser } else { *coarser };
+            *coarse_share = if finer { self.coarse_share } else { *coarse_share };
         }
     }
 }
@@ -101,7 +101,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn as_the_camera_projects_it() {
+    fn visibility_agrees_with_camera_projection() {
         let pinhole = Pinhole { width: 200, height: 160, fx: 150.0, fy: 140.0, cx: 97.0, cy: 85.0 };
         let turned = |k: f64| Rigid {
             rotation: DQuat::from_euler(glam::EulerRot::XYZ, 0.3 * k, 1.1 * k, -0.2 * k),
@@ -121,37 +121,37 @@ mod tests {
             splats.push(&Splat::round(Vec3::new(coordinate(0), coordinate(1), coordinate(2)), 0.0, Vec3::ONE, 0.5));
         }
         for margin in [0.0, 0.2] {
-            let found = finest(&splats, &views, margin);
-            let (mut seen, mut near_an_edge) = (0, 0);
+            let found = finest_pixels(&splats, &views, margin);
+            let (mut visible, mut near_an_edge) = (0, 0);
             for (i, found) in found.iter().enumerate() {
                 let mut best = (f64::INFINITY, 0.0);
-                let mut doubtful = false;
+                let mut is_ambiguous = false;
                 for view in &views {
                     let camera = view.camera.mip(view.mip).window(view.rect);
                     let (pixel, depth) = camera.project(splats.mean(i).as_dvec3());
-                    let beyond = |v: f64, size: u32| {
+                    let distance = |v: f64, size: u32| {
                         let more = f64::from(margin) * f64::from(size);
                         (v + more).min(f64::from(size) + more - v)
                     };
-                    let least = beyond(pixel.x, view.rect.width).min(beyond(pixel.y, view.rect.height));
-                    doubtful |= depth > 0.0 && least.abs() < 1e-2;
+                    let inset = distance(pixel.x, view.rect.width).min(distance(pixel.y, view.rect.height));
+                    is_ambiguous |= depth > 0.0 && inset.abs() < 1e-2;
                     let area = depth * depth / (camera.pinhole.fx * camera.pinhole.fy);
-                    if depth > 0.0 && least >= 0.0 && area < best.0 {
+                    if depth > 0.0 && inset >= 0.0 && area < best.0 {
                         best = (area, 1.0 - 0.25f64.powi(i32::from(view.mip)));
                     }
                 }
-                if doubtful {
+                if is_ambiguous {
                     near_an_edge += 1;
                     continue;
                 }
-                assert_eq!(found.is_seen(), best.0.is_finite(), "splat {i}");
-                if found.is_seen() {
-                    seen += 1;
+                assert_eq!(found.is_visible(), best.0.is_finite(), "splat {i}");
+                if found.is_visible() {
+                    visible += 1;
                     assert!((f64::from(found.area) / best.0 - 1.0).abs() < 1e-3, "splat {i}");
-                    assert!((f64::from(found.coarser) - best.1).abs() < 1e-6, "splat {i}");
+                    assert!((f64::from(found.coarse_share) - best.1).abs() < 1e-6, "splat {i}");
                 }
             }
-            assert!(seen > 100 && seen < 2500 && near_an_edge < 20, "{seen} {near_an_edge}");
+            assert!(visible > 100 && visible < 2500 && near_an_edge < 20, "{visible} {near_an_edge}");
         }
     }
 }

@@ -1,0 +1,60 @@
+//! Selects the device that computes training steps: the CPU or a GPU.
+
+mod cpu;
+#[cfg(feature = "gpu")]
+mod gpu;
+pub(crate) mod step;
+
+#[cfg(feature = "gpu")]
+use std::sync::Arc;
+
+use render::cpu::Isa;
+#[cfg(feature = "gpu")]
+use render::gpu::Gpu;
+use scene::Splats;
+
+use self::step::TrainDevice;
+use crate::checkpoint::State;
+use crate::error::TrainError;
+
+/// The device that computes training steps.
+#[derive(Debug, Clone, Default)]
+pub enum Backend {
+    /// SIMD and threads.
+    #[default]
+    Cpu,
+    /// A GPU, or a software adapter.
+    #[cfg(feature = "gpu")]
+    Gpu(Arc<Gpu>),
+}
+
+impl Backend {
+    /// Full name with the instruction set or adapter. Results of two names may differ in the last bits.
+    pub fn name(&self) -> String {
+        match self {
+            Self::Cpu => format!("cpu-{}", Isa::detect().name()),
+            #[cfg(feature = "gpu")]
+            Self::Gpu(gpu) => gpu.name().to_owned(),
+        }
+    }
+
+    /// True for every backend but the CPU.
+    pub(crate) fn is_gpu(&self) -> bool {
+        !matches!(self, Self::Cpu)
+    }
+
+    /// Sets up a device that continues from `state`; `lambda` is the weight of D-SSIM in the loss.
+    #[cfg_attr(not(feature = "gpu"), allow(unused_variables))]
+    pub(crate) fn open<'a>(
+        &self,
+        state: &State,
+        lambda: f32,
+        context: Option<&'a Splats>,
+    ) -> Result<Box<dyn TrainDevice + 'a>, TrainError> {
+        Ok(match self {
+            Self::Cpu => Box::new(cpu::CpuDevice::new(lambda, context)),
+            #[cfg(feature = "gpu")]
+            Self::Gpu(gpu) => Box::new(gpu::GpuDevice::new(gpu, state, lambda, context)?),
+        })
+    }
+}

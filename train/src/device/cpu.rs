@@ -1,0 +1,145 @@
+//! Computes training steps on the CPU, in place on the state.
+
+use rayon::prelude::*;
+use render::cpu::{Isa, Renderer};
+use render::{Frame, Gradients, Upstream};
+use scene::{Pixels, Splats};
+
+use super::step::{StatePart, Step, TrainDevice, ViewSample};
+use crate::checkpoint::State;
+use crate::error::TrainError;
+use crate::exposure::{expose, expose_backward};
+use crate::loss::PhotometricLoss;
+
+/// The renderer, the loss and their buffers.
+pub(crate) struct CpuDevice<'a> {
+    context: Option<&'a Splats>,
+    renderer: Renderer,
+    loss: PhotometricLoss,
+    upstream: Upstream,
+    exposed: Vec<f32>,
+    weights: Vec<f32>,
+    /// Summed gradients of a step with several samples.
+    sum: Gradients,
+}
+
+impl<'a> CpuDevice<'a> {
+    /// `lambda` is the weight of D-SSIM in the loss.
+    pub(crate) fn new(lambda: f32, context: Option<&'a Splats>) -> Self {
+        let isa = Isa::detect();
+        Self {
+            context,
+            renderer: Renderer::new(isa),
+            loss: PhotometricLoss::new(isa, lambda),
+            upstream: Upstream::default(),
+            exposed: Vec::new(),
+            weights: Vec::new(),
+            sum: Gradients::default(),
+        }
+    }
+}
+
+impl TrainDevice for CpuDevice<'_> {
+    fn step(&mut self, state: &mut State, step: Step) -> Result<(), TrainError> {
+        let Step { samples, options, mut rates, exposure_rate } = step;
+        let several = samples.len() > 1;
+        let before = several.then(|| state.densification.clone());
+        let (mut loss, mut errors, mut by_exposure, mut visible_sum) = (0.0, Vec::new(), Vec::new(), 0);
+        for ViewSample { view, photo, camera, exposure } in &samples {
+            let frame = self.renderer.forward(&state.splats, self.context, camera, &options);
+            pixel_weights(frame, photo, &mut self.weights);
+            let exposure = state.exposures.as_ref().map_or(*exposure, |exposures| exposures.of(*view));
+            let shown = exposure.as_ref().map_or(&frame.colour, |exposure| {
+                expose(exposure, &frame.colour, &mut self.exposed);
+                &self.exposed
+            });
+            let value = self.loss.evaluate(shown, photo, &self.weights, &mut self.upstream.colour);
+            loss += value.total / samples.len() as f64;
+            if !value.total.is_finite() {
+                (state.loss, state.skipped) = (loss, state.skipped + 1);
+                state.densification = before.unwrap_or_else(|| std::mem::take(&mut state.densification));
+                return Ok(());
+            }
+            errors.push(value.l1);
+            if let Some(exposure) = &exposure {
+                by_exposure.push((*view, expose_backward(exposure, &frame.colour, &mut self.upstream.colour)));
+            }
+            let gradients = self.renderer.backward(&state.splats, &self.upstream);
+            state.densification.add(gradients, photo.area() as f32);
+            if several {
+                visible_sum += visible_count(gradients);
+                accumulate(&mut self.sum, gradients, errors.len() == 1);
+            }
+        }
+        state.loss = loss;
+        if let Some(exposures) = &mut state.exposures {
+            by_exposure.iter().for_each(|(view, gradient)| exposures.step(*view, gradient, exposure_rate));
+        }
+        let gradients = match several {
+            // Each sample's regulariser is a mean over the splats visible in it, Adam's over those visible in any.
+            true => {
+                let share = (samples.len() * visible_count(&self.sum)) as f32 / visible_sum.max(1) as f32;
+                rates.opacity_reg *= share;
+                rates.needle_reg *= share;
+                &self.sum
+            }
+            false => self.renderer.gradients(),
+        };
+        state.adam.step(&mut state.splats, gradients, options.sh_degree, &rates);
+        errors.into_iter().for_each(|error| state.coarse_to_fine.tally.add(error));
+        Ok(())
+    }
+
+    fn download(&mut self, _: &mut State, _: StatePart) -> Result<(), TrainError> {
+        Ok(())
+    }
+
+    fn upload(&mut self, _: &State, _: StatePart) -> Result<(), TrainError> {
+        Ok(())
+    }
+}
+
+/// Number of visible splats.
+fn visible_count(gradients: &Gradients) -> usize {
+    gradients.seen.iter().map(|word| word.count_ones() as usize).sum()
+}
+
+/// Adds the columns and visibility of a sample's gradients, which are all that Adam uses.
+fn accumulate(sum: &mut Gradients, more: &Gradients, first: bool) {
+    if first {
+        sum.columns.clone_from(&more.columns);
+        sum.seen.clone_from(&more.seen);
+        return;
+    }
+    sum.columns.par_iter_mut().zip(&more.columns).for_each(|(sum, more)| {
+        sum.iter_mut().zip(more).for_each(|(sum, more)| *sum += more);
+    });
+    sum.seen.iter_mut().zip(&more.seen).for_each(|(sum, more)| *sum |= more);
+}
+
+/// Loss weight of each pixel: zero under a mask, else from the share of the pixel that the block's own splats explain. Empty where all
+/// weights are 1.
+pub(super) fn pixel_weights(frame: &Frame, photo: &Pixels, weights: &mut Vec<f32>) {
+    weights.clear();
+    if !frame.trainable_alpha.is_empty() {
+        // Transmittance that nothing explains yet counts half as the block's own, so that a block may fill it. The share is squared:
+        // Adam normalises gradients, so small steady ones would still move splats.
+        const UNEXPLAINED: f32 = 0.5;
+        const MIN_SHARE: f32 = 1e-4;
+        weights.extend(frame.trainable_alpha.iter().zip(&frame.transmittance).map(|(own, transmittance)| {
+            let open = UNEXPLAINED * transmittance + MIN_SHARE;
+            let share = (own + open) / (1.0 - transmittance + open);
+            share * share
+        }));
+    }
+    if let Some(mask) = &photo.mask {
+        if weights.is_empty() {
+            weights.resize(mask.len(), 1.0);
+        }
+        for (weight, &mask) in weights.iter_mut().zip(mask) {
+            if mask < 128 {
+                *weight = 0.0;
+            }
+        }
+    }
+}

@@ -1,0 +1,348 @@
+//! Computes training steps on a GPU. Splats, Adam moments and densification statistics live on the device, which runs ahead of the host.
+//!
+//! ```text
+//! photos ┐
+//! splats ┴forward→ frames ─loss_forward→ sums ─finish_loss→ optimiser state ─loss_backward→ upstream ─backward→ gradients ─adam→ splats
+//! ```
+//! A step reads nothing back. The device itself checks that the loss is finite and counts finished steps in its optimiser state.
+//! When a step has more tile pairs than the pair buffer holds, that step and all after it change nothing. The host finds this at the
+//! next synchronisation, enlarges the buffer and resubmits those steps. The result therefore depends neither on the buffer's
+//! size nor on when the host synchronises.
+
+use std::collections::VecDeque;
+use std::iter;
+use std::sync::Arc;
+
+use bytemuck::Zeroable;
+use render::cpu::Isa;
+use render::gpu::{Buffer, Columns, Gpu, GpuError, GpuRenderer, GpuSplats, GrowableBuffer, Kernel, UpstreamPlanes};
+use scene::{Camera, Splats, column};
+use shaders::train::{ADAM, AdamConstants, DENSIFICATION_STATS, LOSS, OptimiserState, Photo, Photos};
+use shaders::{MAX_VIEWS, TILE, args};
+
+use super::step::{MAX_VIEWS_PER_STEP, StatePart, Step, TrainDevice, ViewSample};
+use crate::checkpoint::State;
+use crate::coarse_to_fine::Tally;
+use crate::error::TrainError;
+use crate::growth::DensificationStats;
+use crate::optimiser::{self, Adam};
+
+/// Steps in flight on the device while the host reads the next photo.
+const IN_FLIGHT: usize = 2;
+/// Samples between two synchronisations. The host keeps their photos until then, in case it has to resubmit.
+const SYNC_EVERY: usize = 32;
+const _: () = assert!(MAX_VIEWS_PER_STEP as usize == MAX_VIEWS);
+
+/// First column of each bank of [`Columns`], and the end.
+const BANKS: [usize; 5] = [0, column::SH + 3, column::SH + 18, column::SH + 33, column::SH + 48];
+
+/// The training state on a GPU.
+pub(crate) struct GpuDevice {
+    gpu: Arc<Gpu>,
+    renderer: GpuRenderer,
+    kernels: Kernels,
+    lambda: f32,
+    splats: GpuSplats,
+    context: Option<GpuSplats>,
+    /// First and second moments, with the splats' stride.
+    moments: [Columns; 2],
+    /// Densification statistics: error and weight of each splat, with the splats' stride.
+    stats: GrowableBuffer,
+    /// Densification statistics: number of views of each splat.
+    views: GrowableBuffer,
+    /// One [`OptimiserState`].
+    optimiser: Buffer,
+    /// Photos with their masks, one byte per value.
+    photo: GrowableBuffer,
+    /// Derivatives of SSIM.
+    partials: GrowableBuffer,
+    /// Partial sums of the loss, per tile.
+    sums: GrowableBuffer,
+    /// Submitted steps that are not known to be finished.
+    pending: VecDeque<Step>,
+    /// Finished steps at the last synchronisation.
+    done: u32,
+    in_flight: VecDeque<wgpu::SubmissionIndex>,
+}
+
+struct Kernels {
+    loss_forward: Kernel,
+    finish_loss: Kernel,
+    loss_backward: Kernel,
+    stats: Kernel,
+    adam_shape: Kernel,
+    adam_colour: Kernel,
+}
+
+impl GpuDevice {
+    /// Uploads a state. `lambda` is the weight of D-SSIM in the loss.
+    pub(crate) fn new(
+        gpu: &Arc<Gpu>,
+        state: &State,
+        lambda: f32,
+        context: Option<&Splats>,
+    ) -> Result<Self, TrainError> {
+        let g = &**gpu;
+        let kernels = Kernels {
+            loss_forward: g.kernel(&LOSS, "loss_forward")?,
+            finish_loss: g.kernel(&LOSS, "finish_loss")?,
+            loss_backward: g.kernel(&LOSS, "loss_backward")?,
+            stats: g.kernel(&DENSIFICATION_STATS, "densification_stats")?,
+            adam_shape: g.kernel(&ADAM, "adam_shape")?,
+            adam_colour: g.kernel(&ADAM, "adam_colour")?,
+        };
+        let moments = || Columns::new(g, "moments", 0, 0);
+        let mut device = Self {
+            renderer: GpuRenderer::new(Arc::clone(gpu))?,
+            kernels,
+            lambda,
+            splats: GpuSplats::upload(gpu, &state.splats, state.splats.len())?,
+            context: context.map(|context| GpuSplats::upload(gpu, context, context.len())).transpose()?,
+            moments: [moments()?, moments()?],
+            stats: GrowableBuffer::new(g, "densification statistics")?,
+            views: GrowableBuffer::new(g, "views of splats")?,
+            optimiser: g.buffer("optimiser state", size_of::<OptimiserState>() as u64)?,
+            photo: GrowableBuffer::new(g, "photo")?,
+            partials: GrowableBuffer::new(g, "derivatives of SSIM")?,
+            sums: GrowableBuffer::new(g, "sums of tiles")?,
+            pending: VecDeque::new(),
+            done: 0,
+            in_flight: VecDeque::new(),
+            gpu: Arc::clone(gpu),
+        };
+        device.upload_training_state(state)?;
+        Ok(device)
+    }
+
+    /// Uploads everything but the splats.
+    fn upload_training_state(&mut self, state: &State) -> Result<(), GpuError> {
+        let gpu = &*self.gpu;
+        let (stride, sh_degree) = (self.splats.columns().stride(), self.splats.sh_degree());
+        let (adam_steps, first, second) = state.adam.parts();
+        for (moments, columns) in self.moments.iter_mut().zip([first, second]) {
+            if moments.stride() != stride || moments.sh_degree() != sh_degree {
+                // Free the old moments first: device memory may not hold both.
+                *moments = Columns::new(gpu, "moments", 0, 0)?;
+                *moments = Columns::new(gpu, "moments", sh_degree, stride)?;
+            }
+            moments.write(gpu, columns)?;
+        }
+        self.stats.reserve(gpu, 8 * stride as u64)?;
+        self.views.reserve(gpu, 4 * stride as u64)?;
+        let n = state.splats.len();
+        let DensificationStats { error, weight, views } = &state.densification;
+        // The host has statistics of all splats, or of none since the last refinement.
+        let padded =
+            |values: &[f32]| -> Vec<f32> { values.iter().copied().chain(iter::repeat(0.0)).take(stride).collect() };
+        gpu.upload(&self.stats, 0, &padded(error))?;
+        gpu.upload(&self.stats, 4 * stride as u64, &padded(weight))?;
+        let views: Vec<u32> = views.iter().copied().chain(iter::repeat(0)).take(n).collect();
+        gpu.upload(&self.views, 0, &views)?;
+        let Tally { sum, count } = state.coarse_to_fine.tally;
+        let optimiser = OptimiserState {
+            adam_steps: adam_steps as u32,
+            steps_skipped: state.skipped,
+            epoch_views: count,
+            epoch_l1: sum as f32,
+            loss: state.loss as f32,
+            ..OptimiserState::default()
+        };
+        self.done = 0;
+        gpu.upload(&self.optimiser, 0, &[optimiser])
+    }
+
+    /// Submits a step.
+    fn submit(&mut self, step: &Step) -> Result<(), GpuError> {
+        let gpu = Arc::clone(&self.gpu);
+        let Step { samples, options, rates, .. } = step;
+        let (photos, bytes) = self.photos(samples, options.extras);
+        let area: usize = samples.iter().map(|sample| sample.photo.area()).sum();
+        let tiles = 3 * photos.tiles;
+        self.photo.reserve(&gpu, bytes.len() as u64)?;
+        self.partials.reserve(&gpu, 4 * 9 * area as u64)?;
+        self.sums.reserve(&gpu, 16 * u64::from(tiles))?;
+
+        let mut encoder = gpu.encoder();
+        gpu.write(&mut encoder, &self.photo, 0, &bytes);
+        let cameras: Vec<Camera> = samples.iter().map(|sample| sample.camera).collect();
+        self.renderer.forward(&mut encoder, &self.splats, self.context.as_ref(), &cameras, options)?;
+        let photos = gpu.uniform(&photos);
+        {
+            let pass = &mut encoder.begin_compute_pass(&wgpu::ComputePassDescriptor::default());
+            let Kernels { loss_forward, finish_loss, loss_backward, .. } = &self.kernels;
+            let (frame, status) = (self.renderer.frame(), self.renderer.status_buffer());
+            let bindings = [(0, &photos), (1, frame), (2, &*self.photo), (3, &*self.partials), (4, &*self.sums)];
+            loss_forward.run(&gpu, pass, &bindings, tiles);
+            finish_loss.run(&gpu, pass, &[(0, &photos), (4, &self.sums), (5, &self.optimiser), (7, status)], 1);
+            let upstream = self.renderer.upstream();
+            let bindings = [bindings[0], bindings[1], bindings[2], bindings[3], (5, &self.optimiser), (6, upstream)];
+            loss_backward.run(&gpu, pass, &bindings, tiles);
+        }
+        self.renderer.backward(&mut encoder, &self.splats, UpstreamPlanes::default())?;
+        self.update_splats(&mut encoder, options.sh_degree, rates, samples.len());
+        self.in_flight.push_back(gpu.submit(encoder)?);
+        match self.in_flight.len() > IN_FLIGHT {
+            true => self.in_flight.pop_front().map_or(Ok(()), |index| gpu.wait_for(index)),
+            false => Ok(()),
+        }
+    }
+
+    /// The layout of the photos in the photo buffer, and the bytes of all photos.
+    fn photos(&self, samples: &[ViewSample], by_share: bool) -> (Photos, Vec<u8>) {
+        let (mut bytes, mut first_pixel) = (Vec::new(), 0);
+        let mut photos = Photos {
+            count: samples.len() as u32,
+            lambda: self.lambda,
+            share_weighted: by_share.into(),
+            ..Photos::zeroed()
+        };
+        for (layout, ViewSample { photo, .. }) in photos.photo.iter_mut().zip(samples) {
+            let (width, height) = (photo.width, photo.height);
+            *layout = Photo {
+                width,
+                height,
+                tiles_x: width.div_ceil(TILE),
+                tiles_y: height.div_ceil(TILE),
+                first_tile: photos.tiles,
+                first_pixel,
+                first_byte: bytes.len() as u32,
+                masked: photo.mask.is_some().into(),
+            };
+            photos.tiles += layout.tiles_x * layout.tiles_y;
+            first_pixel += photo.area() as u32;
+            bytes.extend_from_slice(&photo.rgb);
+            bytes.extend_from_slice(photo.mask.as_deref().unwrap_or_default());
+            bytes.resize(bytes.len().next_multiple_of(4), 0);
+        }
+        (photos, bytes)
+    }
+
+    /// Updates densification statistics and splats from the summed gradients of `views` views.
+    fn update_splats(
+        &self,
+        encoder: &mut wgpu::CommandEncoder,
+        sh_degree: u8,
+        rates: &optimiser::LearningRates,
+        views: usize,
+    ) {
+        let Self { gpu, renderer, kernels, .. } = self;
+        let used = column::SH + 3 * scene::splats::sh_coefficients(sh_degree.min(self.splats.sh_degree()));
+        let rates = |columns: usize| {
+            gpu.uniform(&AdamConstants {
+                mean: rates.mean,
+                log_scale: rates.log_scale,
+                quat: rates.quat,
+                opacity: rates.opacity,
+                sh_dc: rates.sh_dc,
+                sh_rest: rates.sh_rest,
+                beta2: rates.beta2,
+                // Each view's regulariser is a mean over its visible splats.
+                opacity_reg: views as f32 * rates.opacity_reg,
+                needle_reg: views as f32 * rates.needle_reg,
+                log_scale_min: rates.log_scale_bounds[0],
+                log_scale_max: rates.log_scale_bounds[1],
+                columns: columns as u32,
+                stride: self.splats.columns().stride() as u32,
+                views: views as u32,
+                padding: [0; 2],
+            })
+        };
+        let pass = &mut encoder.begin_compute_pass(&wgpu::ComputePassDescriptor::default());
+        let (status, visible, args) = (renderer.status_buffer(), renderer.visible(), renderer.args());
+        let first_rates = rates(0);
+        let common = [(0, &first_rates), (1, status), (2, &self.optimiser), (3, visible)];
+        let bindings = [(4, renderer.statistics()), (5, &*self.stats), (6, &*self.views)];
+        kernels.stats.run_indirect(gpu, pass, &[&common[..], &bindings].concat(), args, args::VISIBLE_TRAINABLE);
+        let values = self.splats.columns().banks();
+        let [first, second] = self.moments.each_ref().map(Columns::banks);
+        let gradients = renderer.gradients().banks();
+        let of_bank = |bank: usize| [(4, values[bank]), (5, first[bank]), (6, second[bank]), (7, gradients[bank])];
+        kernels.adam_shape.run_indirect(gpu, pass, &[&common[..], &of_bank(0)].concat(), args, args::VISIBLE_TRAINABLE);
+        for bank in 1..4 {
+            let start = BANKS[bank];
+            if used > start {
+                let rates = rates(used.min(BANKS[bank + 1]) - start);
+                let bindings = [&[(0, &rates)], &common[1..], &of_bank(bank)].concat();
+                kernels.adam_colour.run_indirect(gpu, pass, &bindings, args, args::VISIBLE_TRAINABLE);
+            }
+        }
+    }
+
+    /// Waits until all submitted steps are finished, resubmitting those that did not fit the pair buffer.
+    fn synchronise(&mut self) -> Result<OptimiserState, GpuError> {
+        loop {
+            let grown = self.renderer.grow_after_overflow()?;
+            self.in_flight.clear();
+            let optimiser: OptimiserState = self.gpu.read(&self.optimiser, 0, 1)?[0];
+            let finished = (optimiser.steps_done - self.done) as usize;
+            self.pending.drain(..finished.min(self.pending.len()));
+            self.done = optimiser.steps_done;
+            if self.pending.is_empty() {
+                return Ok(optimiser);
+            }
+            if !grown {
+                return Err(GpuError::Failed("submitted steps were neither finished nor skipped".into()));
+            }
+            let again: Vec<Step> = self.pending.iter().cloned().collect();
+            again.iter().try_for_each(|step| self.submit(step))?;
+        }
+    }
+}
+
+impl TrainDevice for GpuDevice {
+    fn step(&mut self, _: &mut State, step: Step) -> Result<(), TrainError> {
+        if self.pending.iter().map(|step| step.samples.len()).sum::<usize>() >= SYNC_EVERY {
+            self.synchronise()?;
+        }
+        self.submit(&step)?;
+        self.pending.push_back(step);
+        Ok(())
+    }
+
+    fn download(&mut self, state: &mut State, part: StatePart) -> Result<(), TrainError> {
+        let optimiser = self.synchronise()?;
+        state.skipped = optimiser.steps_skipped;
+        state.loss = f64::from(optimiser.loss);
+        state.coarse_to_fine.tally = Tally { sum: f64::from(optimiser.epoch_l1), count: optimiser.epoch_views };
+        if part >= StatePart::Splats {
+            state.splats = self.splats.download()?;
+        }
+        if part >= StatePart::All {
+            let (gpu, n, stride) = (&*self.gpu, self.splats.len(), self.splats.columns().stride());
+            let [first, second] = &self.moments;
+            let (first, second) = (first.read(gpu, n)?, second.read(gpu, n)?);
+            state.adam = Adam::from_parts(Isa::detect(), optimiser.adam_steps as i32, first, second);
+            state.densification = DensificationStats {
+                error: gpu.read(&self.stats, 0, n)?,
+                weight: gpu.read(&self.stats, stride, n)?,
+                views: gpu.read(&self.views, 0, n)?,
+            };
+        }
+        Ok(())
+    }
+
+    fn upload(&mut self, state: &State, part: StatePart) -> Result<(), TrainError> {
+        self.synchronise()?;
+        if part == StatePart::Tally {
+            let Tally { sum, count } = state.coarse_to_fine.tally;
+            let offset = std::mem::offset_of!(OptimiserState, epoch_views) as u64;
+            self.gpu.upload(&self.optimiser, offset, &[count, (sum as f32).to_bits()])?;
+        } else {
+            self.splats.replace(&state.splats)?;
+            self.upload_training_state(state)?;
+        }
+        Ok(())
+    }
+}
+
+impl From<GpuError> for TrainError {
+    fn from(error: GpuError) -> Self {
+        match error.is_out_of_memory() {
+            true => Self::OutOfMemory(error.to_string()),
+            false => Self::Device(error.to_string()),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;

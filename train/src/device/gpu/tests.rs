@@ -1,0 +1,246 @@
+//! Compares each stage of a GPU step with the CPU, on the inputs that the previous stage left on the device.
+
+use glam::{DQuat, DVec3, Vec3};
+use render::Options;
+use scene::{Camera, Pinhole, Pixels, Rigid, Splat};
+
+use super::*;
+use crate::coarse_to_fine::CoarseToFine;
+use crate::loss::PhotometricLoss;
+use crate::random::{bits, uniform};
+
+fn gpu() -> Option<Arc<Gpu>> {
+    match Gpu::open() {
+        Ok(gpu) => Some(gpu),
+        Err(error) if std::env::var("PLAT_GPU").is_ok_and(|value| value == "required") => panic!("{error}"),
+        Err(error) => {
+            println!("skipped: no adapter ({error})");
+            None
+        }
+    }
+}
+
+/// Splats before the camera, every number from `key`; some needles, with all columns of the SH degree.
+fn cloud(key: u64, count: u64, sh_degree: u8) -> Splats {
+    let mut splats = Splats::new(sh_degree);
+    for i in 0..count {
+        let number = |k: u64| uniform(key, 64 * i + k);
+        let place = Vec3::new(3.0 * number(0) - 1.5, 2.0 * number(1) - 1.0, 3.0 + 2.0 * number(2));
+        let mut splat = Splat::round(place, -2.0, Vec3::new(number(3), number(4), number(5)), 0.1 + 0.8 * number(6));
+        splat.log_scale += Vec3::new(number(7), number(8), number(9)) - 0.5;
+        if i % 9 == 0 {
+            splat.log_scale.x -= 4.0;
+            splat.log_scale.y -= 4.0;
+        }
+        splat.quat = [number(10) + 0.1, number(11), number(12), number(13)];
+        splat.sh[1..].iter_mut().flatten().zip(14..).for_each(|(value, k)| *value = 0.3 * (number(k) - 0.5));
+        splats.push(&splat);
+    }
+    splats
+}
+
+/// A photo of noise, masked on the right if `masked`.
+fn sample(masked: bool, key: u64, [width, height]: [u32; 2], translation: DVec3) -> ViewSample {
+    let area = (width * height) as usize;
+    let rgb = (0..3 * area).map(|i| bits(key, i as u64) as u8).collect();
+    let mask = masked.then(|| (0..area).map(|i| if i % width as usize > 50 { 0 } else { 255 }).collect());
+    let pinhole = Pinhole { width, height, fx: 70.0, fy: 72.0, cx: 37.0, cy: 27.0 };
+    let camera_from_world = Rigid { rotation: DQuat::IDENTITY, translation };
+    let photo = Arc::new(Pixels { width, height, rgb, mask });
+    ViewSample { view: 0, photo, camera: Camera { pinhole, camera_from_world }, exposure: None }
+}
+
+/// A step with one sample whose size is no multiple of a tile.
+fn step(masked: bool, extras: bool, key: u64) -> Step {
+    Step {
+        samples: vec![sample(masked, key, [75, 53], DVec3::ZERO)],
+        options: Options { extras, sh_degree: 3, ..Options::default() },
+        rates: optimiser::LearningRates {
+            mean: 0.03,
+            log_scale: 0.01,
+            quat: 0.002,
+            opacity: 0.05,
+            sh_dc: 0.01,
+            sh_rest: 0.0005,
+            beta2: 0.999,
+            opacity_reg: 0.02,
+            needle_reg: 0.01,
+            log_scale_bounds: [-5.0, -1.0],
+        },
+        exposure_rate: 0.0,
+    }
+}
+
+fn new_state(splats: Splats) -> State {
+    State {
+        step: 0,
+        skipped: 0,
+        start_count: splats.len(),
+        coarse_to_fine: CoarseToFine::default(),
+        adam: Adam::new(Isa::detect(), &splats),
+        densification: DensificationStats::default(),
+        exposures: None,
+        splats,
+        loss: f64::NAN,
+    }
+}
+
+/// The largest difference between values, in units of the largest value.
+fn off(found: &[f32], expected: &[f32]) -> f32 {
+    assert_eq!(found.len(), expected.len());
+    let largest = expected.iter().fold(1e-30f32, |most, value| most.max(value.abs()));
+    found.iter().zip(expected).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max) / largest
+}
+
+fn words(state: &State) -> Vec<u32> {
+    let (_, first, second) = state.adam.parts();
+    let columns = state.splats.columns().iter().chain(first).chain(second);
+    let DensificationStats { error, weight, .. } = &state.densification;
+    columns.chain([error, weight]).flatten().map(|value| value.to_bits()).collect()
+}
+
+#[test]
+fn stages_agree_with_the_cpu() {
+    let Some(gpu) = gpu() else { return };
+    for (sh_degree, masked, extras) in [(0, false, false), (1, true, false), (2, false, true), (3, true, true)] {
+        let context = extras.then(|| cloud(7, 60, 3));
+        let mut state = new_state(cloud(3, 300, sh_degree));
+        let mut device = GpuDevice::new(&gpu, &state, 0.2, context.as_ref()).unwrap();
+        // The second step starts with nonzero moments.
+        for key in [1, 2] {
+            let step = step(masked, extras, key);
+            let photo = &step.samples[0].photo;
+            device.download(&mut state, StatePart::All).unwrap();
+            let mut expected = state.clone();
+            device.step(&mut state, step.clone()).unwrap();
+            device.download(&mut state, StatePart::All).unwrap();
+
+            let frame = device.renderer.read_frame(0).unwrap();
+            let mut weights = Vec::new();
+            super::super::cpu::pixel_weights(&frame, photo, &mut weights);
+            let mut upstream = Vec::new();
+            let value =
+                PhotometricLoss::new(Isa::detect(), 0.2).evaluate(&frame.colour, photo, &weights, &mut upstream);
+            let found: Vec<f32> = gpu.read(device.renderer.upstream(), 0, upstream.len()).unwrap();
+            let loss_off = (state.loss - value.total).abs() / value.total;
+            let l1_off =
+                (state.coarse_to_fine.tally.sum - expected.coarse_to_fine.tally.sum - value.l1).abs() / value.l1;
+            let upstream_off = off(&found, &upstream);
+
+            let gradients = device.renderer.read_gradients(&device.splats).unwrap();
+            expected.adam.step(&mut expected.splats, &gradients, 3, &step.rates);
+            expected.densification.add(&gradients, photo.area() as f32);
+            let by_column = |found: &[Vec<f32>], expected: &[Vec<f32>]| {
+                found.iter().zip(expected).map(|(a, b)| off(a, b)).fold(0.0, f32::max)
+            };
+            let splats_off = by_column(state.splats.columns(), expected.splats.columns());
+            let ((steps, first, second), (cpu_steps, cpu_first, cpu_second)) =
+                (state.adam.parts(), expected.adam.parts());
+            let moments_off = by_column(first, cpu_first).max(by_column(second, cpu_second));
+            let stats_off = off(&state.densification.error, &expected.densification.error)
+                .max(off(&state.densification.weight, &expected.densification.weight));
+            println!(
+                "SH {sh_degree}, masked {masked}, context {extras}, step {key}: loss {loss_off:.1e}, L1 {l1_off:.1e}, \
+                 upstream {upstream_off:.1e}, splats {splats_off:.1e}, moments {moments_off:.1e}, statistics {stats_off:.1e}"
+            );
+            assert_eq!((steps, state.densification.views.clone()), (cpu_steps, expected.densification.views));
+            assert!(
+                state.densification.views.iter().any(|&views| views > 0)
+                    && state.splats != new_state(cloud(3, 300, sh_degree)).splats
+            );
+            assert!(loss_off < 1e-6 && l1_off < 1e-6 && upstream_off < 1e-5, "the loss");
+            assert!(splats_off < 2e-6 && moments_off < 2e-6 && stats_off < 1e-6, "Adam or the statistics");
+        }
+    }
+}
+
+/// Samples of several sizes, one of them masked, in front of a context. The CPU renders them one after the other.
+#[test]
+fn steps_of_several_samples_agree_with_the_cpu() {
+    let Some(gpu) = gpu() else { return };
+    let context = cloud(7, 60, 3);
+    let begin = new_state(cloud(3, 300, 2));
+    let samples: Vec<ViewSample> = [[75, 53], [16, 16], [33, 90], [64, 48]]
+        .into_iter()
+        .zip(1..)
+        .map(|(size, key)| sample(key == 3, key, size, DVec3::new(0.3 * key as f64, 0.0, 0.5)))
+        .collect();
+    let one = |samples: &[ViewSample]| {
+        let mut step = step(false, true, 1);
+        // Regularisers large enough to exceed rounding errors.
+        (step.rates.opacity_reg, step.rates.needle_reg) = (30.0, 30.0);
+        Step { samples: samples.to_vec(), ..step }
+    };
+    let run = |device: &mut dyn TrainDevice, samples: &[ViewSample]| {
+        let mut state = begin.clone();
+        device.step(&mut state, one(samples)).unwrap();
+        device.download(&mut state, StatePart::All).unwrap();
+        state
+    };
+    let cpu = run(&mut super::super::cpu::CpuDevice::new(0.2, Some(&context)), &samples);
+    let gpu_device = || GpuDevice::new(&gpu, &begin, 0.2, Some(&context)).unwrap();
+    let on_gpu = run(&mut gpu_device(), &samples);
+    assert!(words(&on_gpu) == words(&run(&mut gpu_device(), &samples)), "the same bits");
+
+    let by_column = |found: &[Vec<f32>], expected: &[Vec<f32>]| {
+        found.iter().zip(expected).map(|(a, b)| off(a, b)).fold(0.0, f32::max)
+    };
+    let moments_off = |a: &State, b: &State| {
+        let ((steps, first, second), (others, other_first, other_second)) = (a.adam.parts(), b.adam.parts());
+        assert_eq!((steps, others), (1, 1));
+        by_column(first, other_first).max(by_column(second, other_second))
+    };
+    let loss_off = (on_gpu.loss - cpu.loss).abs() / cpu.loss;
+    let (tally, cpu_tally) = (on_gpu.coarse_to_fine.tally, cpu.coarse_to_fine.tally);
+    let l1_off = (tally.sum - cpu_tally.sum).abs() / cpu_tally.sum;
+    let stats_off = off(&on_gpu.densification.error, &cpu.densification.error)
+        .max(off(&on_gpu.densification.weight, &cpu.densification.weight));
+    let off_by = moments_off(&on_gpu, &cpu);
+    println!("loss {loss_off:.1e}, L1 {l1_off:.1e}, moments {off_by:.1e}, statistics {stats_off:.1e}");
+    assert_eq!((tally.count, cpu_tally.count), (4, 4));
+    assert_eq!(on_gpu.densification.views, cpu.densification.views);
+    assert!((0..=4).filter(|n| cpu.densification.views.contains(n)).count() >= 4, "{:?}", cpu.densification.views);
+    assert!(loss_off < 1e-5 && l1_off < 1e-5 && stats_off < 1e-4 && off_by < 1e-4);
+    // Every sample contributes to the splats and to the loss.
+    for n in 0..samples.len() {
+        let mut fewer = samples.clone();
+        fewer.remove(n);
+        let without = run(&mut gpu_device(), &fewer);
+        assert!(moments_off(&without, &on_gpu) > 1e-2 && without.loss != on_gpu.loss, "sample {n} has no effect");
+    }
+    // A loss that is not finite skips the whole step.
+    let mut gpu_nan = GpuDevice::new(&gpu, &begin, f32::NAN, Some(&context)).unwrap();
+    let mut cpu_nan = super::super::cpu::CpuDevice::new(f32::NAN, Some(&context));
+    for device in [&mut gpu_nan as &mut dyn TrainDevice, &mut cpu_nan] {
+        let skipped = run(device, &samples);
+        assert_eq!((skipped.skipped, skipped.coarse_to_fine.tally.count, skipped.adam.parts().0), (1, 0, 0));
+        assert!(skipped.splats == begin.splats && skipped.densification.views.iter().all(|&views| views == 0));
+    }
+}
+
+#[test]
+fn pair_buffer_size_changes_no_byte() {
+    let Some(gpu) = gpu() else { return };
+    // Every splat covers the whole window of twenty tiles: more pairs than the initial buffer holds.
+    let mut splats = cloud(5, 20_000, 0);
+    splats.columns_mut()[column::OPACITY].fill(-5.0);
+    (0..3).for_each(|axis| splats.columns_mut()[column::LOG_SCALE + axis].fill(0.5));
+    let begin = new_state(splats);
+    let mut device = GpuDevice::new(&gpu, &begin, 0.2, None).unwrap();
+    let mut run = |expect_overflow: bool| {
+        let mut state = begin.clone();
+        device.upload(&state, StatePart::All).unwrap();
+        for key in 0..3 {
+            let mut step = step(false, false, key);
+            step.rates.log_scale_bounds = [-5.0, 1.0];
+            device.step(&mut state, step).unwrap();
+        }
+        let status: shaders::Status = gpu.read(device.renderer.status_buffer(), 0, 1).unwrap()[0];
+        assert_eq!(status.overflow != 0, expect_overflow, "{status:?}");
+        device.download(&mut state, StatePart::All).unwrap();
+        let (steps, ..) = state.adam.parts();
+        assert_eq!((steps, state.coarse_to_fine.tally.count, state.skipped), (3, 3, 0));
+        words(&state)
+    };
+    assert!(run(true) == run(false), "resubmitted steps give other bytes");
+}

@@ -1,0 +1,64 @@
+//! The interface between the training loop and a device, and the inputs of one step.
+//!
+//! The loop decides on the host (views, mips, densification) from a [`State`]; a [`TrainDevice`] computes the steps. The CPU works
+//! on the state in place. A GPU keeps its own copy and runs ahead of the host. [`TrainDevice::download`] brings the host's
+//! state up to date; it costs time and changes no bit of the result.
+
+use std::sync::Arc;
+
+use render::Options;
+use scene::{Camera, Exposure, Pixels};
+
+use crate::checkpoint::State;
+use crate::error::TrainError;
+use crate::optimiser::LearningRates;
+
+/// Largest number of views in one optimiser step.
+pub const MAX_VIEWS_PER_STEP: u32 = 16;
+
+/// One optimiser step on the sum of the gradients of its samples.
+#[derive(Debug, Clone)]
+pub(crate) struct Step {
+    /// One to [`MAX_VIEWS_PER_STEP`], of different views.
+    pub(crate) samples: Vec<ViewSample>,
+    pub(crate) options: Options,
+    pub(crate) rates: LearningRates,
+    /// Learning rate of exposures, where they are trained.
+    pub(crate) exposure_rate: f32,
+}
+
+/// A window of a view with its photo.
+#[derive(Debug, Clone)]
+pub(crate) struct ViewSample {
+    /// Index of the view in the capture.
+    pub(crate) view: u32,
+    /// Pixels of the window.
+    pub(crate) photo: Arc<Pixels>,
+    /// Camera of the window.
+    pub(crate) camera: Camera,
+    /// Exposure of the view, where exposures are given and fixed.
+    pub(crate) exposure: Option<Exposure>,
+}
+
+/// A part of the [`State`]; each includes the parts before it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(crate) enum StatePart {
+    /// Last loss, errors of the epoch, number of skipped steps.
+    Tally,
+    /// The splats.
+    Splats,
+    /// Everything that the next step depends on.
+    All,
+}
+
+/// Computes training steps. A step whose loss is not finite changes nothing but the count of skipped steps.
+pub(crate) trait TrainDevice {
+    /// Starts a step. It may still be running when this returns.
+    fn step(&mut self, state: &mut State, step: Step) -> Result<(), TrainError>;
+
+    /// Waits for the started steps and copies a part of the state to the host.
+    fn download(&mut self, state: &mut State, part: StatePart) -> Result<(), TrainError>;
+
+    /// Copies a part of the state, which the host has changed since it was downloaded, to the device.
+    fn upload(&mut self, state: &State, part: StatePart) -> Result<(), TrainError>;
+}

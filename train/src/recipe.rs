@@ -1,0 +1,117 @@
+//! The hyperparameters of training a block.
+
+use serde::{Deserialize, Serialize};
+
+use crate::growth::Growth;
+
+/// The hyperparameters of training a block. Shares are of the number of steps. Learning rates are of Adam with one view per step,
+/// given as `[first, last]` and interpolated geometrically.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Recipe {
+    /// Weight λ of D-SSIM (1 - SSIM) in the loss.
+    pub lambda: f32,
+    /// Learning rate of means, in units of each splat's size.
+    pub mean: [f32; 2],
+    /// Learning rate of ln(scale).
+    pub log_scale: [f32; 2],
+    /// Learning rate of quaternions.
+    pub quat: [f32; 2],
+    /// Learning rate of opacity logits.
+    pub opacity: [f32; 2],
+    /// Learning rate of the SH coefficients of degree 0.
+    pub sh_dc: [f32; 2],
+    /// Learning rate of the other SH coefficients, relative to `sh_dc`.
+    pub sh_rest: f32,
+    /// Learning rate of exposures, multiplied by the number of times that a view is drawn. A view is drawn 7 times at the root of
+    /// a tree and 60 times in a job of one block, and its exposure has to move as far.
+    pub exposure: [f32; 2],
+    /// Decay β₂ of Adam's second moment. A splat that few of many views see gets few updates, but the bias correction counts
+    /// all steps. At 0.999 its updates were up to seven times the learning rate, and the root of a city of 1.2 km² lost 26,000
+    /// of its 27,700 splats.
+    pub beta2: f32,
+    /// Weight of the opacity regulariser, see [`LearningRates`](crate::optimiser::LearningRates).
+    pub opacity_reg: f32,
+    /// Weight of the needle regulariser, see [`LearningRates`](crate::optimiser::LearningRates).
+    pub needle_reg: f32,
+    /// Shares of the steps after which SH degrees 1, 2 and 3 are trained.
+    pub sh_from: [f32; 3],
+    /// Largest share of the steps that is trained at each coarse mip, coarsest first; each is one mip coarser than the next.
+    pub coarse: Vec<f32>,
+    /// Training goes to the next finer mip once the error is at most this many times the detail that the coarse photos lack (see
+    /// [`coarse_to_fine`](crate::coarse_to_fine)). With 0 only the shares in `coarse` decide.
+    pub detail_factor: f32,
+    /// Views per optimiser step, at most [`MAX_VIEWS_PER_STEP`](crate::MAX_VIEWS_PER_STEP). With n views the learning rate is √n
+    /// times as high, as the noise of the summed gradient is √n times smaller relative to it (as in gsplat; Granziol et al. 2022). It keeps
+    /// a large device busy where one window has too few tiles. It saves no arithmetic, so a CPU gains nothing.
+    pub views_per_step: u32,
+    /// Opacity of the initial splats.
+    pub initial_opacity: f32,
+    /// Densification schedule.
+    pub growth: Growth,
+}
+
+impl Default for Recipe {
+    fn default() -> Self {
+        Self {
+            lambda: 0.2,
+            mean: [0.05, 0.005],
+            log_scale: [0.017, 0.0085],
+            quat: [0.0034, 0.0017],
+            opacity: [0.06, 0.025],
+            sh_dc: [0.017, 0.004],
+            sh_rest: 0.05,
+            exposure: [0.2, 0.02],
+            beta2: 0.99,
+            opacity_reg: 0.0,
+            needle_reg: 0.01,
+            sh_from: [0.1, 0.2, 0.3],
+            coarse: vec![0.2, 0.5],
+            detail_factor: 2.0,
+            views_per_step: 1,
+            initial_opacity: 0.1,
+            growth: Growth::default(),
+        }
+    }
+}
+
+impl Recipe {
+    /// For splats that already fit one mip coarser: full SH degree from the start and higher first learning rates, as there are
+    /// fewer steps. Splats that do not fit the coarser mip yet are trained there first.
+    pub fn refinement() -> Self {
+        let recipe = Self::default();
+        let longer = |[first, last]: [f32; 2]| [1.5 * first, last];
+        Self {
+            mean: longer(recipe.mean),
+            log_scale: longer(recipe.log_scale),
+            quat: longer(recipe.quat),
+            opacity: longer(recipe.opacity),
+            sh_dc: longer(recipe.sh_dc),
+            sh_from: [0.0; 3],
+            coarse: vec![0.7],
+            ..recipe
+        }
+    }
+
+    /// The same recipe with all learning rates multiplied by `factor`.
+    #[must_use]
+    pub fn at_rate(self, factor: f32) -> Self {
+        let scaled = |rate: [f32; 2]| rate.map(|rate| factor * rate);
+        Self {
+            mean: scaled(self.mean),
+            log_scale: scaled(self.log_scale),
+            quat: scaled(self.quat),
+            opacity: scaled(self.opacity),
+            sh_dc: scaled(self.sh_dc),
+            exposure: scaled(self.exposure),
+            ..self
+        }
+    }
+
+    /// The same recipe on a fixed schedule that ignores the training error: the baseline for the adaptive schedule. Blocks
+    /// that are initialised from points start at coarse mips, others do not.
+    #[must_use]
+    pub fn fixed_schedule(self, from_points: bool) -> Self {
+        let coarse = if from_points { vec![0.15, 0.3] } else { Vec::new() };
+        Self { coarse, detail_factor: 0.0, growth: Growth { worth_db: 0.0, ..self.growth }, ..self }
+    }
+}
