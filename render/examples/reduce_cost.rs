@@ -107,8 +107,8 @@ impl Timed {
             renderer.forward(encoder, splats, None, &[camera()], &Options::default())?;
             renderer.backward(encoder, splats, planes)
         })?;
-        time(1, &mut |encoder| renderer.add_up_pairs(encoder, planes, Reduction::InOrder))?;
-        time(2, &mut |encoder| renderer.add_up_pairs(encoder, planes, Reduction::ByAtomics))
+        time(1, &mut |encoder| renderer.reduce_moments(encoder, planes, Reduction::Ordered))?;
+        time(2, &mut |encoder| renderer.reduce_moments(encoder, planes, Reduction::Atomic))
     }
 }
 

@@ -32,11 +32,11 @@ fn bits(isa: Isa, threads: usize, antialiased: bool) -> Vec<u32> {
         // Twice: a renderer that has been used gives the same again.
         for _ in 0..2 {
             let frame = renderer.forward(&splats, Some(&context), &camera, &options);
-            for plane in [&frame.colour, &frame.transmittance, &frame.depth, &frame.own] {
+            for plane in [&frame.colour, &frame.transmittance, &frame.depth, &frame.trainable_alpha] {
                 all.extend(plane.iter().map(|v| v.to_bits()));
             }
             let gradients = renderer.backward(&splats, &upstream);
-            let extra = [&gradients.screen, &gradients.screen_abs, &gradients.weight];
+            let extra = [&gradients.screen_gradient, &gradients.screen_gradient_abs, &gradients.weight];
             for column in gradients.columns.iter().chain(extra) {
                 all.extend(column.iter().map(|v| v.to_bits()));
             }

@@ -105,7 +105,7 @@ fn draw(isa: Isa, splats: &Splats, context: Option<&Splats>, camera: &Camera, op
 
 /// Every gradient of splat `i`.
 fn row(gradients: &Gradients, i: usize) -> Vec<f32> {
-    let extra = [&gradients.screen, &gradients.screen_abs, &gradients.weight];
+    let extra = [&gradients.screen_gradient, &gradients.screen_gradient_abs, &gradients.weight];
     gradients.columns.iter().chain(extra).map(|column| column[i]).collect()
 }
 
@@ -114,7 +114,7 @@ fn is_seen(gradients: &Gradients, i: usize) -> bool {
 }
 
 fn planes(frame: &Frame) -> [&[f32]; 4] {
-    [&frame.colour, &frame.transmittance, &frame.depth, &frame.own]
+    [&frame.colour, &frame.transmittance, &frame.depth, &frame.trainable_alpha]
 }
 
 #[test]
@@ -247,8 +247,8 @@ fn no_splats_show_the_background() {
                 let background = options(false).background;
                 assert!((0..3 * area).all(|i| frame.colour[i] == background[i / area]));
                 assert!(frame.transmittance.iter().all(|&t| t == 1.0));
-                assert!(frame.depth.iter().chain(&frame.own).all(|&v| v == 0.0));
-                assert_eq!((frame.depth.len(), frame.own.len()), (area, area));
+                assert!(frame.depth.iter().chain(&frame.trainable_alpha).all(|&v| v == 0.0));
+                assert_eq!((frame.depth.len(), frame.trainable_alpha.len()), (area, area));
                 assert!(gradients.columns.iter().all(Vec::is_empty) && gradients.pose == [0.0; 6]);
             }
         }
@@ -273,13 +273,13 @@ fn a_context_draws_as_if_merged_and_own_is_the_share_of_the_rest() {
                 for (x, y) in planes(&apart).iter().zip(planes(&together)).take(3) {
                     assert!(x.iter().zip(y).all(|(x, y)| (x - y).abs() <= 1e-6), "{own} and {others} {}", isa.name());
                 }
-                assert!(together.own.iter().zip(&together.transmittance).all(|(o, t)| (o + t - 1.0).abs() < 1e-5));
+                assert!(together.trainable_alpha.iter().zip(&together.transmittance).all(|(o, t)| (o + t - 1.0).abs() < 1e-5));
                 for i in 0..own {
                     assert_eq!(row(&gradients, i), row(&merged_gradients, i), "splat {i} of {own} {}", isa.name());
                 }
                 let image = Scene::new(&a, Some(&b), &camera, &options).render();
-                for (pixel, &expected) in image.own.iter().enumerate().filter(|&(p, _)| image.margin[p] > 1e-3) {
-                    let found = f64::from(apart.own[pixel]);
+                for (pixel, &expected) in image.trainable_alpha.iter().enumerate().filter(|&(p, _)| image.margin[p] > 1e-3) {
+                    let found = f64::from(apart.trainable_alpha[pixel]);
                     assert!((found - expected).abs() < 1e-3, "own at {pixel}: {found} against {expected}");
                 }
             }

@@ -123,7 +123,7 @@ fn classes(sh_degree: u8) -> Vec<(&'static str, usize, usize)> {
 /// Central differences of every column in use, for the trainable splats.
 fn column_slopes(scene: &Scene, upstream: &Upstream) -> Vec<Vec<f64>> {
     let used = column::SH + 3 * sh_coefficients(scene.options.sh_degree);
-    (0..used).map(|k| (0..scene.own).map(|i| slope(scene, upstream, &|s, x| s.columns[k][i] += x)).collect()).collect()
+    (0..used).map(|k| (0..scene.trainable).map(|i| slope(scene, upstream, &|s, x| s.columns[k][i] += x)).collect()).collect()
 }
 
 /// Central differences of ξ in `camera_from_world ← exp(ξ)·camera_from_world`, one component at a time.
@@ -284,8 +284,8 @@ fn screen_gradients_and_weights() {
         }
         for isa in Isa::available() {
             let (_, gradients) = analytic(isa, &s, &s.upstream);
-            assert_agrees(&format!("{} screen", isa.name()), &gradients.screen, &screen, TOLERANCE);
-            assert_agrees(&format!("{} screen_abs", isa.name()), &gradients.screen_abs, &screen_abs, TOLERANCE);
+            assert_agrees(&format!("{} screen", isa.name()), &gradients.screen_gradient, &screen, TOLERANCE);
+            assert_agrees(&format!("{} screen_abs", isa.name()), &gradients.screen_gradient_abs, &screen_abs, TOLERANCE);
             assert_agrees(&format!("{} weight", isa.name()), &gradients.weight, &weight, TOLERANCE);
         }
     }

@@ -13,7 +13,7 @@ use reference::mixture::{KINDS, Kind, SIZES, Tally, camera_of, mixture};
 use reference::{Random, Scene, tensors};
 use render::cpu::{Isa, Renderer};
 use render::gpu::{Gpu, GpuError, GpuOptions, GpuRenderer, GpuSplats, Path, Reduction, UpstreamPlanes};
-use render::{Frame, Gradients, Options, Stages, Upstream};
+use render::{Frame, Gradients, Options, ForwardIntermediates, Upstream};
 use scene::{Camera, Splats};
 
 /// One device for all tests; `None` where there is none and that is allowed.
@@ -134,7 +134,7 @@ fn every_path_draws_the_same_bits_and_adds_up_the_same_sums() {
         let [a, b] = [fast, portable].map(|gpu| {
             let mut renderer = GpuRenderer::new(gpu.clone()).expect("a renderer");
             let drawn = on_gpu(gpu, &mut renderer, &splats, Some(&context), &camera, &options, &upstream);
-            (drawn, renderer.read_stages().expect("stages"))
+            (drawn, renderer.read_forward_intermediates().expect("stages"))
         });
         assert!(a.1 == b.1 && a.0.frame == b.0.frame, "{kind:?}: scans and sorts are exact");
         assert_eq!(a.0.gradients.seen, b.0.gradients.seen);
@@ -191,12 +191,12 @@ fn atomics_come_to_the_same_sums() {
         let options = options(false);
         let frame = renderer.draw(&there, None, &camera, &options).expect("drawn");
         let upstream = noise(&camera, &options);
-        let [ordered, atomic] = [Reduction::InOrder, Reduction::ByAtomics].map(|how| {
+        let [ordered, atomic] = [Reduction::Ordered, Reduction::Atomic].map(|how| {
             let mut encoder = gpu.encoder();
             gpu.write(&mut encoder, renderer.upstream(), 0, &upstream.colour);
-            renderer.add_up_pairs(&mut encoder, UpstreamPlanes::default(), how).expect("encoded");
+            renderer.reduce_moments(&mut encoder, UpstreamPlanes::default(), how).expect("encoded");
             gpu.submit(encoder).expect("submitted");
-            renderer.read_sums(how).expect("sums")
+            renderer.read_splat_moments(how).expect("sums")
         });
         assert!(frame.transmittance.iter().any(|&t| t < 0.5) && ordered.len() == 2000);
         for m in 0..ordered[0].len() {
@@ -218,7 +218,7 @@ fn memory_is_counted_and_capped() {
     let other = gpu.buffer("other", (1 << 19) - 16).expect("there is room");
     assert_eq!(gpu.memory_bytes(), [(1 << 20) - 16; 2]);
     let error = gpu.buffer("more", 20).expect_err("there is no room");
-    assert!(error.is_memory() && error.to_string().contains("more would take 20 bytes"), "{error}");
+    assert!(error.is_out_of_memory() && error.to_string().contains("more would take 20 bytes"), "{error}");
     assert_eq!(gpu.buffer("rest", 16).map(|rest| rest.size()), Ok(16));
     drop((half, other));
     assert_eq!(gpu.memory_bytes(), [0, 1 << 20]);
@@ -229,7 +229,7 @@ fn memory_is_counted_and_capped() {
     });
     let error = drawn.expect_err("pairs alone take more");
     println!("{error}");
-    assert!(matches!(error, GpuError::OverCap { most: 1_048_576, .. }), "{error}");
+    assert!(matches!(error, GpuError::OverCap { limit: 1_048_576, .. }), "{error}");
     assert_eq!(gpu.memory_bytes()[0], 0, "what failed gives back what it had");
     gpu.buffer("all", 1 << 20).expect("there is room again");
 }
@@ -305,7 +305,7 @@ fn difference(a: &[f32], b: &[f32]) -> f64 {
 fn columns(gradients: &Gradients) -> Vec<(String, &[f32])> {
     let columns = gradients.columns.iter().enumerate().map(|(k, column)| (format!("column {k}"), column.as_slice()));
     let statistics =
-        [("screen", gradients.screen.as_slice()), ("screen_abs", &gradients.screen_abs), ("weight", &gradients.weight)];
+        [("screen", gradients.screen_gradient.as_slice()), ("screen_abs", &gradients.screen_gradient_abs), ("weight", &gradients.weight)];
     columns.chain(statistics.map(|(name, column)| (name.to_string(), column))).collect()
 }
 
@@ -381,10 +381,10 @@ fn stages_agree_with_the_cpu() {
         cpu.forward(&splats, Some(&context), &camera, &options);
         let [own, frozen] = [&splats, &context].map(|s| GpuSplats::upload(&gpu, s, 0).expect("splats fit"));
         renderer.draw(&own, Some(&frozen), &camera, &options).expect("drawn");
-        let (ours, theirs) = (renderer.read_stages().expect("stages"), cpu.stages());
+        let (ours, theirs) = (renderer.read_forward_intermediates().expect("stages"), cpu.forward_intermediates());
 
         // The same splats, and their records by splat.
-        let by_splat = |stages: &Stages| -> BTreeMap<u32, [f32; 12]> {
+        let by_splat = |stages: &ForwardIntermediates| -> BTreeMap<u32, [f32; 12]> {
             stages.order.iter().copied().zip(stages.records.iter().copied()).collect()
         };
         let (a, b) = (by_splat(&ours), by_splat(&theirs));
@@ -394,13 +394,13 @@ fn stages_agree_with_the_cpu() {
         let records = records.fold(0.0, f64::max);
         // The same order, but for depths that rounding cannot tell apart; ties by index.
         assert!(ours.records.windows(2).zip(ours.order.windows(2)).all(|(r, i)| (r[0][9], i[0]) < (r[1][9], i[1])));
-        let depth_of = |stages: &Stages, n: usize| f64::from(stages.records[n][9]);
+        let depth_of = |stages: &ForwardIntermediates, n: usize| f64::from(stages.records[n][9]);
         let depths = (0..a.len()).map(|n| (depth_of(&ours, n) / depth_of(&theirs, n) - 1.0).abs()).fold(0.0, f64::max);
         // For each tile the CPU's splats, and hardly more: the CPU asks for each block of sixteen pixels.
         let (mut more, tiles) = (0, theirs.start.len() - 1);
         assert_eq!(ours.start.len() - 1, tiles);
         for tile in 0..tiles {
-            let splats = |stages: &Stages| -> Vec<u32> {
+            let splats = |stages: &ForwardIntermediates| -> Vec<u32> {
                 let pairs = &stages.pairs[stages.start[tile] as usize..stages.start[tile + 1] as usize];
                 assert!(pairs.is_sorted(), "{kind:?}: tile {tile} is not front to back");
                 pairs.iter().map(|&rank| stages.order[rank as usize]).collect()
@@ -454,7 +454,7 @@ fn every_degree_of_colour_agrees() {
 /// Every number of a frame and of its gradients, as bits.
 fn bits(drawn: &Drawn) -> Vec<u32> {
     let frame = &drawn.frame;
-    let planes = [&frame.colour, &frame.transmittance, &frame.depth, &frame.own];
+    let planes = [&frame.colour, &frame.transmittance, &frame.depth, &frame.trainable_alpha];
     let columns = columns(&drawn.gradients);
     planes.into_iter().flatten().chain(columns.iter().flat_map(|(_, c)| c.iter())).map(|v| v.to_bits()).collect()
 }
@@ -529,7 +529,7 @@ fn views_side_by_side_are_each_as_if_alone() {
         let planes = UpstreamPlanes { transmittance: true, depth: true };
         renderer.backward(&mut encoder, &there, planes).expect("backward");
         gpu.submit(encoder).expect("submitted");
-        assert!(!renderer.recover().expect("a status"));
+        assert!(!renderer.grow_after_overflow().expect("a status"));
         for (n, alone) in alone.iter().enumerate() {
             assert!(renderer.read_frame(n).expect("a frame") == alone.frame, "{}: view {n} differs", gpu.name());
         }
@@ -555,7 +555,7 @@ fn views_side_by_side_are_each_as_if_alone() {
             let error = forward(&vec![cameras[0]; number]).expect_err("too few or too many").to_string();
             assert!(error.contains("1 to 16"), "{error}");
         }
-        assert!(renderer.read_stages().is_err() && renderer.read_frame(4).is_err());
+        assert!(renderer.read_forward_intermediates().is_err() && renderer.read_frame(4).is_err());
     }
 }
 
@@ -572,7 +572,7 @@ fn no_splats_show_the_background() {
             let drawn = on_gpu(&gpu, &mut renderer, &Splats::new(2), context.as_ref(), &camera, &options, &upstream);
             assert!((0..3 * area).all(|i| drawn.frame.colour[i] == options.background[i / area]));
             assert!(drawn.frame.transmittance.iter().all(|&t| t == 1.0));
-            assert!(drawn.frame.depth.iter().chain(&drawn.frame.own).all(|&v| v == 0.0));
+            assert!(drawn.frame.depth.iter().chain(&drawn.frame.trainable_alpha).all(|&v| v == 0.0));
             assert!(drawn.gradients.columns.iter().all(Vec::is_empty));
         }
     }
@@ -660,18 +660,18 @@ fn too_many_pairs_draw_nothing_until_there_is_room() {
         renderer.status().expect("a status")
     };
     let status = forward(&mut renderer, &many);
-    println!("{} pairs at first", status.most_pairs);
-    assert!(status.overflow == 1 && status.seen == 0 && status.pairs == 0 && status.most_pairs > 1 << 18);
+    println!("{} pairs at first", status.max_pairs);
+    assert!(status.overflow == 1 && status.visible_trainable == 0 && status.pairs == 0 && status.max_pairs > 1 << 18);
     // It stays, whatever is drawn, until the host has seen it.
     let status = forward(&mut renderer, &few);
-    assert!(status.overflow == 1 && status.seen == 0 && status.pairs == 0);
+    assert!(status.overflow == 1 && status.visible_trainable == 0 && status.pairs == 0);
     let area = 250 * 187;
     let frame = renderer.read_frame(0).expect("a frame");
     assert!((0..3 * area).all(|i| frame.colour[i] == options.background[i / area]));
-    assert!(renderer.recover().expect("room"), "an overflow must be told");
+    assert!(renderer.grow_after_overflow().expect("room"), "an overflow must be told");
     let status = forward(&mut renderer, &many);
-    assert!(status.overflow == 0 && status.pairs == status.most_pairs && status.seen > 0);
-    assert!(!renderer.recover().expect("room"));
+    assert!(status.overflow == 0 && status.pairs == status.max_pairs && status.visible_trainable > 0);
+    assert!(!renderer.grow_after_overflow().expect("room"));
     assert_eq!(renderer.draw(&few, None, &camera, &options).expect("drawn"), expected);
 }
 
@@ -709,7 +709,7 @@ fn what_does_not_fit_is_refused_with_how_much_does() {
     let error = render::gpu::Columns::new(&gpu, "test", 3, usize::MAX / 128).expect_err("no such memory").to_string();
     println!("{error}");
     assert!(error.contains("splats do not fit") && !error.contains('\n'), "{error}");
-    let fit = (gpu.room() / 60) as usize;
+    let fit = (gpu.max_binding_bytes() / 60) as usize;
     assert!(error.contains(&(fit / 64 * 64).to_string()), "{error}");
     let mut renderer = GpuRenderer::new(gpu.clone()).expect("a renderer");
     let splats = GpuSplats::upload(&gpu, &Splats::new(0), 0).expect("no splats fit");

@@ -1,53 +1,60 @@
-//! The stages of training on the GPU: the loss, the step of Adam, and what growth goes by.
+//! The GPU stages of training: loss, Adam and densification statistics, with their layouts.
 
 use bytemuck::{Pod, Zeroable};
 
-use crate::{MOST_VIEWS, Stage, VIEW};
+use crate::{MAX_VIEWS, Stage, VIEW};
 
-/// What training keeps on the device, and the constants of its stages.
-const BOOKS: &str = include_str!("../wgsl/books.wgsl");
+/// Structs and constants of the training stages.
+const TRAIN: &str = include_str!("../wgsl/train.wgsl");
 
 /// `loss.wgsl`
-pub const LOSS: Stage =
-    Stage::new("loss", &[VIEW, BOOKS, include_str!("../wgsl/loss.wgsl")], &["loss_forward", "judge", "loss_backward"]);
+pub const LOSS: Stage = Stage::new(
+    "loss",
+    &[VIEW, TRAIN, include_str!("../wgsl/loss.wgsl")],
+    &["loss_forward", "finish_loss", "loss_backward"],
+);
 /// `adam.wgsl`
 pub const ADAM: Stage =
-    Stage::new("adam", &[VIEW, BOOKS, include_str!("../wgsl/adam.wgsl")], &["adam_shape", "adam_colour"]);
-/// `evidence.wgsl`
-pub const EVIDENCE: Stage =
-    Stage::new("evidence", &[VIEW, BOOKS, include_str!("../wgsl/evidence.wgsl")], &["evidence"]);
+    Stage::new("adam", &[VIEW, TRAIN, include_str!("../wgsl/adam.wgsl")], &["adam_shape", "adam_colour"]);
+/// `densification_stats.wgsl`
+pub const DENSIFICATION_STATS: Stage = Stage::new(
+    "densification_stats",
+    &[VIEW, TRAIN, include_str!("../wgsl/densification_stats.wgsl")],
+    &["densification_stats"],
+);
 /// Every stage of training.
-pub const STAGES: &[Stage] = &[LOSS, ADAM, EVIDENCE];
+pub const STAGES: &[Stage] = &[LOSS, ADAM, DENSIFICATION_STATS];
 
-/// What training keeps on the device from step to step. A step that is left out, as its loss is not finite, is done and
-/// skipped; one whose pairs had no room is not done.
+/// Counters and losses that stay on the device between steps.
+///
+/// A step with a non-finite loss is skipped and counts as done. A step whose pairs overflowed the buffers is not done.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Pod, Zeroable)]
 #[repr(C)]
-pub struct Books {
-    /// Steps that are over.
-    pub done: u32,
-    /// Steps of Adam.
+pub struct OptimiserState {
+    /// Finished steps, skipped ones included.
+    pub steps_done: u32,
+    /// Updates of Adam: the t of its bias correction.
     pub adam_steps: u32,
-    /// Steps left out.
-    pub skipped: u32,
-    /// Views in `sum`.
-    pub count: u32,
-    /// Mean absolute errors of the epoch under way.
-    pub sum: f32,
-    /// Mean over the views of the last step that is over.
+    /// Steps skipped for a non-finite loss.
+    pub steps_skipped: u32,
+    /// Views summed in `epoch_l1`.
+    pub epoch_views: u32,
+    /// Sum of the mean absolute errors of the current epoch's views.
+    pub epoch_l1: f32,
+    /// Mean loss over the views of the last finished step.
     pub loss: f32,
-    /// 1: the step under way counts.
-    pub good: u32,
-    /// Not used.
+    /// 1: the current step updates the splats; 0: it is skipped, or its pairs overflowed.
+    pub is_step_valid: u32,
+    /// Padding.
     pub padding: u32,
-    /// Of each view of a step: what the gradients of L1 and of SSIM are scaled by.
-    pub scales: [[f32; 2]; MOST_VIEWS],
+    /// Scale factors of the gradients of L1 and of SSIM, for each view of the step.
+    pub gradient_scales: [[f32; 2]; MAX_VIEWS],
 }
 
-/// A photo beside a frame.
+/// The target photo of one view.
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
 #[repr(C)]
-pub struct Window {
+pub struct Photo {
     /// Width in pixels.
     pub width: u32,
     /// Height in pixels.
@@ -56,64 +63,64 @@ pub struct Window {
     pub tiles_x: u32,
     /// Height in tiles.
     pub tiles_y: u32,
-    /// Tiles of the photos before this one.
+    /// Number of tiles of the photos before this one.
     pub first_tile: u32,
-    /// Pixels of the photos before this one.
+    /// Number of pixels of the photos before this one.
     pub first_pixel: u32,
-    /// Bytes of the photos before this one.
+    /// Number of bytes of the photos before this one.
     pub first_byte: u32,
     /// 1: the photo has a mask.
     pub masked: u32,
 }
 
-/// The photos of a step. Uniform.
+/// The target photos of a step. Uniform.
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
 #[repr(C)]
-pub struct Windows {
-    /// How many there are.
+pub struct Photos {
+    /// Number of photos.
     pub count: u32,
-    /// Tiles of all.
+    /// Tiles of all photos.
     pub tiles: u32,
     /// Weight of 1 - SSIM.
     pub lambda: f32,
-    /// 1: a pixel counts by the share of it that the trainable splats explain.
-    pub by_share: u32,
-    /// Each; those past `count` mean nothing.
-    pub each: [Window; MOST_VIEWS],
+    /// 1: pixels are weighted by the share of their alpha that trainable splats contribute.
+    pub share_weighted: u32,
+    /// The photos; only the first `count` are defined.
+    pub photo: [Photo; MAX_VIEWS],
 }
 
-/// Step sizes of one step and the pull of the regularisers, for one bank of columns. Uniform.
+/// Learning rates and regulariser weights of one step, for one bank of columns. Uniform.
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
 #[repr(C)]
-pub struct Rates {
-    /// Step of the mean in units of the splat's size.
+pub struct AdamConstants {
+    /// Learning rate of the mean, in units of the splat's size.
     pub mean: f32,
-    /// Step of ln(scale).
+    /// Learning rate of ln(scale).
     pub log_scale: f32,
-    /// Step of the quaternion.
+    /// Learning rate of the quaternion.
     pub quat: f32,
-    /// Step of the opacity's logit.
+    /// Learning rate of the opacity logit.
     pub opacity: f32,
-    /// Step of the constant colour coefficient.
+    /// Learning rate of the constant SH coefficient.
     pub sh_dc: f32,
-    /// Step of the other coefficients.
+    /// Learning rate of the other SH coefficients.
     pub sh_rest: f32,
     /// Decay of the second moment.
     pub beta2: f32,
-    /// Weight of the mean opacity of seen splats in the loss.
-    pub opacity_pull: f32,
-    /// Weight of the mean excess of needles among seen splats.
-    pub needle_pull: f32,
-    /// Bounds of ln(scale).
+    /// Weight of the mean opacity of visible splats in the loss.
+    pub opacity_reg: f32,
+    /// Weight of the needle penalty of visible splats in the loss.
+    pub needle_reg: f32,
+    /// Lower bound of ln(scale).
     pub log_scale_min: f32,
-    /// See `log_scale_min`.
+    /// Upper bound of ln(scale).
     pub log_scale_max: f32,
     /// Columns of the bank that the SH degree uses.
     pub columns: u32,
-    /// Entries from a column to the next.
+    /// Entries from one column to the next.
     pub stride: u32,
     /// Views of the step.
     pub views: u32,
-    /// Not used.
+    /// Padding.
     pub padding: [u32; 2],
 }

@@ -2,21 +2,21 @@
 
 fn view_of_tile(tile: u32) -> u32 {
     var v = 0u;
-    while v + 1u < views.count && tile >= views.each[v + 1u].first_tile {
+    while v + 1u < views.count && tile >= views.view[v + 1u].first_tile {
         v++;
     }
     return v;
 }
 
-struct Touch {
+struct PixelAlpha {
     delta: vec2<f32>,
     // Before it is clamped at ALPHA_MAX; below ALPHA_MIN the splat is skipped.
     alpha: f32,
 }
 
-fn touch(place: vec4<f32>, c: f32, log2_opacity: f32, pixel: vec2<f32>) -> Touch {
-    let delta = pixel - place.xy;
-    let u = fma(place.z, delta.x, place.w * delta.y);
+fn pixel_alpha(mean_ab: vec4<f32>, c: f32, log2_opacity: f32, pixel: vec2<f32>) -> PixelAlpha {
+    let delta = pixel - mean_ab.xy;
+    let u = fma(mean_ab.z, delta.x, mean_ab.w * delta.y);
     let v = c * delta.y;
-    return Touch(delta, exp2(fma(-u, u, fma(-v, v, log2_opacity))));
+    return PixelAlpha(delta, exp2(fma(-u, u, fma(-v, v, log2_opacity))));
 }

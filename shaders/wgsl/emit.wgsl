@@ -6,7 +6,7 @@
 @group(0) @binding(3) var<storage, read> order: array<u32>;
 // Exclusive sums of the tiles of the splats in this order.
 @group(0) @binding(4) var<storage, read> sums: array<u32>;
-@group(0) @binding(5) var<storage, read_write> first: array<u32>;
+@group(0) @binding(5) var<storage, read_write> first_pair: array<u32>;
 @group(0) @binding(6) var<storage, read_write> pair_splat: array<u32>;
 @group(0) @binding(7) var<storage, read_write> keys: array<u32>;
 @group(0) @binding(8) var<storage, read_write> values: array<u32>;
@@ -17,22 +17,22 @@ fn emit(
     @builtin(num_workgroups) groups: vec3<u32>,
     @builtin(local_invocation_index) local: u32,
 ) {
-    let rank = linear(group, groups, local);
+    let rank = thread_number(group, groups, local);
     if rank >= status.visible || status.pairs == 0u {
         return;
     }
     let i = order[rank];
     var pair = sums[rank];
     let end = sums[rank + 1u];
-    first[i] = pair;
+    first_pair[i] = pair;
     let r = records[i];
-    let tiles = views.each[i % views.count].tiles;
-    let first_tile = views.each[i % views.count].first_tile;
-    let box = span(r, tiles);
+    let tiles = views.view[i % views.count].tiles;
+    let first_tile = views.view[i % views.count].first_tile;
+    let box = tile_box(r, tiles);
     let e = ellipse(r);
     for (var y = box.first.y; y < box.end.y; y++) {
         for (var x = box.first.x; x < box.end.x; x++) {
-            if touches(e, vec2<u32>(x, y)) {
+            if overlaps(e, vec2<u32>(x, y)) {
                 if pair < end {
                     pair_splat[pair] = i;
                     keys[pair] = first_tile + y * tiles.x + x;

@@ -11,7 +11,7 @@ fn gather(
     @builtin(num_workgroups) groups: vec3<u32>,
     @builtin(local_invocation_index) local: u32,
 ) {
-    let rank = linear(group, groups, local);
+    let rank = thread_number(group, groups, local);
     if rank < status.visible {
         sums[rank] = tiles[order[rank]];
     }

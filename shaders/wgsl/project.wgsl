@@ -1,8 +1,8 @@
 // Stage `project`: splats in the world become ellipses in the view; a thread a splat in a view.
 
 @group(0) @binding(6) var<storage, read_write> records: array<Record>;
-@group(0) @binding(7) var<storage, read_write> seen: array<u32>;
-// The same as `seen`, to be summed up.
+@group(0) @binding(7) var<storage, read_write> is_visible: array<u32>;
+// The same as `is_visible`, to be summed up.
 @group(0) @binding(8) var<storage, read_write> sums: array<u32>;
 @group(0) @binding(9) var<storage, read_write> tiles: array<u32>;
 
@@ -12,15 +12,15 @@ fn project(
     @builtin(num_workgroups) groups: vec3<u32>,
     @builtin(local_invocation_index) local: u32,
 ) {
-    let entry = linear(group, groups, local);
+    let entry = thread_number(group, groups, local);
     if entry >= splats.count * views.count {
         return;
     }
-    view = views.each[entry % views.count];
+    view = views.view[entry % views.count];
     let n = splats.first * views.count + entry;
     var record: Record;
     let drawn = project_splat(entry / views.count, &record);
-    seen[n] = u32(drawn);
+    is_visible[n] = u32(drawn);
     sums[n] = u32(drawn);
     if drawn {
         records[n] = record;
@@ -31,7 +31,7 @@ fn project(
 // Whether the splat may touch the image, at a fraction of what knowing costs: as far as an opaque ball of its largest scale
 // reaches.
 fn near_image(i: u32, p: vec3<f32>) -> bool {
-    // sqrt(2 ln 255), and that times sqrt(BLUR), with a little to spare for rounding.
+    // sqrt(2 ln 255), and that times sqrt(LOW_PASS), with a little to spare for rounding.
     let scales = column3(3u, i);
     let reach = exp2(max(scales.x, max(scales.y, scales.z)) * LOG2_E) * 3.34;
     let inv_z = 1.0 / max(p.z, NEAR_METRES);
@@ -61,7 +61,7 @@ fn project_splat(i: u32, record: ptr<function, Record>) -> bool {
     }
     // The squared radius in sigmas at which alpha falls to 1/255.
     let reach = 2.0 * log(o * 255.0);
-    let variance = e.cov.xz + BLUR;
+    let variance = e.cov.xz + LOW_PASS;
     let half = sqrt(max(reach * variance, vec2<f32>(0.0)));
     let centre = view.focal * p.xy * e.inv_z + view.principal;
     // A pixel is touched when its centre lies in the box.
@@ -81,19 +81,19 @@ fn project_splat(i: u32, record: ptr<function, Record>) -> bool {
     }
     let inv_std_y = sqrt(0.5 * LOG2_E / variance.y);
     let inv_std_x = sqrt(0.5 * LOG2_E * variance.y * inv_det); // of x given y
-    (*record).place = vec4<f32>(centre, inv_std_x, -(inv_std_x * e.cov.y / variance.y));
-    (*record).reach = vec4<f32>(inv_std_y, log2(o), half);
-    (*record).look = vec4<f32>(max(raw, vec3<f32>(0.0)), p.z);
+    (*record).mean_ab = vec4<f32>(centre, inv_std_x, -(inv_std_x * e.cov.y / variance.y));
+    (*record).c_opacity_extent = vec4<f32>(inv_std_y, log2(o), half);
+    (*record).colour_depth = vec4<f32>(max(raw, vec3<f32>(0.0)), p.z);
     return true;
 }
 
 fn count_tiles(r: Record) -> u32 {
-    let box = span(r, view.tiles);
+    let box = tile_box(r, view.tiles);
     let e = ellipse(r);
     var count = 0u;
     for (var y = box.first.y; y < box.end.y; y++) {
         for (var x = box.first.x; x < box.end.x; x++) {
-            count += u32(touches(e, vec2<u32>(x, y)));
+            count += u32(overlaps(e, vec2<u32>(x, y)));
         }
     }
     return count;

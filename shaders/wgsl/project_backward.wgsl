@@ -13,30 +13,30 @@
 @group(0) @binding(13) var<storage, read_write> statistics: array<vec4<f32>>;
 
 // Whether a view before has left its gradient already, so that this one's is added to that.
-var<private> again: bool;
+var<private> accumulate: bool;
 
-fn put(k: u32, i: u32, value: f32) {
+fn write_gradient(k: u32, i: u32, value: f32) {
     let at = k * splats.stride + i;
     var sum = value;
-    if again {
+    if accumulate {
         sum += out_a[at];
     }
     out_a[at] = sum;
 }
 
-fn put3(k: u32, i: u32, value: vec3<f32>) {
-    put(k, i, value.x);
-    put(k + 1u, i, value.y);
-    put(k + 2u, i, value.z);
+fn write_gradient3(k: u32, i: u32, value: vec3<f32>) {
+    write_gradient(k, i, value.x);
+    write_gradient(k + 1u, i, value.y);
+    write_gradient(k + 2u, i, value.z);
 }
 
 // One basis function of coefficient b: writes its gradient; returns what the colour changes by along it.
-fn put_coefficient(b: u32, i: u32, basis: f32, d_colour: vec3<f32>) -> f32 {
+fn write_coefficient(b: u32, i: u32, basis: f32, d_colour: vec3<f32>) -> f32 {
     let n = splats.stride;
     var d = d_colour * basis;
     if b < 6u {
         let k = (3u * b - 3u) * n + i;
-        if again {
+        if accumulate {
             d += vec3<f32>(out_b[k], out_b[k + n], out_b[k + 2u * n]);
         }
         out_b[k] = d.x;
@@ -44,7 +44,7 @@ fn put_coefficient(b: u32, i: u32, basis: f32, d_colour: vec3<f32>) -> f32 {
         out_b[k + 2u * n] = d.z;
     } else if b < 11u {
         let k = (3u * b - 18u) * n + i;
-        if again {
+        if accumulate {
             d += vec3<f32>(out_c[k], out_c[k + n], out_c[k + 2u * n]);
         }
         out_c[k] = d.x;
@@ -52,7 +52,7 @@ fn put_coefficient(b: u32, i: u32, basis: f32, d_colour: vec3<f32>) -> f32 {
         out_c[k + 2u * n] = d.z;
     } else {
         let k = (3u * b - 33u) * n + i;
-        if again {
+        if accumulate {
             d += vec3<f32>(out_d[k], out_d[k + n], out_d[k + 2u * n]);
         }
         out_d[k] = d.x;
@@ -68,41 +68,41 @@ fn project_backward(
     @builtin(num_workgroups) groups: vec3<u32>,
     @builtin(local_invocation_index) local: u32,
 ) {
-    let first = linear(group, groups, local);
-    if first >= status.seen {
+    let first = thread_number(group, groups, local);
+    if first >= status.visible_trainable {
         return;
     }
     let i = visible[first] / views.count;
     if first > 0u && visible[first - 1u] / views.count == i {
         return; // another thread's
     }
-    for (var place = first; place < status.seen; place++) {
-        let entry = visible[place];
+    for (var visible_at = first; visible_at < status.visible_trainable; visible_at++) {
+        let entry = visible[visible_at];
         if entry / views.count != i {
             break;
         }
-        view = views.each[entry % views.count];
-        again = place > first;
-        go_back(i, place);
+        view = views.view[entry % views.count];
+        accumulate = visible_at > first;
+        splat_gradient(i, visible_at);
     }
 }
 
 // A splat's gradient by one view.
-fn go_back(i: u32, place: u32) {
-    let s = place * MOMENTS;
+fn splat_gradient(i: u32, visible_at: u32) {
+    let s = visible_at * MOMENTS;
     let mean = column3(0u, i);
     let p = camera_point(mean);
     let e = ewa(i, p);
 
     // The conic, and what follows from the moments.
     let inv_det = 1.0 / e.det1;
-    let conic = vec3<f32>(e.cov.z + BLUR, -e.cov.y, e.cov.x + BLUR) * inv_det;
+    let conic = vec3<f32>(e.cov.z + LOW_PASS, -e.cov.y, e.cov.x + LOW_PASS) * inv_det;
     let d_mean = vec2<f32>(
         fma(conic.x, sums[s + 1u], conic.y * sums[s + 2u]),
         fma(conic.y, sums[s + 1u], conic.z * sums[s + 2u]),
     );
     let along = vec2<f32>(sums[s + 11u], sums[s + 12u]);
-    statistics[place] = vec4<f32>(
+    statistics[visible_at] = vec4<f32>(
         sqrt(d_mean.x * d_mean.x + d_mean.y * d_mean.y),
         sqrt(along.x * along.x + along.y * along.y),
         sums[s + 10u],
@@ -120,7 +120,7 @@ fn go_back(i: u32, place: u32) {
     );
 
     // Opacity: the sum of v is o_eff dL/do_eff, and o_eff = o sqrt(det0 / det1) in anti-aliased mode.
-    put(10u, i, sums[s] * (1.0 - opacity(i)));
+    write_gradient(10u, i, sums[s] * (1.0 - opacity(i)));
     if views.antialiased != 0u {
         let ratio = e.det0 * inv_det;
         let d_ratio = 0.5 * sums[s] / max(ratio, 1e-12);
@@ -137,7 +137,7 @@ fn go_back(i: u32, place: u32) {
     let d_axis0 = fma(e.t0, vec3<f32>(d_a0.x), e.t1 * d_a1.x);
     let d_axis1 = fma(e.t0, vec3<f32>(d_a0.y), e.t1 * d_a1.y);
     let d_axis2 = fma(e.t0, vec3<f32>(d_a0.z), e.t1 * d_a1.z);
-    put3(3u, i, vec3<f32>(dot3(d_axis0, e.axes[0]), dot3(d_axis1, e.axes[1]), dot3(d_axis2, e.axes[2])));
+    write_gradient3(3u, i, vec3<f32>(dot3(d_axis0, e.axes[0]), dot3(d_axis1, e.axes[1]), dot3(d_axis2, e.axes[2])));
     let r0 = d_axis0 * e.scale.x; // the rotation's gradient, by columns
     let r1 = d_axis1 * e.scale.y;
     let r2 = d_axis2 * e.scale.z;
@@ -152,8 +152,8 @@ fn go_back(i: u32, place: u32) {
         2.0 * (x * (r2.x + r0.z) + y * (r2.y + r1.z) + w * (r0.y - r1.x)) - 4.0 * z * (r0.x + r1.y),
     );
     let d_quat = (d_unit - e.quat * dot(e.quat, d_unit)) * e.inv_norm;
-    put3(6u, i, d_quat.xyz);
-    put(9u, i, d_quat.w);
+    write_gradient3(6u, i, d_quat.xyz);
+    write_gradient(9u, i, d_quat.w);
 
     // Through T = J W and the projection of the centre.
     var d_p = vec3<f32>(0.0, 0.0, sums[s + 9u]);
@@ -174,24 +174,24 @@ fn go_back(i: u32, place: u32) {
     // Colour; where it is clamped at zero there is no gradient.
     let to_splat = direction(mean);
     let d = to_splat.xyz;
-    let shown = colour(i, d) > vec3<f32>(0.0);
-    let d_colour = select(vec3<f32>(0.0), vec3<f32>(sums[s + 6u], sums[s + 7u], sums[s + 8u]), shown);
-    put3(11u, i, d_colour * SH_C0);
+    let is_unclamped = colour(i, d) > vec3<f32>(0.0);
+    let d_colour = select(vec3<f32>(0.0), vec3<f32>(sums[s + 6u], sums[s + 7u], sums[s + 8u]), is_unclamped);
+    write_gradient3(11u, i, d_colour * SH_C0);
     var d_direction = vec3<f32>(0.0);
     if splats.sh_degree >= 1u {
         let b = basis1(d);
-        let s1 = put_coefficient(1u, i, b[0], d_colour);
-        let s2 = put_coefficient(2u, i, b[1], d_colour);
-        let s3 = put_coefficient(3u, i, b[2], d_colour);
+        let s1 = write_coefficient(1u, i, b[0], d_colour);
+        let s2 = write_coefficient(2u, i, b[1], d_colour);
+        let s3 = write_coefficient(3u, i, b[2], d_colour);
         d_direction = C1 * vec3<f32>(-s3, -s1, s2);
     }
     if splats.sh_degree >= 2u {
         let b = basis2(d);
-        let s4 = C2A * put_coefficient(4u, i, b[0], d_colour);
-        let s5 = -C2A * put_coefficient(5u, i, b[1], d_colour);
-        let s6 = 2.0 * C2B * put_coefficient(6u, i, b[2], d_colour);
-        let s7 = -C2A * put_coefficient(7u, i, b[3], d_colour);
-        let s8 = 2.0 * C2C * put_coefficient(8u, i, b[4], d_colour);
+        let s4 = C2A * write_coefficient(4u, i, b[0], d_colour);
+        let s5 = -C2A * write_coefficient(5u, i, b[1], d_colour);
+        let s6 = 2.0 * C2B * write_coefficient(6u, i, b[2], d_colour);
+        let s7 = -C2A * write_coefficient(7u, i, b[3], d_colour);
+        let s8 = 2.0 * C2C * write_coefficient(8u, i, b[4], d_colour);
         d_direction += vec3<f32>(
             s4 * d.y - s6 * d.x + s7 * d.z + s8 * d.x,
             s4 * d.x + s5 * d.z - s6 * d.y - s8 * d.y,
@@ -200,13 +200,13 @@ fn go_back(i: u32, place: u32) {
     }
     if splats.sh_degree >= 3u {
         let b = basis3(d);
-        let s9 = C3A * put_coefficient(9u, i, b[0], d_colour);
-        let s10 = C3B * put_coefficient(10u, i, b[1], d_colour);
-        let s11 = C3C * put_coefficient(11u, i, b[2], d_colour);
-        let s12 = C3D * put_coefficient(12u, i, b[3], d_colour);
-        let s13 = C3C * put_coefficient(13u, i, b[4], d_colour);
-        let s14 = C3E * put_coefficient(14u, i, b[5], d_colour);
-        let s15 = C3A * put_coefficient(15u, i, b[6], d_colour);
+        let s9 = C3A * write_coefficient(9u, i, b[0], d_colour);
+        let s10 = C3B * write_coefficient(10u, i, b[1], d_colour);
+        let s11 = C3C * write_coefficient(11u, i, b[2], d_colour);
+        let s12 = C3D * write_coefficient(12u, i, b[3], d_colour);
+        let s13 = C3C * write_coefficient(13u, i, b[4], d_colour);
+        let s14 = C3E * write_coefficient(14u, i, b[5], d_colour);
+        let s15 = C3A * write_coefficient(15u, i, b[6], d_colour);
         let q = d * d;
         let xy = d.x * d.y;
         let xz = d.x * d.z;
@@ -220,5 +220,5 @@ fn go_back(i: u32, place: u32) {
         );
     }
     d_world += (d_direction - d * dot3(d_direction, d)) * to_splat.w;
-    put3(0u, i, d_world);
+    write_gradient3(0u, i, d_world);
 }

@@ -1,8 +1,8 @@
 // Stage `radix`: one pass of a stable sort of keys with values, by eight bits. `radix_count` counts the digits of each
 // block of 4096 entries, `scan` turns the counts (digit by digit, block by block) into places, `radix_scatter` goes there.
 
-struct Pass {
-    slot: u32,
+struct PassConstants {
+    len_word: u32,
     shift: u32,
     padding: vec2<u32>,
 }
@@ -13,17 +13,17 @@ struct Pass {
 @group(0) @binding(3) var<storage, read_write> values_out: array<u32>;
 @group(0) @binding(4) var<storage, read_write> histogram: array<u32>;
 @group(0) @binding(5) var<storage, read> status: array<u32>;
-@group(0) @binding(6) var<uniform> pass_: Pass;
+@group(0) @binding(6) var<uniform> pass_: PassConstants;
 
 const BLOCK: u32 = 4096u;
 const ROUNDS: u32 = 16u;
 
 var<workgroup> counts: array<atomic<u32>, 256>;
 // Bit t % 32 of word t / 32 of a digit: thread t has it in this round.
-var<workgroup> holders: array<atomic<u32>, 2048>;
-var<workgroup> next: array<u32, 256>;
+var<workgroup> digit_masks: array<atomic<u32>, 2048>;
+var<workgroup> next_slot: array<u32, 256>;
 
-fn block_of(group: vec3<u32>, groups: vec3<u32>) -> u32 {
+fn block_index(group: vec3<u32>, groups: vec3<u32>) -> u32 {
     return group.y * groups.x + group.x;
 }
 
@@ -33,9 +33,9 @@ fn radix_count(
     @builtin(num_workgroups) groups: vec3<u32>,
     thread: Thread,
 ) {
-    let local = place_of(thread);
-    let count = status[pass_.slot];
-    let block = block_of(group, groups);
+    let local = local_index(thread);
+    let count = status[pass_.len_word];
+    let block = block_index(group, groups);
     atomicStore(&counts[local], 0u);
     workgroupBarrier();
     for (var round = 0u; round < ROUNDS; round++) {
@@ -59,17 +59,17 @@ fn radix_scatter(
     @builtin(num_workgroups) groups: vec3<u32>,
     thread: Thread,
 ) {
-    let local = place_of(thread);
-    let count = status[pass_.slot];
-    let block = block_of(group, groups);
+    let local = local_index(thread);
+    let count = status[pass_.len_word];
+    let block = block_index(group, groups);
     let blocks = count / BLOCK + select(0u, 1u, count % BLOCK != 0u);
     var start = 0u;
     if block < blocks {
         start = histogram[local * blocks + block];
     }
-    next[local] = start;
+    next_slot[local] = start;
     for (var word = 0u; word < 8u; word++) {
-        atomicStore(&holders[word * 256u + local], 0u);
+        atomicStore(&digit_masks[word * 256u + local], 0u);
     }
     workgroupBarrier();
     let word = local / 32u;
@@ -82,24 +82,24 @@ fn radix_scatter(
             key = keys[at];
             digit = (key >> pass_.shift) & 255u;
         }
-        hold_digit(digit, at < count, thread);
+        mark_digit(digit, at < count, thread);
         workgroupBarrier();
         if at < count {
-            var rank = countOneBits(atomicLoad(&holders[word * 256u + digit]) & (bit - 1u));
+            var rank = countOneBits(atomicLoad(&digit_masks[word * 256u + digit]) & (bit - 1u));
             for (var before = 0u; before < word; before++) {
-                rank += countOneBits(atomicLoad(&holders[before * 256u + digit]));
+                rank += countOneBits(atomicLoad(&digit_masks[before * 256u + digit]));
             }
-            let to = next[digit] + rank;
+            let to = next_slot[digit] + rank;
             keys_out[to] = key;
             values_out[to] = values[at];
         }
         workgroupBarrier();
-        var found = 0u;
+        var count_of_digit = 0u;
         for (var each = 0u; each < 8u; each++) {
-            found += countOneBits(atomicLoad(&holders[each * 256u + local]));
-            atomicStore(&holders[each * 256u + local], 0u);
+            count_of_digit += countOneBits(atomicLoad(&digit_masks[each * 256u + local]));
+            atomicStore(&digit_masks[each * 256u + local], 0u);
         }
-        next[local] += found;
+        next_slot[local] += count_of_digit;
         workgroupBarrier();
     }
 }

@@ -11,7 +11,7 @@ fn ranges(
     @builtin(num_workgroups) groups: vec3<u32>,
     @builtin(local_invocation_index) local: u32,
 ) {
-    let p = linear(group, groups, local);
+    let p = thread_number(group, groups, local);
     if p >= status.pairs {
         return;
     }

@@ -5,19 +5,19 @@
 @group(0) @binding(2) var<storage, read> sorted: array<u32>;
 @group(0) @binding(3) var<storage, read> pair_splat: array<u32>;
 @group(0) @binding(4) var<storage, read> records: array<Record>;
-// Of each view planes: red, green, blue, transmittance and, with extras, depth and own.
+// Of each view planes: red, green, blue, transmittance and, with extras, depth and trainable_alpha.
 @group(0) @binding(5) var<storage, read_write> frame: array<f32>;
-// For each pixel the end of what was blended there: one past its last pair, 0 if there was none.
-@group(0) @binding(6) var<storage, read_write> last: array<u32>;
+// For each pixel the end of what was blended there: one past its last_pair pair, 0 if there was none.
+@group(0) @binding(6) var<storage, read_write> last_pair: array<u32>;
 
 const BATCH: u32 = 256u;
 
-var<workgroup> places: array<vec4<f32>, BATCH>;
-var<workgroup> reaches: array<vec2<f32>, BATCH>;
-var<workgroup> looks: array<vec4<f32>, BATCH>;
-var<workgroup> owns: array<f32, BATCH>;
-var<workgroup> alive: atomic<u32>;
-var<workgroup> alive_now: u32;
+var<workgroup> means_ab: array<vec4<f32>, BATCH>;
+var<workgroup> c_opacities: array<vec2<f32>, BATCH>;
+var<workgroup> colours_depths: array<vec4<f32>, BATCH>;
+var<workgroup> is_trainable: array<f32, BATCH>;
+var<workgroup> any_unfinished: atomic<u32>;
+var<workgroup> any_unfinished_now: u32;
 
 @compute @workgroup_size(256)
 fn rasterize(
@@ -25,16 +25,16 @@ fn rasterize(
     @builtin(num_workgroups) groups: vec3<u32>,
     @builtin(local_invocation_index) local: u32,
 ) {
-    // More workgroups than tiles: the last ones find no pair and no pixel.
+    // More workgroups than tiles: the last_pair ones find no pair and no pixel.
     let tile = group.y * groups.x + group.x;
     let exists = tile < views.tiles;
     var range = vec2<u32>(0u);
     if exists {
         range = tile_ranges[tile];
     }
-    let view = views.each[view_of_tile(tile)];
-    let of_view = tile - view.first_tile;
-    let corner = vec2<u32>(of_view % view.tiles.x, of_view / view.tiles.x) * TILE;
+    let view = views.view[view_of_tile(tile)];
+    let tile_of_view = tile - view.first_tile;
+    let corner = vec2<u32>(tile_of_view % view.tiles.x, tile_of_view / view.tiles.x) * TILE;
     let at = corner + vec2<u32>(local % TILE, local / TILE);
     let inside = exists && all(at < view.pixels);
     let pixel = vec2<f32>(at) + 0.5;
@@ -43,48 +43,48 @@ fn rasterize(
     var finished = !inside;
     var colour = vec3<f32>(0.0);
     var depth = 0.0;
-    var own = 0.0;
+    var trainable_alpha = 0.0;
     var end = 0u;
     for (var first = range.x; first < range.y; first += BATCH) {
         if local == 0u {
-            atomicStore(&alive, 0u);
+            atomicStore(&any_unfinished, 0u);
         }
         workgroupBarrier();
         if !finished {
-            atomicOr(&alive, 1u);
+            atomicOr(&any_unfinished, 1u);
         }
         workgroupBarrier();
         if local == 0u {
-            alive_now = atomicLoad(&alive);
+            any_unfinished_now = atomicLoad(&any_unfinished);
         }
-        if workgroupUniformLoad(&alive_now) == 0u {
+        if workgroupUniformLoad(&any_unfinished_now) == 0u {
             break;
         }
         let count = min(BATCH, range.y - first);
         if local < count {
             let i = pair_splat[sorted[first + local]];
             let record = records[i];
-            places[local] = record.place;
-            reaches[local] = record.reach.xy;
-            looks[local] = record.look;
-            owns[local] = f32(i < views.own);
+            means_ab[local] = record.mean_ab;
+            c_opacities[local] = record.c_opacity_extent.xy;
+            colours_depths[local] = record.colour_depth;
+            is_trainable[local] = f32(i < views.trainable_entries);
         }
         workgroupBarrier();
         for (var k = 0u; k < count && !finished; k++) {
-            let touched = touch(places[k], reaches[k].x, reaches[k].y, pixel);
-            if touched.alpha < ALPHA_MIN {
+            let sample = pixel_alpha(means_ab[k], c_opacities[k].x, c_opacities[k].y, pixel);
+            if sample.alpha < ALPHA_MIN {
                 continue;
             }
-            let weight = min(touched.alpha, ALPHA_MAX) * transmittance;
+            let weight = min(sample.alpha, ALPHA_MAX) * transmittance;
             let rest = transmittance - weight;
             if rest <= TRANSMITTANCE_MIN {
                 finished = true;
                 break;
             }
-            let look = looks[k];
-            colour = fma(vec3<f32>(weight), look.xyz, colour);
-            depth = fma(weight, look.w, depth);
-            own = fma(weight, owns[k], own);
+            let colour_depth = colours_depths[k];
+            colour = fma(vec3<f32>(weight), colour_depth.xyz, colour);
+            depth = fma(weight, colour_depth.w, depth);
+            trainable_alpha = fma(weight, is_trainable[k], trainable_alpha);
             transmittance = rest;
             end = first + k + 1u;
         }
@@ -93,7 +93,7 @@ fn rasterize(
     if inside {
         let area = view.pixels.x * view.pixels.y;
         let here = at.y * view.pixels.x + at.x;
-        let to = planes_of(views.extras) * view.first_pixel + here;
+        let to = frame_planes(views.extras) * view.first_pixel + here;
         colour = fma(vec3<f32>(transmittance), views.background.xyz, colour);
         frame[to] = colour.x;
         frame[area + to] = colour.y;
@@ -101,8 +101,8 @@ fn rasterize(
         frame[3u * area + to] = transmittance;
         if views.extras != 0u {
             frame[4u * area + to] = depth;
-            frame[5u * area + to] = own;
+            frame[5u * area + to] = trainable_alpha;
         }
-        last[view.first_pixel + here] = end;
+        last_pair[view.first_pixel + here] = end;
     }
 }

@@ -1,10 +1,10 @@
 // Stage `rasterize_backward`: the gradient of each pair of a trainable splat and a tile, as sums over the tile's pixels.
 //
-// A workgroup walks its tile's pairs front to back, as `rasterize` does, eight at a time, in two steps. First a thread is a
+// A workgroup walks its tile's output_slots front to back, as `rasterize` does, eight at a time, in two steps. First a thread is a
 // pixel: it replays its eight opacities, knows the colour behind each as "final minus seen so far", and leaves
 // v = alpha dL/dalpha and w = alpha T in workgroup memory. Then 32 threads are a pair: each adds up eight pixels of one
 // column, so that most moments need only the sums of v, v dy and v dy^2; 32 such parts are added in a fixed order
-// (`add_up_parts`). No atomics on floats: the same bits every time.
+// (`reduce_parts`). No atomics on floats: the same bits every time.
 
 @group(0) @binding(0) var<uniform> views: Views;
 @group(0) @binding(1) var<storage, read> tile_ranges: array<vec2<u32>>;
@@ -12,22 +12,22 @@
 @group(0) @binding(3) var<storage, read> pair_splat: array<u32>;
 @group(0) @binding(4) var<storage, read> records: array<Record>;
 @group(0) @binding(5) var<storage, read> frame: array<f32>;
-@group(0) @binding(6) var<storage, read> last: array<u32>;
+@group(0) @binding(6) var<storage, read> last_pair: array<u32>;
 // Of each view planes: dL/d red, green, blue and, where `planes` says so, transmittance and depth; room for all five.
 @group(0) @binding(7) var<storage, read> upstream: array<f32>;
-@group(0) @binding(8) var<uniform> planes: Planes;
+@group(0) @binding(8) var<uniform> planes: UpstreamPlanes;
 const PAIRS: u32 = 8u; // at a time
 const PARTS: u32 = 32u; // threads of a pair
 const PIXELS: u32 = 8u; // of a part
 
-var<workgroup> places: array<vec4<f32>, PAIRS>;
-var<workgroup> reaches: array<vec2<f32>, PAIRS>;
-var<workgroup> looks: array<vec4<f32>, PAIRS>;
+var<workgroup> means_ab: array<vec4<f32>, PAIRS>;
+var<workgroup> c_opacities: array<vec2<f32>, PAIRS>;
+var<workgroup> colours_depths: array<vec4<f32>, PAIRS>;
 // Of each pair, or of its splat, where its sums go.
-var<workgroup> pairs: array<u32, PAIRS>;
-var<workgroup> owns: array<u32, PAIRS>;
+var<workgroup> output_slots: array<u32, PAIRS>;
+var<workgroup> is_trainable: array<u32, PAIRS>;
 // dL/d colour and depth of each pixel.
-var<workgroup> wanted: array<vec4<f32>, 256>;
+var<workgroup> gradients: array<vec4<f32>, 256>;
 // Bit k: some pixel blended pair k.
 var<workgroup> blended: atomic<u32>;
 var<workgroup> end_of_tile: atomic<u32>;
@@ -39,21 +39,21 @@ fn rasterize_backward(
     @builtin(num_workgroups) groups: vec3<u32>,
     thread: Thread,
 ) {
-    let local = place_of(thread);
+    let local = local_index(thread);
     let tile = group.y * groups.x + group.x;
     let exists = tile < views.tiles;
     var range = vec2<u32>(0u);
     if exists {
         range = tile_ranges[tile];
     }
-    let view = views.each[view_of_tile(tile)];
-    let of_view = tile - view.first_tile;
-    let corner = vec2<u32>(of_view % view.tiles.x, of_view / view.tiles.x) * TILE;
+    let view = views.view[view_of_tile(tile)];
+    let tile_of_view = tile - view.first_tile;
+    let corner = vec2<u32>(tile_of_view % view.tiles.x, tile_of_view / view.tiles.x) * TILE;
     let at = corner + vec2<u32>(local % TILE, local / TILE);
     let area = view.pixels.x * view.pixels.y;
     let pixel_of_view = at.y * view.pixels.x + at.x;
-    let here = planes_of(views.extras) * view.first_pixel + pixel_of_view;
-    let there = 5u * view.first_pixel + pixel_of_view;
+    let frame_at = frame_planes(views.extras) * view.first_pixel + pixel_of_view;
+    let upstream_at = 5u * view.first_pixel + pixel_of_view;
 
     // Of this thread's pixel: the upstream gradient, the end of what was blended, and what lies behind the splats seen so
     // far, weighted by the gradient; at first all of it.
@@ -61,19 +61,19 @@ fn rasterize_backward(
     var end = 0u;
     var behind = 0.0;
     if exists && all(at < view.pixels) {
-        gradient = vec4<f32>(upstream[there], upstream[area + there], upstream[2u * area + there], 0.0);
-        let colour = vec3<f32>(frame[here], frame[area + here], frame[2u * area + here]);
+        gradient = vec4<f32>(upstream[upstream_at], upstream[area + upstream_at], upstream[2u * area + upstream_at], 0.0);
+        let colour = vec3<f32>(frame[frame_at], frame[area + frame_at], frame[2u * area + frame_at]);
         behind = fma(colour.x, gradient.x, fma(colour.y, gradient.y, colour.z * gradient.z));
         if planes.transmittance != 0u {
-            behind = fma(frame[3u * area + here], upstream[3u * area + there], behind);
+            behind = fma(frame[3u * area + frame_at], upstream[3u * area + upstream_at], behind);
         }
         if planes.depth != 0u {
-            gradient.w = upstream[4u * area + there];
-            behind = fma(frame[4u * area + here], gradient.w, behind);
+            gradient.w = upstream[4u * area + upstream_at];
+            behind = fma(frame[4u * area + frame_at], gradient.w, behind);
         }
-        end = last[view.first_pixel + pixel_of_view];
+        end = last_pair[view.first_pixel + pixel_of_view];
     }
-    wanted[local] = gradient;
+    gradients[local] = gradient;
     if local == 0u {
         atomicStore(&end_of_tile, range.x);
     }
@@ -93,62 +93,62 @@ fn rasterize_backward(
             let pair = sorted[first + local];
             let i = pair_splat[pair];
             let record = records[i];
-            places[local] = record.place;
-            reaches[local] = record.reach.xy;
-            looks[local] = record.look;
-            pairs[local] = owner_of(pair, i);
-            owns[local] = u32(i < views.own);
+            means_ab[local] = record.mean_ab;
+            c_opacities[local] = record.c_opacity_extent.xy;
+            colours_depths[local] = record.colour_depth;
+            output_slots[local] = output_slot(pair, i);
+            is_trainable[local] = u32(i < views.trainable_entries);
         }
         if local == 0u {
             atomicStore(&blended, 0u);
         }
         workgroupBarrier();
 
-        var mine = 0u;
+        var blended_here = 0u;
         for (var k = 0u; k < count; k++) {
             var v = 0.0;
             var w = 0.0;
             if first + k < end {
-                let touched = touch(places[k], reaches[k].x, reaches[k].y, pixel);
-                if touched.alpha >= ALPHA_MIN {
-                    let alpha = min(touched.alpha, ALPHA_MAX);
+                let sample = pixel_alpha(means_ab[k], c_opacities[k].x, c_opacities[k].y, pixel);
+                if sample.alpha >= ALPHA_MIN {
+                    let alpha = min(sample.alpha, ALPHA_MAX);
                     w = alpha * transmittance;
-                    let look = looks[k];
-                    let along = fma(gradient.x, look.x, fma(gradient.y, look.y, fma(gradient.z, look.z, gradient.w * look.w)));
-                    behind = fma(-w, along, behind);
-                    // alpha dL/dalpha = alpha (T along - behind / (1 - alpha)); zero where clamped.
-                    if touched.alpha < ALPHA_MAX {
-                        v = alpha * (transmittance * along - behind / (1.0 - alpha));
+                    let colour_depth = colours_depths[k];
+                    let d_weight = fma(gradient.x, colour_depth.x, fma(gradient.y, colour_depth.y, fma(gradient.z, colour_depth.z, gradient.w * colour_depth.w)));
+                    behind = fma(-w, d_weight, behind);
+                    // alpha dL/dalpha = alpha (T d_weight - behind / (1 - alpha)); zero where clamped.
+                    if sample.alpha < ALPHA_MAX {
+                        v = alpha * (transmittance * d_weight - behind / (1.0 - alpha));
                     }
                     transmittance -= w;
-                    mine |= 1u << k;
+                    blended_here |= 1u << k;
                 }
             }
-            put_touch(256u * k + local, v, w, f32(area));
+            store_pixel_terms(256u * k + local, v, w, f32(area));
         }
-        if mine != 0u {
-            atomicOr(&blended, mine);
+        if blended_here != 0u {
+            atomicOr(&blended, blended_here);
         }
         workgroupBarrier();
 
         let k = local / PARTS;
         let part = local % PARTS;
-        var sums = Sums(0.0, 0.0, 0.0, vec4<f32>(0.0), 0.0, vec2<f32>(0.0));
+        var sums = PartSums(0.0, 0.0, 0.0, vec4<f32>(0.0), 0.0, vec2<f32>(0.0));
         let any = ((atomicLoad(&blended) >> k) & 1u) != 0u;
-        let dx = f32(corner.x + part % TILE) + 0.5 - places[k].x;
-        if k < count && any && owns[k] != 0u {
-            sums = add_up(k, part, f32(area), dx, f32(corner.y + part / TILE) + 0.5 - places[k].y);
+        let dx = f32(corner.x + part % TILE) + 0.5 - means_ab[k].x;
+        if k < count && any && is_trainable[k] != 0u {
+            sums = sum_part(k, part, f32(area), dx, f32(corner.y + part / TILE) + 0.5 - means_ab[k].y);
         }
-        add_up_parts(moments_of(sums, dx), count, thread);
+        reduce_parts(moments_from(sums, dx), count, thread);
     }
 
-    // Pairs behind the last one that any pixel blended.
+    // Pairs behind the last_pair one that any pixel blended.
     var rest = max(stop, range.x);
     if stop > range.x {
         // The loop above went to the end of a group of eight.
         rest = min(range.x + (stop - range.x + PAIRS - 1u) / PAIRS * PAIRS, range.y);
     }
-    leave_nothing(rest, range.y, local);
+    clear_moments(rest, range.y, local);
 }
 
 // What a pair hands to its splat, MOMENTS floats: v, v dx, v dy, v dx^2 | v dx dy, v dy^2, w red, w green | w blue, w depth, w,
@@ -161,37 +161,37 @@ struct Moments {
     d: f32,
 }
 
-fn moments_of(sums: Sums, dx: f32) -> Moments {
+fn moments_from(sums: PartSums, dx: f32) -> Moments {
     return Moments(
         vec4<f32>(sums.v, sums.v * dx, sums.vy, sums.v * dx * dx),
-        vec4<f32>(sums.vy * dx, sums.vyy, sums.look.xy),
-        vec4<f32>(sums.look.zw, sums.w, sums.along.x),
-        sums.along.y,
+        vec4<f32>(sums.vy * dx, sums.vyy, sums.colour_depth.xy),
+        vec4<f32>(sums.colour_depth.zw, sums.w, sums.d_weight.x),
+        sums.d_weight.y,
     );
 }
 
-struct Sums {
+struct PartSums {
     v: f32,
     vy: f32,
     vyy: f32,
-    look: vec4<f32>,
+    colour_depth: vec4<f32>,
     w: f32,
-    along: vec2<f32>,
+    d_weight: vec2<f32>,
 }
 
 // The sums over the eight pixels of a part: column part % 16, every second row from part / 16; dx and dy of the first.
-fn add_up(k: u32, part: u32, pixels: f32, dx: f32, dy: f32) -> Sums {
-    let a = places[k].z;
-    let b = places[k].w;
-    let c = reaches[k].x;
+fn sum_part(k: u32, part: u32, pixels: f32, dx: f32, dy: f32) -> PartSums {
+    let a = means_ab[k].z;
+    let b = means_ab[k].w;
+    let c = c_opacities[k].x;
     // dalpha/d(mean) / alpha: the exponent's derivative in natural units.
     let aa = 2.0 * LN_2 * a * a;
     let ab = 2.0 * LN_2 * a * b;
     let bc = 2.0 * LN_2 * fma(b, b, c * c);
-    var sums = Sums(0.0, 0.0, 0.0, vec4<f32>(0.0), 0.0, vec2<f32>(0.0));
+    var sums = PartSums(0.0, 0.0, 0.0, vec4<f32>(0.0), 0.0, vec2<f32>(0.0));
     for (var n = 0u; n < PIXELS; n++) {
         let p = part + PARTS * n;
-        let vw = touch_at(256u * k + p, pixels);
+        let vw = load_pixel_terms(256u * k + p, pixels);
         let v = vw.x;
         let w = vw.y;
         let y = dy + f32(2u * n);
@@ -199,9 +199,9 @@ fn add_up(k: u32, part: u32, pixels: f32, dx: f32, dy: f32) -> Sums {
         sums.v += v;
         sums.vy += vy;
         sums.vyy = fma(vy, y, sums.vyy);
-        sums.look = fma(vec4<f32>(w), wanted[p], sums.look);
+        sums.colour_depth = fma(vec4<f32>(w), gradients[p], sums.colour_depth);
         sums.w += w;
-        sums.along += abs(v) * abs(vec2<f32>(fma(aa, dx, ab * y), fma(bc, y, ab * dx)));
+        sums.d_weight += abs(v) * abs(vec2<f32>(fma(aa, dx, ab * y), fma(bc, y, ab * dx)));
     }
     return sums;
 }

@@ -3,7 +3,7 @@
 
 @group(0) @binding(0) var<storage, read> status: Status;
 @group(0) @binding(1) var<storage, read> visible: array<u32>;
-@group(0) @binding(2) var<storage, read> first: array<u32>;
+@group(0) @binding(2) var<storage, read> first_pair: array<u32>;
 @group(0) @binding(3) var<storage, read> tiles: array<u32>;
 @group(0) @binding(4) var<storage, read> moments: array<f32>;
 @group(0) @binding(5) var<storage, read_write> sums: array<f32>;
@@ -14,19 +14,19 @@ fn reduce(
     @builtin(num_workgroups) groups: vec3<u32>,
     @builtin(local_invocation_index) local: u32,
 ) {
-    let place = linear(group, groups, local) / 16u;
+    let entry = thread_number(group, groups, local) / 16u;
     let moment = local % 16u;
-    if place >= status.seen || moment >= MOMENTS {
+    if entry >= status.visible_trainable || moment >= MOMENTS {
         return;
     }
-    let i = visible[place];
+    let i = visible[entry];
     let count = tiles[i];
     var total = 0.0;
     if count > 0u {
-        let start = first[i];
+        let start = first_pair[i];
         for (var pair = start; pair < start + count; pair++) {
             total += moments[pair * MOMENTS + moment];
         }
     }
-    sums[place * MOMENTS + moment] = total;
+    sums[entry * MOMENTS + moment] = total;
 }

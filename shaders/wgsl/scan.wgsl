@@ -1,8 +1,8 @@
-// Stage `scan`: exclusive sums in place, in three dispatches: of each block, over the blocks, within each block. Sums
+// Stage `scan`: exclusive_scan sums in place, in three dispatches: of each block, over the blocks, within each block. Sums
 // that would not fit stay at the largest number, so that whoever compares them with a limit cannot be fooled.
 
-struct Pass {
-    slot: u32,
+struct PassConstants {
+    len_word: u32,
     shift: u32,
     padding: vec2<u32>,
 }
@@ -10,16 +10,16 @@ struct Pass {
 @group(0) @binding(0) var<storage, read_write> data: array<u32>;
 @group(0) @binding(1) var<storage, read_write> block_sums: array<u32>;
 @group(0) @binding(2) var<storage, read> status: array<u32>;
-@group(0) @binding(3) var<uniform> pass_: Pass;
+@group(0) @binding(3) var<uniform> pass_: PassConstants;
 
 const BLOCK: u32 = 1024u; // four entries a thread
 
-fn add(a: u32, b: u32) -> u32 {
+fn saturating_add(a: u32, b: u32) -> u32 {
     let sum = a + b;
     return select(sum, 0xffffffffu, sum < a);
 }
 
-fn block_of(group: vec3<u32>, groups: vec3<u32>) -> u32 {
+fn block_index(group: vec3<u32>, groups: vec3<u32>) -> u32 {
     return group.y * groups.x + group.x;
 }
 
@@ -36,21 +36,21 @@ fn scan_blocks(
     @builtin(num_workgroups) groups: vec3<u32>,
     thread: Thread,
 ) {
-    let local = place_of(thread);
-    let count = status[pass_.slot];
-    let block = block_of(group, groups);
+    let local = local_index(thread);
+    let count = status[pass_.len_word];
+    let block = block_index(group, groups);
     let at = block * BLOCK + 4u * local;
-    let sum = add(add(load(at, count), load(at + 1u, count)), add(load(at + 2u, count), load(at + 3u, count)));
-    exclusive(sum, thread);
+    let sum = saturating_add(saturating_add(load(at, count), load(at + 1u, count)), saturating_add(load(at + 2u, count), load(at + 3u, count)));
+    exclusive_scan(sum, thread);
     if local == 0u && block * BLOCK < count {
-        block_sums[block] = total(thread);
+        block_sums[block] = scan_total(thread);
     }
 }
 
 @compute @workgroup_size(256)
 fn scan_sums(thread: Thread) {
-    let local = place_of(thread);
-    let count = status[pass_.slot];
+    let local = local_index(thread);
+    let count = status[pass_.len_word];
     let blocks = count / BLOCK + select(0u, 1u, count % BLOCK != 0u);
     var carry = 0u;
     for (var first = 0u; first < blocks; first += 256u) {
@@ -59,11 +59,11 @@ fn scan_sums(thread: Thread) {
         if at < blocks {
             value = block_sums[at];
         }
-        let before = exclusive(value, thread);
+        let before = exclusive_scan(value, thread);
         if at < blocks {
-            block_sums[at] = add(carry, before);
+            block_sums[at] = saturating_add(carry, before);
         }
-        carry = add(carry, total(thread));
+        carry = saturating_add(carry, scan_total(thread));
         workgroupBarrier();
     }
 }
@@ -74,20 +74,20 @@ fn scan_apply(
     @builtin(num_workgroups) groups: vec3<u32>,
     thread: Thread,
 ) {
-    let local = place_of(thread);
-    let count = status[pass_.slot];
-    let block = block_of(group, groups);
+    let local = local_index(thread);
+    let count = status[pass_.len_word];
+    let block = block_index(group, groups);
     let at = block * BLOCK + 4u * local;
     var values = array<u32, 4>(load(at, count), load(at + 1u, count), load(at + 2u, count), load(at + 3u, count));
-    let before = exclusive(add(add(values[0], values[1]), add(values[2], values[3])), thread);
+    let before = exclusive_scan(saturating_add(saturating_add(values[0], values[1]), saturating_add(values[2], values[3])), thread);
     if block * BLOCK >= count {
         return;
     }
-    var sum = add(block_sums[block], before);
+    var sum = saturating_add(block_sums[block], before);
     for (var k = 0u; k < 4u; k++) {
         if at + k < count {
             data[at + k] = sum;
         }
-        sum = add(sum, values[k]);
+        sum = saturating_add(sum, values[k]);
     }
 }

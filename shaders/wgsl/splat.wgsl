@@ -6,7 +6,7 @@
 @group(0) @binding(2) var<storage, read> bank_c: array<f32>;
 @group(0) @binding(3) var<storage, read> bank_d: array<f32>;
 @group(0) @binding(4) var<uniform> views: Views;
-@group(0) @binding(5) var<uniform> splats: Set;
+@group(0) @binding(5) var<uniform> splats: SplatSet;
 
 // The view that this thread is at.
 var<private> view: View;
@@ -104,7 +104,7 @@ fn ewa(i: u32, p: vec3<f32>) -> Ewa {
         e.a0.z * e.a1.x - e.a1.z * e.a0.x,
     );
     e.det0 = dot3(minors, minors);
-    e.det1 = fma(BLUR, e.cov.x + e.cov.z + BLUR, e.det0);
+    e.det1 = fma(LOW_PASS, e.cov.x + e.cov.z + LOW_PASS, e.det0);
     return e;
 }
 

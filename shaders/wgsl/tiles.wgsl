@@ -1,16 +1,16 @@
-// Which tiles the ellipse of a record at alpha = 1/255 touches. `project` counts them and `emit` lists them: both must
+// Which tiles the ellipse of a record at alpha = 1/255 overlaps. `project` counts them and `emit` lists them: both must
 // find the same ones, so nothing here leaves a compiler a choice of how to round (fma where a product is added).
 
-struct Span {
+struct TileBox {
     first: vec2<u32>,
     end: vec2<u32>,
 }
 
 // The tiles of the ellipse's box; extents are below 1e7.
-fn span(r: Record, tiles: vec2<u32>) -> Span {
-    let low = max((r.place.xy - r.reach.zw - 0.5) * 0.0625, vec2<f32>(0.0));
-    let high = max((r.place.xy + r.reach.zw - 0.5) * 0.0625, vec2<f32>(0.0));
-    return Span(vec2<u32>(low), min(vec2<u32>(high) + 1u, tiles));
+fn tile_box(r: Record, tiles: vec2<u32>) -> TileBox {
+    let low = max((r.mean_ab.xy - r.c_opacity_extent.zw - 0.5) * 0.0625, vec2<f32>(0.0));
+    let high = max((r.mean_ab.xy + r.c_opacity_extent.zw - 0.5) * 0.0625, vec2<f32>(0.0));
+    return TileBox(vec2<u32>(low), min(vec2<u32>(high) + 1u, tiles));
 }
 
 struct Ellipse {
@@ -26,14 +26,14 @@ struct Ellipse {
 }
 
 fn ellipse(r: Record) -> Ellipse {
-    let a = r.place.z;
-    let b = r.place.w;
-    let c = r.reach.x;
+    let a = r.mean_ab.z;
+    let b = r.mean_ab.w;
+    let c = r.c_opacity_extent.x;
     // log2(1/255) is -7.9943534; a little slack, as the rasterizer tests each pixel anyway.
-    return Ellipse(r.place.xy, a, b, c, -(a * b) / fma(b, b, c * c), -b / a, r.reach.y + 7.9953534);
+    return Ellipse(r.mean_ab.xy, a, b, c, -(a * b) / fma(b, b, c * c), -b / a, r.c_opacity_extent.y + 7.9953534);
 }
 
-fn touches(e: Ellipse, tile: vec2<u32>) -> bool {
+fn overlaps(e: Ellipse, tile: vec2<u32>) -> bool {
     // Pixel centres of the tile's corners, from the mean.
     let low = vec2<f32>(tile * TILE) + 0.5 - e.mean;
     let high = low + 15.0;

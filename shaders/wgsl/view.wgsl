@@ -1,13 +1,13 @@
 // What all stages share: constants (those of `render`, which a test there compares), the views and their status.
 
-const GROUP: u32 = 256u;
+const WORKGROUP_SIZE: u32 = 256u;
 const TILE: u32 = 16u;
 const MOMENTS: u32 = 13u;
 // Views drawn side by side, at most.
-const MOST_VIEWS: u32 = 16u;
+const MAX_VIEWS: u32 = 16u;
 
 const NEAR_METRES: f32 = 0.01;
-const BLUR: f32 = 0.3;
+const LOW_PASS: f32 = 0.3;
 const ALPHA_MIN: f32 = 0.003921569;
 const ALPHA_MAX: f32 = 0.999;
 const TRANSMITTANCE_MIN: f32 = 1e-4;
@@ -40,22 +40,22 @@ struct Views {
     tiles: u32,
     pixels: u32,
     // Entries of the trainable splats; of these and the context.
-    own: u32,
-    total: u32,
+    trainable_entries: u32,
+    entries: u32,
     pair_capacity: u32,
     antialiased: u32,
     extras: u32,
-    each: array<View, MOST_VIEWS>,
+    view: array<View, MAX_VIEWS>,
 }
 
-struct Set {
+struct SplatSet {
     first: u32,
     count: u32,
     stride: u32,
     sh_degree: u32,
 }
 
-struct Planes {
+struct UpstreamPlanes {
     transmittance: u32,
     depth: u32,
     padding: vec2<u32>,
@@ -65,33 +65,33 @@ struct Status {
     overflow: u32,
     fault: u32,
     pairs: u32,
-    most_pairs: u32,
+    max_pairs: u32,
     visible: u32,
-    seen: u32,
-    splat_slots: u32,
-    visible_slots: u32,
-    visible_digits: u32,
-    pair_digits: u32,
+    visible_trainable: u32,
+    entry_scan_len: u32,
+    visible_scan_len: u32,
+    visible_histogram_len: u32,
+    pair_histogram_len: u32,
 }
 
 // A splat in the view. The ellipse is the conic's Cholesky factor for exponents of two:
 // alpha = 2^(log2_opacity - (a dx + b dy)^2 - (c dy)^2); the conic itself would cancel along needles.
 struct Record {
     // Mean in pixels, a, b.
-    place: vec4<f32>,
+    mean_ab: vec4<f32>,
     // c, log2 of the opacity, half extents in pixels of the ellipse at alpha = 1/255.
-    reach: vec4<f32>,
+    c_opacity_extent: vec4<f32>,
     // Colour, clamped from below at 0; depth in metres.
-    look: vec4<f32>,
+    colour_depth: vec4<f32>,
 }
 
 // The number of a thread in a dispatch of one or two dimensions of workgroups.
-fn linear(group: vec3<u32>, groups: vec3<u32>, local: u32) -> u32 {
-    return (group.y * groups.x + group.x) * GROUP + local;
+fn thread_number(group: vec3<u32>, groups: vec3<u32>, local: u32) -> u32 {
+    return (group.y * groups.x + group.x) * WORKGROUP_SIZE + local;
 }
 
-// Planes of a frame.
-fn planes_of(extras: u32) -> u32 {
+// UpstreamPlanes of a frame.
+fn frame_planes(extras: u32) -> u32 {
     return select(4u, 6u, extras != 0u);
 }
 

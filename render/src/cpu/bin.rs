@@ -1,12 +1,13 @@
-//! Stages `sort` and `bin`: splats in depth order, and for every tile the list of splats that touch it.
+//! Stages `sort` and `bin`: the depth order of the splats, and for every tile the list of splats that overlap it.
 //!
-//! A tile is 16×16 pixels: sixteen blocks of 4×4 pixels, one lane each. A pair carries a bit per block that the ellipse at
-//! α = 1/255 touches, computed for all sixteen blocks at once, so the rasterizer never visits the corners of a box.
-//! Splats are sorted by depth once; pairs are emitted in that order and distributed by a counting sort, which keeps it.
+//! A tile is 16×16 pixels, that is sixteen blocks of 4×4 pixels. A pair of splat and tile has a bit for each block that the ellipse at
+//! α = 1/255 overlaps; one SIMD test, a lane per block, computes all sixteen bits. So the rasterizer skips the empty corners of the
+//! bounding box.
+//! Splats are sorted by depth once; pairs are emitted in that order and sorted by tile with a stable counting sort.
 
 use rayon::prelude::*;
 
-use super::deal::{Places, first_places, parts};
+use super::counting_sort::{ScatterWriter, offsets, parts};
 use super::project::{Projected, at};
 use super::simd::{Isa, Lanes};
 use crate::kernel;
@@ -17,15 +18,15 @@ pub(crate) const TILE: usize = 16;
 /// A splat in a tile.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub(crate) struct Pair {
-    /// Place of the splat in depth order.
+    /// Rank of the splat in depth order.
     pub(crate) rank: u32,
-    /// The 4×4 blocks that it touches.
+    /// Bit per 4×4 block that it overlaps.
     pub(crate) blocks: u16,
-    /// Whether the splat is under training.
-    pub(crate) own: bool,
+    /// Whether the splat is trainable.
+    pub(crate) trainable: bool,
 }
 
-/// For each tile, its splats front to back.
+/// The pairs of every tile, front to back.
 #[derive(Debug, Default)]
 pub(crate) struct Bins {
     pub(crate) tiles_x: usize,
@@ -33,17 +34,17 @@ pub(crate) struct Bins {
     /// `pairs[start[t] .. start[t + 1]]` belong to tile `t` (row-major).
     pub(crate) start: Vec<u32>,
     pub(crate) pairs: Vec<Pair>,
-    /// `emitted[r] .. emitted[r + 1]` are the emission numbers of the splat of rank `r`.
+    /// `emitted[r] .. emitted[r + 1]` are the emission numbers of the pairs of rank `r`.
     pub(crate) emitted: Vec<u32>,
-    /// Where the pair with this emission number came to lie in `pairs`.
-    pub(crate) place: Vec<u32>,
+    /// Index in `pairs` of the pair with this emission number.
+    pub(crate) position: Vec<u32>,
 }
 
-/// Indices of the seen splats by depth, nearest first; ties keep index order. Positive floats sort as their bits.
+/// Sorts the indices of the visible splats by depth, nearest first; ties keep index order. Positive floats sort as their bits.
 pub(crate) fn sort_by_depth(projected: &[Projected], seen: &[u16], order: &mut Vec<u32>, scratch: &mut SortScratch) {
     const BITS: u32 = 11;
     const BUCKETS: usize = 1 << BITS;
-    let SortScratch { keys, other } = scratch;
+    let SortScratch { keys, swap } = scratch;
     keys.clear();
     for (word, &bits) in seen.iter().enumerate() {
         let mut bits = bits;
@@ -53,8 +54,8 @@ pub(crate) fn sort_by_depth(projected: &[Projected], seen: &[u16], order: &mut V
             keys.push((projected[i].0[at::Z].to_bits(), i as u32));
         }
     }
-    other.clear();
-    other.resize(keys.len(), (0, 0));
+    swap.clear();
+    swap.resize(keys.len(), (0, 0));
     let mut counts = [[0u32; BUCKETS]; 3];
     for (key, _) in keys.iter() {
         for (pass, counts) in counts.iter_mut().enumerate() {
@@ -68,10 +69,10 @@ pub(crate) fn sort_by_depth(projected: &[Projected], seen: &[u16], order: &mut V
         }
         for &(key, i) in keys.iter() {
             let to = &mut counts[(key >> (BITS * pass as u32)) as usize & (BUCKETS - 1)];
-            other[*to as usize] = (key, i);
+            swap[*to as usize] = (key, i);
             *to += 1;
         }
-        std::mem::swap(keys, other);
+        std::mem::swap(keys, swap);
     }
     order.clear();
     order.extend(keys.iter().map(|&(_, i)| i));
@@ -81,7 +82,7 @@ pub(crate) fn sort_by_depth(projected: &[Projected], seen: &[u16], order: &mut V
 #[derive(Debug, Default)]
 pub(crate) struct SortScratch {
     keys: Vec<(u32, u32)>,
-    other: Vec<(u32, u32)>,
+    swap: Vec<(u32, u32)>,
 }
 
 /// Fills `bins` with the tiles of `width × height` pixels; `ranked` are the records in depth order.
@@ -108,49 +109,49 @@ pub(crate) fn bin(isa: Isa, ranked: &[Projected], width: usize, height: usize, b
     });
     let mut next: Vec<Vec<u32>> = counted.collect();
     bins.start.clear();
-    first_places(&mut next, tiles, |start| bins.start.push(start));
+    offsets(&mut next, tiles, |start| bins.start.push(start));
 
     bins.pairs.resize(total, Pair::default());
-    bins.place.resize(total, 0);
+    bins.position.resize(total, 0);
     bins.emitted.resize(ranked.len() + 1, 0);
     bins.emitted[0] = 0;
-    let (mut first, mut place, mut emitted) = (0, &mut bins.place[..], &mut bins.emitted[1..]);
-    let mut deals = Vec::with_capacity(next.len());
+    let (mut first, mut position, mut emitted) = (0, &mut bins.position[..], &mut bins.emitted[1..]);
+    let mut scatters = Vec::with_capacity(next.len());
     for (part, next) in emissions.chunks(part).zip(next) {
-        let own: usize = part.iter().map(|emission| emission.pairs.len()).sum();
+        let pairs: usize = part.iter().map(|emission| emission.pairs.len()).sum();
         let records = part.iter().map(|emission| emission.counts.len()).sum();
-        deals.push(Deal {
+        scatters.push(Scatter {
             part,
             next,
             first,
-            place: place.split_off_mut(..own).expect("as many places as pairs"),
-            emitted: emitted.split_off_mut(..records).expect("as many records as were emitted"),
+            position: position.split_off_mut(..pairs).expect("as many positions as pairs"),
+            emitted: emitted.split_off_mut(..records).expect("as many counts as records"),
         });
-        first += own as u32;
+        first += pairs as u32;
     }
-    let pairs = Places::new(&mut bins.pairs);
-    deals.into_par_iter().for_each(|deal| deal.out(&pairs));
+    let pairs = ScatterWriter::new(&mut bins.pairs);
+    scatters.into_par_iter().for_each(|scatter| scatter.run(&pairs));
 }
 
-/// Pairs that one thread deals out to their tiles.
-struct Deal<'a> {
+/// The scatter pass of the counting sort over one part of the pairs.
+struct Scatter<'a> {
     part: &'a [Emission],
-    /// Where the next pair of each tile goes.
+    /// Output position of the next pair of each tile.
     next: Vec<u32>,
     /// Emission number of the first pair.
     first: u32,
-    place: &'a mut [u32],
+    position: &'a mut [u32],
     emitted: &'a mut [u32],
 }
 
-impl Deal<'_> {
-    fn out(mut self, pairs: &Places<Pair>) {
+impl Scatter<'_> {
+    fn run(mut self, pairs: &ScatterWriter<Pair>) {
         let emitted = self.part.iter().flat_map(|emission| &emission.pairs);
-        for (&(tile, pair), place) in emitted.zip(self.place) {
+        for (&(tile, pair), position) in emitted.zip(self.position) {
             let to = &mut self.next[tile as usize];
-            // Safety: the places of a tile and a part are counted, and no others'.
-            unsafe { pairs.put(*to as usize, pair) };
-            *place = *to;
+            // Safety: the counting pass reserved this range of positions for this tile and part.
+            unsafe { pairs.write(*to as usize, pair) };
+            *position = *to;
             *to += 1;
         }
         let counts = self.part.iter().flat_map(|emission| &emission.counts);
@@ -161,7 +162,7 @@ impl Deal<'_> {
     }
 }
 
-/// The pairs of some splats, in depth order, and the number of pairs of each.
+/// The pairs of a chunk of splats, in depth order, and the number of pairs of each splat.
 #[derive(Default)]
 struct Emission {
     pairs: Vec<(u32, Pair)>,
@@ -172,7 +173,7 @@ kernel!(fn emit(records: &[Projected], first_rank: u32, tiles: (usize, usize), o
 
 #[inline(always)]
 fn emit_lanes<L: Lanes>(records: &[Projected], first_rank: u32, tiles: (usize, usize), out: &mut Emission) {
-    // Left and top pixel centres of the sixteen blocks of a tile.
+    // Pixel centres at the left and top of the sixteen blocks of a tile.
     let (mut block_x, mut block_y) = ([0.5; 16], [0.5; 16]);
     for b in 0..16 {
         block_x[b] += (b % 4 * 4) as f32;
@@ -183,7 +184,7 @@ fn emit_lanes<L: Lanes>(records: &[Projected], first_rank: u32, tiles: (usize, u
     for (n, Projected(r)) in records.iter().enumerate() {
         let before = out.pairs.len();
         let span = |centre: f32, half: f32, tiles: usize| {
-            // The cast saturates, so huge and negative extents end at the image's border.
+            // The cast saturates, which clips huge and negative extents to the image.
             let first = ((centre - half - 0.5) / TILE as f32).max(0.0) as usize;
             let last = ((centre + half - 0.5) / TILE as f32).max(0.0) as usize;
             first..(last + 1).min(tiles)
@@ -191,10 +192,10 @@ fn emit_lanes<L: Lanes>(records: &[Projected], first_rank: u32, tiles: (usize, u
         let columns = span(r[at::X], r[at::HALF_WIDTH], tiles.0);
         let rows = span(r[at::Y], r[at::HALF_HEIGHT], tiles.1);
         let (a, b, c) = (L::splat(r[at::A]), L::splat(r[at::B]), L::splat(r[at::C]));
-        // Where the exponent is largest on a vertical (times x) and on a horizontal line (times y).
+        // Position of the largest exponent on a vertical line (times x) and on a horizontal line (times y).
         let on_column = L::splat(-r[at::A] * r[at::B] / (r[at::B] * r[at::B] + r[at::C] * r[at::C]));
         let on_row = L::splat(-r[at::B] / r[at::A]);
-        // The exponent must reach log2(α_min); a little slack, as the rasterizer tests each pixel anyway.
+        // The exponent must reach log2(α_min). The slack covers rounding; the rasterizer tests each pixel itself.
         let reach = L::splat(r[at::LOG2_OPACITY] - crate::ALPHA_MIN.log2() + 1e-3);
         for row in rows {
             let y0 = block_y + L::splat((row * TILE) as f32 - r[at::Y]);
@@ -214,7 +215,8 @@ fn emit_lanes<L: Lanes>(records: &[Projected], first_rank: u32, tiles: (usize, u
                 let blocks = on_vertical.min(on_horizontal).le(reach);
                 if blocks != 0 {
                     let tile = (row * tiles.0 + column) as u32;
-                    out.pairs.push((tile, Pair { rank: first_rank + n as u32, blocks, own: r[at::OWN] > 0.0 }));
+                    out.pairs
+                        .push((tile, Pair { rank: first_rank + n as u32, blocks, trainable: r[at::TRAINABLE] > 0.0 }));
                 }
             }
         }

@@ -1,39 +1,43 @@
-//! The CPU backend: SIMD chosen at run time, rayon over chunks of splats and bands of tiles.
+//! The CPU backend: SIMD kernels selected at run time, rayon over chunks of splats and rows of tiles.
 //!
-//! Data flow of a view, one array a stage:
+//! Data flow of a view; every arrow is an array:
 //! ```text
 //! splats ─project→ records ─sort→ order ─bin→ pairs per tile ─rasterize→ frame
 //! upstream ─rasterize_backward→ moments per pair ─reduce→ moments per splat ─project_backward→ gradients
 //! ```
-//! Every reduction runs in the order of the data, not of the threads, so results do not depend on their number. Threads take one chunk or band at
-//! a time (`with_max_len(1)`): left to itself, rayon hands out quarters of a picture, and whoever has the lighter one waits.
+//! Every reduction runs in the order of the data, so results do not depend on the number of threads. `with_max_len(1)` makes threads take
+//! one chunk or tile row at a time: rayon's default split into a few large ranges balances the load badly.
 
 mod bin;
 pub mod ceiling;
-mod contribute;
-mod deal;
-mod moments;
+mod contributions;
+mod counting_sort;
+mod intermediates;
 mod project;
 mod project_backward;
 mod rasterize;
+mod rasterize_backward;
 mod sh;
 pub mod simd;
+mod tile;
 
 use rayon::prelude::*;
 use scene::{Camera, Splats};
 
-use crate::{Contributions, Frame, Gradients, Options, Stages, Upstream};
+use crate::{Contributions, Frame, Gradients, Options, Upstream};
 use bin::{Bins, SortScratch, TILE};
 use project::{Projected, View};
-use project_backward::Sink;
-use rasterize::{AHEAD, BackwardBand, Band, Moments, TileInput, Visited};
+use project_backward::GradientChunk;
+use rasterize::{Band, Visited};
+use rasterize_backward::BackwardBand;
 pub use simd::Isa;
 use simd::prefetch;
+use tile::{Moments, PREFETCH_DISTANCE, TileInput};
 
-/// Splats per parallel chunk; a multiple of the lanes.
+/// Splats per parallel chunk; a multiple of [`simd::LANES`].
 const CHUNK: usize = 1024;
 
-/// What a pass is made of, see the [module](self).
+/// A stage of the forward or backward pass, see the [module](self).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[allow(missing_docs)]
 pub enum Stage {
@@ -47,7 +51,7 @@ pub enum Stage {
 }
 
 impl Stage {
-    /// In their order.
+    /// All stages in order.
     pub const ALL: [Self; 7] = [
         Self::Project,
         Self::Sort,
@@ -58,7 +62,7 @@ impl Stage {
         Self::ProjectBackward,
     ];
 
-    /// Its name in every backend.
+    /// The stage's name in every backend.
     pub fn name(self) -> &'static str {
         match self {
             Self::Project => "project",
@@ -72,7 +76,7 @@ impl Stage {
     }
 }
 
-/// A renderer with its buffers, which it keeps from view to view.
+/// A renderer that reuses its buffers from view to view.
 #[derive(Debug)]
 pub struct Renderer {
     isa: Isa,
@@ -84,14 +88,14 @@ pub struct Renderer {
     bins: Bins,
     visited: Vec<Visited>,
     moments: Vec<Moments>,
-    /// Rank of each splat in depth order; only those of seen splats mean anything.
+    /// Rank of each splat in depth order; defined for visible splats only.
     rank: Vec<u32>,
     sums: Vec<Moments>,
     gradients: Gradients,
     contributions: Contributions,
     frame: Frame,
-    /// What the last `forward` drew, for `backward`.
-    drawn: Option<(View, Options, usize)>,
+    /// View, options and number of trainable splats of the last `forward`.
+    last_forward: Option<(View, Options, usize)>,
 }
 
 impl Default for Renderer {
@@ -118,22 +122,22 @@ impl Renderer {
             gradients: Gradients::default(),
             contributions: Contributions::default(),
             frame: Frame::default(),
-            drawn: None,
+            last_forward: None,
         }
     }
 
-    /// "cpu-avx512", "cpu-avx2" or "cpu-portable".
+    /// The backend's name: "cpu-avx512", "cpu-avx2" or "cpu-portable".
     pub fn name(&self) -> String {
         format!("cpu-{}", self.isa.name())
     }
 
-    /// Draws the trainable splats and, with them, a frozen context.
+    /// Draws the trainable splats together with a frozen context.
     pub fn forward(&mut self, splats: &Splats, context: Option<&Splats>, camera: &Camera, options: &Options) -> &Frame {
-        self.forward_watched(splats, context, camera, options, &mut |_| ())
+        self.forward_timed(splats, context, camera, options, &mut |_| ())
     }
 
-    /// As [`forward`](Self::forward); `done` is called after each stage, for whoever has a clock.
-    pub fn forward_watched(
+    /// As [`forward`](Self::forward); calls `done` after each stage, for timing.
+    pub fn forward_timed(
         &mut self,
         splats: &Splats,
         context: Option<&Splats>,
@@ -143,7 +147,7 @@ impl Renderer {
     ) -> &Frame {
         let options = Options { sh_degree: options.sh_degree.min(splats.sh_degree()), ..*options };
         let view = View::new(camera);
-        self.drawn = Some((view, options, splats.len()));
+        self.last_forward = Some((view, options, splats.len()));
         self.project(splats, context, &view, &options);
         done(Stage::Project);
         bin::sort_by_depth(&self.records, &self.seen, &mut self.order, &mut self.sort);
@@ -160,32 +164,32 @@ impl Renderer {
         &self.frame
     }
 
-    /// The last frame drawn.
+    /// The frame of the last [`forward`](Self::forward).
     pub fn frame(&self) -> &Frame {
         &self.frame
     }
 
-    /// Gradients of the trainable splats of the last [`forward`](Self::forward), whose splats must be passed again
+    /// Gradients of the trainable splats of the last [`forward`](Self::forward). `splats` must be those of the forward pass,
     /// unchanged.
     ///
     /// # Panics
-    /// Without a forward pass before, or with another number of splats: both are errors of the caller.
+    /// Without a forward pass before, or with another number of splats.
     pub fn backward(&mut self, splats: &Splats, upstream: &Upstream) -> &mut Gradients {
-        self.backward_watched(splats, upstream, &mut |_| ())
+        self.backward_timed(splats, upstream, &mut |_| ())
     }
 
-    /// As [`backward`](Self::backward); `done` is called after each stage, for whoever has a clock.
+    /// As [`backward`](Self::backward); calls `done` after each stage, for timing.
     ///
     /// # Panics
     /// As `backward`.
-    pub fn backward_watched(
+    pub fn backward_timed(
         &mut self,
         splats: &Splats,
         upstream: &Upstream,
         done: &mut dyn FnMut(Stage),
     ) -> &mut Gradients {
-        let (view, options, count) = self.drawn.expect("backward follows forward");
-        assert_eq!(count, splats.len(), "backward needs the splats that forward drew");
+        let (view, options, count) = self.last_forward.expect("backward follows forward");
+        assert_eq!(count, splats.len(), "backward needs the splats of the forward pass");
         self.rasterize_backward(upstream);
         done(Stage::RasterizeBackward);
         self.reduce(count);
@@ -195,40 +199,24 @@ impl Renderer {
         &mut self.gradients
     }
 
-    /// The last gradients.
+    /// The gradients of the last [`backward`](Self::backward).
     pub fn gradients(&self) -> &Gradients {
         &self.gradients
     }
 
-    /// Pairs of splat and tile in the last view: what the rasterizer's time is proportional to.
+    /// Number of (splat, tile) pairs of the last view; the rasterizer's time is roughly proportional to it.
     pub fn pairs(&self) -> usize {
         self.bins.pairs.len()
     }
 
-    /// What the stages before `rasterize` came to in the last view.
-    pub fn stages(&self) -> Stages {
-        let own = self.drawn.map_or(0, |(.., own)| own as u32);
-        let first_context = own.next_multiple_of(simd::LANES as u32);
-        let record = |Projected(r): &Projected| {
-            use project::at::{A, B, BLUE, C, GREEN, HALF_HEIGHT, HALF_WIDTH, LOG2_OPACITY, RED, X, Y, Z};
-            [X, Y, A, B, C, LOG2_OPACITY, RED, GREEN, BLUE, Z, HALF_WIDTH, HALF_HEIGHT].map(|k| r[k])
-        };
-        Stages {
-            order: self.order.iter().map(|&i| if i < own { i } else { i - first_context + own }).collect(),
-            records: self.ranked.iter().map(record).collect(),
-            start: self.bins.start.clone(),
-            pairs: self.bins.pairs.iter().map(|pair| pair.rank).collect(),
-        }
-    }
-
-    /// Blocks of 4×4 pixels that the rasterizer visited in the last view, each for one splat: what its arithmetic is
-    /// proportional to. The backward pass visits the same.
+    /// Number of (splat, 4×4 pixel block) combinations that the rasterizer evaluated in the last view, for counting its operations. The
+    /// backward pass evaluates the same ones.
     pub fn visits(&self) -> u64 {
         self.visited.iter().map(|tile| u64::from(tile.blocks)).sum()
     }
 
     fn project(&mut self, splats: &Splats, context: Option<&Splats>, view: &View, options: &Options) {
-        // Context records start at a whole group of lanes.
+        // Context records start at a multiple of LANES.
         let first_context = splats.len().next_multiple_of(simd::LANES);
         let total = first_context + context.map_or(0, Splats::len);
         self.records.resize(total, Projected::default());
@@ -263,21 +251,21 @@ impl Renderer {
         frame.transmittance.resize(area, 0.0);
         let extra = if options.extras { area } else { 0 };
         frame.depth.resize(extra, 0.0);
-        frame.own.resize(extra, 0.0);
+        frame.trainable_alpha.resize(extra, 0.0);
 
         let rows = TILE * width;
         let mut colour = frame.colour.chunks_mut(area.max(1)).map(|plane| plane.chunks_mut(rows));
         let mut next_colour = || colour.next().expect("three colour planes");
         let (red, green, blue) = (next_colour(), next_colour(), next_colour());
         let mut depth = frame.depth.chunks_mut(rows);
-        let mut own = frame.own.chunks_mut(rows);
+        let mut trainable_alpha = frame.trainable_alpha.chunks_mut(rows);
         self.visited.resize(self.bins.tiles_x * self.bins.tiles_y, Visited::default());
         let bands: Vec<_> = (red.zip(green).zip(blue).zip(frame.transmittance.chunks_mut(rows)))
             .map(|(((red, green), blue), transmittance)| Band {
                 colour: [red, green, blue],
                 transmittance,
                 depth: depth.next().unwrap_or_default(),
-                own: own.next().unwrap_or_default(),
+                trainable_alpha: trainable_alpha.next().unwrap_or_default(),
             })
             .collect();
         let (bins, ranked, isa) = (&self.bins, &self.ranked, self.isa);
@@ -302,13 +290,13 @@ impl Renderer {
             frame.width,
             frame.height,
             |row, tile, out| {
-                rasterize::rasterize_backward(isa, tile, &BackwardBand::new(frame, upstream, row), out);
+                rasterize_backward::rasterize_backward(isa, tile, &BackwardBand::new(frame, upstream, row), out);
             },
         );
     }
 
-    /// Adds up the pairs of each splat, in the order of its tiles. Splats are taken by depth, as pairs are numbered: only the pairs' own
-    /// places then lie anywhere, and those are known ahead.
+    /// Sums the moments of each splat's pairs, in the order of its tiles. Splats are processed in depth order, which is the order of the
+    /// emission numbers: then only the moments are gathered from scattered positions, and these are known ahead for prefetching.
     fn reduce(&mut self, count: usize) {
         self.rank_splats();
         self.sums.resize(self.order.len(), Moments::default());
@@ -319,9 +307,12 @@ impl Renderer {
                 let mut total = [0.0f32; 16];
                 let pairs = bins.emitted[rank] as usize..bins.emitted[rank + 1] as usize;
                 for pair in pairs {
-                    let ahead = bins.place.get(pair + AHEAD).and_then(|&place| moments.get(place as usize));
+                    let ahead = bins
+                        .position
+                        .get(pair + PREFETCH_DISTANCE)
+                        .and_then(|&position| moments.get(position as usize));
                     ahead.into_iter().for_each(prefetch);
-                    for (total, value) in total.iter_mut().zip(&moments[bins.place[pair] as usize].0) {
+                    for (total, value) in total.iter_mut().zip(&moments[bins.position[pair] as usize].0) {
                         *total += value;
                     }
                 }
@@ -330,6 +321,7 @@ impl Renderer {
         });
     }
 
+    /// Fills `rank`, the inverse of `order`.
     fn rank_splats(&mut self) {
         self.rank.resize(self.records.len(), 0);
         for (rank, &i) in self.order.iter().enumerate() {
@@ -341,33 +333,40 @@ impl Renderer {
         let n = splats.len();
         let out = &mut self.gradients;
         out.columns.resize(splats.columns().len(), Vec::new());
-        for column in out.columns.iter_mut().chain([&mut out.screen, &mut out.screen_abs, &mut out.weight]) {
+        for column in
+            out.columns.iter_mut().chain([&mut out.screen_gradient, &mut out.screen_gradient_abs, &mut out.weight])
+        {
             column.resize(n, 0.0);
         }
         let words = n.div_ceil(simd::LANES);
         out.seen.clear();
         out.seen.extend_from_slice(&self.seen[..words]);
-        // Coefficients above the degree in use are not touched: their columns stay out of the sinks.
+        // Columns of coefficients above the degree in use are not written.
         let used = scene::column::SH + 3 * scene::splats::sh_coefficients(options.sh_degree);
-        let mut sinks: Vec<Sink> = (out
-            .screen
+        let mut chunks: Vec<GradientChunk> = (out
+            .screen_gradient
             .chunks_mut(CHUNK)
-            .zip(out.screen_abs.chunks_mut(CHUNK))
+            .zip(out.screen_gradient_abs.chunks_mut(CHUNK))
             .zip(out.weight.chunks_mut(CHUNK)))
-        .map(|((screen, screen_abs), weight)| Sink { columns: Vec::with_capacity(used), screen, screen_abs, weight })
+        .map(|((screen_gradient, screen_gradient_abs), weight)| GradientChunk {
+            columns: Vec::with_capacity(used),
+            screen_gradient,
+            screen_gradient_abs,
+            weight,
+        })
         .collect();
         for column in &mut out.columns[..used] {
-            for (sink, chunk) in sinks.iter_mut().zip(column.chunks_mut(CHUNK)) {
-                sink.columns.push(chunk);
+            for (chunk, column) in chunks.iter_mut().zip(column.chunks_mut(CHUNK)) {
+                chunk.columns.push(column);
             }
         }
         let (isa, seen, sums, rank) = (self.isa, &self.seen, &self.sums, &self.rank);
-        let poses: Vec<[f32; 6]> = (sinks.par_iter_mut().enumerate().with_max_len(1))
-            .map(|(chunk, sink)| {
-                let first = chunk * CHUNK;
+        let poses: Vec<[f32; 6]> = (chunks.par_iter_mut().enumerate().with_max_len(1))
+            .map(|(n_chunk, chunk)| {
+                let first = n_chunk * CHUNK;
                 let rank = &rank[first..(first + CHUNK).min(n)];
                 let seen = &seen[first / simd::LANES..];
-                project_backward::project_backward(isa, splats, first, view, options, seen, rank, sums, sink)
+                project_backward::project_backward(isa, splats, first, view, options, seen, rank, sums, chunk)
             })
             .collect();
         out.pose = [0.0; 6];
@@ -380,8 +379,8 @@ impl Renderer {
 }
 
 impl Bins {
-    /// Calls `work(row of tiles, tile, entries)` for every tile, in parallel over rows; entries that lie after the last pair
-    /// a tile visited are cleared.
+    /// Calls `work(tile row, tile, moments)` for every tile, in parallel over tile rows. `moments` are those of the pairs that the
+    /// forward pass visited; the moments of the tile's other pairs are set to zero.
     fn for_each_tile(
         &self,
         ranked: &[Projected],
@@ -392,7 +391,7 @@ impl Bins {
         work: impl Fn(usize, &TileInput, &mut [Moments]) + Sync,
     ) {
         moments.resize(self.pairs.len(), Moments::default());
-        // The pairs of a band of tiles lie together, so bands write disjoint slices.
+        // The pairs of a tile row are contiguous, so tile rows write disjoint slices.
         let mut rest = moments.as_mut_slice();
         let mut bands = Vec::with_capacity(self.tiles_y);
         for row in 0..self.tiles_y {
@@ -407,8 +406,8 @@ impl Bins {
                 let pairs = &self.pairs[self.start[tile] as usize..self.start[tile + 1] as usize];
                 let (out, after) = std::mem::take(&mut moments).split_at_mut(pairs.len());
                 moments = after;
-                let (out, unseen) = out.split_at_mut(visited[tile].pairs as usize);
-                unseen.fill(Moments::default());
+                let (out, unvisited) = out.split_at_mut(visited[tile].pairs as usize);
+                unvisited.fill(Moments::default());
                 let pairs = &pairs[..out.len()];
                 let input = TileInput { ranked, pairs, x: column * TILE, y: row * TILE, width, height };
                 work(row, &input, out);

@@ -1,44 +1,44 @@
-//! Stage `project`: splats in the world become ellipses in the view, sixteen at a time.
+//! Stage `project`: EWA projection of splats to ellipses in the view, sixteen at a time.
 //!
-//! EWA splatting (Zwicker et al. 2001) as gsplat does it: `Σ' = A Aᵀ + 0.3·I` with `A = J W R S`, the Jacobian taken at
-//! the centre, clamped to the view's cone plus 15 %. Colour is evaluated here, once per splat and view.
+//! EWA splatting (Zwicker et al. 2001) with gsplat's conventions: `Σ' = A Aᵀ + 0.3·I` with `A = J W R S`. The Jacobian J is taken at the
+//! centre, clamped to the view plus 15 %. SH colour is evaluated here, once per splat and view.
 
 use scene::{Camera, Splats, column};
 
 use super::sh;
 use super::simd::{LANES, Lanes, prefetch};
-use crate::{ALPHA_MIN, BLUR, NEAR_METRES, Options, each, kernel};
+use crate::{ALPHA_MIN, LOW_PASS, NEAR_METRES, Options, kernel, unroll};
 
-/// Places of the values in a [`Projected`] record.
+/// Indices of the values in a [`Projected`] record.
 pub(crate) mod at {
     /// Mean in pixels.
     pub(crate) const X: usize = 0;
     pub(crate) const Y: usize = 1;
-    /// The conic's Cholesky factor, for exponents of two: α = 2^(LOG2_OPACITY - (A dx + B dy)² - (C dy)²). The conic itself
-    /// would cancel along needles: its error grows with the square of their length.
+    /// Cholesky factor of the conic, scaled for base 2: α = 2^(LOG2_OPACITY - (A dx + B dy)² - (C dy)²). Evaluating the conic itself
+    /// cancels along needles: its error grows with the square of their length.
     pub(crate) const A: usize = 2;
     pub(crate) const B: usize = 3;
     pub(crate) const C: usize = 4;
     pub(crate) const LOG2_OPACITY: usize = 5;
-    /// Colour, clamped from below at 0.
+    /// Colour, clamped below at 0.
     pub(crate) const RED: usize = 6;
     pub(crate) const GREEN: usize = 7;
     pub(crate) const BLUE: usize = 8;
     /// Depth in metres.
     pub(crate) const Z: usize = 9;
     /// 1 for trainable splats, 0 for context.
-    pub(crate) const OWN: usize = 10;
-    /// Half extents in pixels of the ellipse at α = 1/255.
+    pub(crate) const TRAINABLE: usize = 10;
+    /// Half extents of the ellipse at α = 1/255, pixels.
     pub(crate) const HALF_WIDTH: usize = 11;
     pub(crate) const HALF_HEIGHT: usize = 12;
 }
 
-/// A splat in a view: one cache line.
+/// A projected splat: one cache line.
 #[derive(Debug, Clone, Copy, Default)]
 #[repr(C, align(64))]
 pub(crate) struct Projected(pub(crate) [f32; 16]);
 
-/// A camera in single precision with what the kernels want of it.
+/// A camera in single precision.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct View {
     pub(crate) rotation: [[f32; 3]; 3],
@@ -47,7 +47,7 @@ pub(crate) struct View {
     pub(crate) focal: [f32; 2],
     pub(crate) principal: [f32; 2],
     pub(crate) size: [f32; 2],
-    /// Bounds of x/z and y/z within which the Jacobian is taken.
+    /// Bounds of x/z and y/z in the Jacobian.
     pub(crate) cone_min: [f32; 2],
     pub(crate) cone_max: [f32; 2],
 }
@@ -74,34 +74,36 @@ impl View {
     }
 }
 
-/// Everything between a splat's columns and its conic that the backward pass needs again.
+/// Values between a splat's columns and its conic that the backward pass recomputes.
 pub(crate) struct Ewa<L> {
     pub(crate) inv_z: L,
-    /// Clamped x/z, y/z of the Jacobian.
+    /// x/z and y/z in the Jacobian, clamped.
     pub(crate) u: [L; 2],
-    /// Lanes whose x/z (y/z) was not clamped.
-    pub(crate) free: [u16; 2],
+    /// Mask of the lanes whose x/z (y/z) is not clamped.
+    pub(crate) unclamped: [u16; 2],
     /// Normalised quaternion and 1 / its length.
     pub(crate) quat: [L; 4],
     pub(crate) inv_norm: L,
-    /// Rotation columns times scale: `m[k]` is the k-th axis.
+    /// `R S`: `axes[k]` is the k-th principal axis, that is rotation column times scale.
     pub(crate) axes: [[L; 3]; 3],
     pub(crate) scale: [L; 3],
-    /// `J W`, two rows.
+    /// The two rows of `T = J W`.
     pub(crate) t: [[L; 3]; 2],
     /// `A = T · axes`: `a[k]` is the k-th column.
     pub(crate) a: [[L; 2]; 3],
-    /// xx, xy, yy of the covariance before blur, and determinants before and after.
+    /// xx, xy, yy of the covariance before the low-pass filter.
     pub(crate) cov: [L; 3],
+    /// Determinant before the low-pass filter.
     pub(crate) det0: L,
+    /// Determinant after the low-pass filter.
     pub(crate) det1: L,
 }
 
-/// Centre of sixteen splats in camera axes.
+/// Centres of sixteen splats in the camera frame.
 #[inline(always)]
 pub(crate) fn camera_point<L: Lanes>(splats: &Splats, i: usize, view: &View) -> [L; 3] {
-    let m = each!(k in [0, 1, 2] => L::load_from(splats.col(column::MEAN + k), i, 0.0));
-    each!(r in [0, 1, 2] => {
+    let m = unroll!(k in [0, 1, 2] => L::load_from(splats.col(column::MEAN + k), i, 0.0));
+    unroll!(r in [0, 1, 2] => {
         let row = &view.rotation[r];
         let moved = m[2].fma(L::splat(row[2]), L::splat(view.translation[r]));
         m[0].fma(L::splat(row[0]), m[1].fma(L::splat(row[1]), moved))
@@ -114,45 +116,45 @@ pub(crate) fn ewa<L: Lanes>(splats: &Splats, i: usize, view: &View, p: [L; 3]) -
     let (one, two) = (L::splat(1.0), L::splat(2.0));
     let inv_z = one / p[2].max(L::splat(NEAR_METRES));
     let mut u = [L::zero(); 2];
-    let mut free = [0; 2];
+    let mut unclamped = [0; 2];
     for d in 0..2 {
         let ratio = p[d] * inv_z;
         u[d] = ratio.max(L::splat(view.cone_min[d])).min(L::splat(view.cone_max[d]));
-        free[d] = ratio.le(u[d]) & u[d].le(ratio);
+        unclamped[d] = ratio.le(u[d]) & u[d].le(ratio);
     }
 
-    let q = each!(c in [0, 1, 2, 3] => L::load_from(splats.col(column::QUAT + c), i, 1.0));
+    let q = unroll!(c in [0, 1, 2, 3] => L::load_from(splats.col(column::QUAT + c), i, 1.0));
     let norm2 = q[0].fma(q[0], q[1].fma(q[1], q[2].fma(q[2], q[3] * q[3])));
     let inv_norm = one / norm2.max(L::splat(1e-24)).sqrt();
-    let quat = each!(c in [0, 1, 2, 3] => q[c] * inv_norm);
+    let quat = unroll!(c in [0, 1, 2, 3] => q[c] * inv_norm);
     let [w, x, y, z] = quat;
     let rotation = [
         [one - two * (y * y + z * z), two * (x * y + w * z), two * (x * z - w * y)],
         [two * (x * y - w * z), one - two * (x * x + z * z), two * (y * z + w * x)],
         [two * (x * z + w * y), two * (y * z - w * x), one - two * (x * x + y * y)],
     ]; // by columns
-    let scale = each!(c in [0, 1, 2] => {
+    let scale = unroll!(c in [0, 1, 2] => {
         (L::load_from(splats.col(column::LOG_SCALE + c), i, 0.0) * L::splat(std::f32::consts::LOG2_E)).exp2()
     });
-    let axes = each!(c in [0, 1, 2] => each!(j in [0, 1, 2] => rotation[c][j] * scale[c]));
+    let axes = unroll!(c in [0, 1, 2] => unroll!(j in [0, 1, 2] => rotation[c][j] * scale[c]));
 
     let w = &view.rotation;
-    let t = each!(r in [0, 1] => {
+    let t = unroll!(r in [0, 1] => {
         let j0 = L::splat(view.focal[r]) * inv_z;
         let j2 = -(j0 * u[r]);
-        each!(c in [0, 1, 2] => j0.fma(L::splat(w[r][c]), j2 * L::splat(w[2][c])))
+        unroll!(c in [0, 1, 2] => j0.fma(L::splat(w[r][c]), j2 * L::splat(w[2][c])))
     });
-    let a = each!(c in [0, 1, 2] => each!(r in [0, 1] => dot(t[r], axes[c])));
+    let a = unroll!(c in [0, 1, 2] => unroll!(r in [0, 1] => dot(t[r], axes[c])));
     let cov = [
         a[0][0].fma(a[0][0], a[1][0].fma(a[1][0], a[2][0] * a[2][0])),
         a[0][0].fma(a[0][1], a[1][0].fma(a[1][1], a[2][0] * a[2][1])),
         a[0][1].fma(a[0][1], a[1][1].fma(a[1][1], a[2][1] * a[2][1])),
     ];
-    // A sum of squares (Cauchy and Binet), as xx·yy - xy² would cancel in needles.
-    let minors = each!(c in [0, 1, 2] => a[c][0] * a[(c + 1) % 3][1] - a[c][1] * a[(c + 1) % 3][0]);
+    // A sum of squares (Cauchy-Binet), as xx·yy - xy² cancels for needles.
+    let minors = unroll!(c in [0, 1, 2] => a[c][0] * a[(c + 1) % 3][1] - a[c][1] * a[(c + 1) % 3][0]);
     let det0 = dot(minors, minors);
-    let det1 = L::splat(BLUR).fma(cov[0] + cov[2] + L::splat(BLUR), det0);
-    Ewa { inv_z, u, free, quat, inv_norm, axes, scale, t, a, cov, det0, det1 }
+    let det1 = L::splat(LOW_PASS).fma(cov[0] + cov[2] + L::splat(LOW_PASS), det0);
+    Ewa { inv_z, u, unclamped, quat, inv_norm, axes, scale, t, a, cov, det0, det1 }
 }
 
 #[inline(always)]
@@ -163,9 +165,9 @@ pub(crate) fn dot<L: Lanes>(a: [L; 3], b: [L; 3]) -> L {
 /// Unit directions from the camera's centre to sixteen splats, and 1 / distance.
 #[inline(always)]
 pub(crate) fn directions<L: Lanes>(splats: &Splats, i: usize, view: &View) -> ([L; 3], L) {
-    let v = each!(c in [0, 1, 2] => L::load_from(splats.col(column::MEAN + c), i, 0.0) - L::splat(view.centre[c]));
+    let v = unroll!(c in [0, 1, 2] => L::load_from(splats.col(column::MEAN + c), i, 0.0) - L::splat(view.centre[c]));
     let inv = L::splat(1.0) / dot(v, v).max(L::splat(1e-24)).sqrt();
-    (each!(c in [0, 1, 2] => v[c] * inv), inv)
+    (unroll!(c in [0, 1, 2] => v[c] * inv), inv)
 }
 
 /// Opacity of sixteen splats.
@@ -177,10 +179,10 @@ pub(crate) fn opacity<L: Lanes>(splats: &Splats, i: usize) -> L {
 }
 
 kernel!(
-    /// Projects splats `first .. first + out.len()` (a multiple of 16 but for the last chunk) into `out`; sets bit `i % 16`
-    /// of `seen[i / 16]` for those that touch the image.
+    /// Projects splats `first .. first + out.len()` into `out`; the length is a multiple of 16 except in the last chunk. Sets bit
+    /// `i % 16` of `seen[i / 16]` for visible splats.
     pub(crate) fn project(
-        splats: &Splats, first: usize, view: &View, options: &Options, own: f32, out: &mut [Projected], seen: &mut [u16],
+        splats: &Splats, first: usize, view: &View, options: &Options, trainable: f32, out: &mut [Projected], seen: &mut [u16],
     ) = project_lanes
 );
 
@@ -190,23 +192,24 @@ fn project_lanes<L: Lanes>(
     first: usize,
     view: &View,
     options: &Options,
-    own: f32,
+    trainable: f32,
     out: &mut [Projected],
     seen: &mut [u16],
 ) {
     for (group, (out, seen)) in out.chunks_mut(LANES).zip(seen.iter_mut()).enumerate() {
-        *seen = project_group::<L>(splats, first + group * LANES, view, options, own, out);
+        *seen = project_group::<L>(splats, first + group * LANES, view, options, trainable, out);
     }
 }
 
-/// Which of sixteen splats may touch the image, at a fraction of what knowing costs: as far as opaque balls of their largest
-/// scale reach. Splats near in space are near in memory, so that most groups beside a window end here.
+/// Conservative visibility of sixteen splats: each is treated as an opaque sphere of its largest scale. Splats are in Morton order, so
+/// this cheap test rejects most groups outside the view as a whole.
 #[inline(always)]
 fn near_image<L: Lanes>(splats: &Splats, i: usize, view: &View, p: [L; 3]) -> u16 {
-    /// √(2 ln(1 / ALPHA_MIN)), and that times √BLUR, with a little to spare for rounding.
+    /// √(2 ln(1 / ALPHA_MIN)), with a margin for rounding.
     const SIGMAS: f32 = 3.34;
-    const BLUR_PIXELS: f32 = 1.9;
-    let log_scale = each!(c in [0, 1, 2] => L::load_from(splats.col(column::LOG_SCALE + c), i, 0.0));
+    /// The same times √LOW_PASS.
+    const LOW_PASS_PIXELS: f32 = 1.9;
+    let log_scale = unroll!(c in [0, 1, 2] => L::load_from(splats.col(column::LOG_SCALE + c), i, 0.0));
     let largest = log_scale[0].max(log_scale[1]).max(log_scale[2]);
     let reach = (largest * L::splat(std::f32::consts::LOG2_E)).exp2() * L::splat(SIGMAS);
     let inv_z = L::splat(1.0) / p[2].max(L::splat(NEAR_METRES));
@@ -215,8 +218,8 @@ fn near_image<L: Lanes>(splats: &Splats, i: usize, view: &View, p: [L; 3]) -> u1
         let ratio = p[d] * inv_z;
         let u = ratio.max(L::splat(view.cone_min[d])).min(L::splat(view.cone_max[d]));
         let focal = L::splat(view.focal[d]);
-        // A row of `J W` is f/z √(1 + u²) long.
-        let half = (focal * inv_z * reach).fma(L::splat(1.0) + u.abs(), L::splat(BLUR_PIXELS));
+        // A row of `J W` has norm f/z √(1 + u²).
+        let half = (focal * inv_z * reach).fma(L::splat(1.0) + u.abs(), L::splat(LOW_PASS_PIXELS));
         let centre = focal.fma(ratio, L::splat(view.principal[d]));
         near &= (centre - half).le(L::splat(view.size[d])) & L::zero().le(centre + half);
     }
@@ -229,7 +232,7 @@ fn project_group<L: Lanes>(
     i: usize,
     view: &View,
     options: &Options,
-    own: f32,
+    trainable: f32,
     out: &mut [Projected],
 ) -> u16 {
     let lanes_in_use = if out.len() >= LANES { u16::MAX } else { (1 << out.len()) - 1 };
@@ -238,7 +241,7 @@ fn project_group<L: Lanes>(
     if in_front == 0 || in_front & near_image(splats, i, view, p) == 0 {
         return 0;
     }
-    // More columns than a core expects to walk at once.
+    // The hardware prefetcher does not track this many columns.
     let used = column::SH + 3 * scene::splats::sh_coefficients(options.sh_degree);
     splats.columns()[..used].iter().filter_map(|column| column.get(i + LANES - 1)).for_each(prefetch);
     let e = ewa(splats, i, view, p);
@@ -248,15 +251,15 @@ fn project_group<L: Lanes>(
         opacity = opacity * (e.det0 * inv_det).sqrt();
     }
     let reach = (opacity * L::splat(1.0 / ALPHA_MIN)).map(f32::ln) * L::splat(2.0); // -2 ln(α_min / o): squared radius in sigmas
-    let (var_x, var_y) = (e.cov[0] + L::splat(BLUR), e.cov[2] + L::splat(BLUR));
+    let (var_x, var_y) = (e.cov[0] + L::splat(LOW_PASS), e.cov[2] + L::splat(LOW_PASS));
     let half_width = (reach * var_x).max(L::zero()).sqrt();
     let half_height = (reach * var_y).max(L::zero()).sqrt();
     let x = L::splat(view.focal[0]) * p[0] * e.inv_z + L::splat(view.principal[0]);
     let y = L::splat(view.focal[1]) * p[1] * e.inv_z + L::splat(view.principal[1]);
-    // `exp2` turns NaN into a number, so scales and opacity are looked at themselves.
-    let scales = each!(c in [0, 1, 2] => L::load_from(splats.col(column::LOG_SCALE + c), i, 0.0).abs());
+    // `exp2` turns NaN into a number, so scales and opacity are tested themselves.
+    let scales = unroll!(c in [0, 1, 2] => L::load_from(splats.col(column::LOG_SCALE + c), i, 0.0).abs());
     let logit = L::load_from(splats.col(column::OPACITY), i, 0.0).abs();
-    // A pixel is touched when its centre lies in the box; NaN fails every comparison and is culled.
+    // The bounding box must contain a pixel centre. NaN fails every comparison and is culled.
     let seen = in_front
         & (scales[0] + scales[1] + scales[2] + logit).lt(L::splat(f32::MAX))
         & L::zero().lt(reach)
@@ -271,7 +274,7 @@ fn project_group<L: Lanes>(
     }
 
     let (c0, half) = (L::splat(scene::splats::SH_C0), L::splat(0.5));
-    let mut colour = each!(c in [0, 1, 2] => L::load_from(splats.col(column::SH + c), i, 0.0).fma(c0, half));
+    let mut colour = unroll!(c in [0, 1, 2] => L::load_from(splats.col(column::SH + c), i, 0.0).fma(c0, half));
     if options.sh_degree > 0 {
         let ([dx, dy, dz], _) = directions::<L>(splats, i, view);
         let basis = sh::basis(options.sh_degree, dx, dy, dz);
@@ -281,10 +284,10 @@ fn project_group<L: Lanes>(
             }
         }
     }
-    // Colours that are not finite, or absurd, would poison whole pixels: such splats are culled.
-    let absurd = L::splat(1e6);
-    let seen = seen & colour[0].abs().lt(absurd) & colour[1].abs().lt(absurd) & colour[2].abs().lt(absurd);
-    let colour = each!(c in [0, 1, 2] => colour[c].max(L::zero()));
+    // Non-finite or huge colours would corrupt whole pixels: such splats are culled.
+    let max_colour = L::splat(1e6);
+    let seen = seen & colour[0].abs().lt(max_colour) & colour[1].abs().lt(max_colour) & colour[2].abs().lt(max_colour);
+    let colour = unroll!(c in [0, 1, 2] => colour[c].max(L::zero()));
 
     let half_log2e = L::splat(0.5 * std::f32::consts::LOG2_E);
     let inv_std_y = (half_log2e / var_y).sqrt();
@@ -300,7 +303,7 @@ fn project_group<L: Lanes>(
         colour[1],
         colour[2],
         p[2],
-        L::splat(own),
+        L::splat(trainable),
         half_width,
         half_height,
     ];

@@ -1,20 +1,23 @@
-//! The way back: from a frame's gradient to the splats'.
+//! The backward pass: from the gradient of a frame to the gradients of the splats.
 
-use super::*;
+use shaders::{MOMENTS, args};
 
-/// How the pairs of a splat with its tiles are added up.
+use super::error::GpuError;
+use super::renderer::{GpuRenderer, LastForward, UpstreamPlanes};
+use super::splats::GpuSplats;
+
+/// How the moments of a splat's pairs are summed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Reduction {
-    /// In the order of its tiles: the same bits every time.
-    InOrder,
-    /// By atomics, in whatever order the tiles are done: other bits every time. What the order is measured against; nothing goes on
-    /// from it.
-    ByAtomics,
+    /// In the order of its tiles: bit-identical from run to run.
+    Ordered,
+    /// By atomic additions in any order: not reproducible. Only a baseline for measurements; no training uses it.
+    Atomic,
 }
 
 impl GpuRenderer {
-    /// Gradients of the trainable splats of the last [`forward`](Self::forward), summed over its views, whose splats must be passed again
-    /// unchanged, from what lies in [`upstream`](Self::upstream). The pose has none here.
+    /// Encodes a backward pass of the last [`forward`](Self::forward): gradients of the trainable splats, summed over its views, from
+    /// the content of [`upstream`](Self::upstream). `splats` must be those of the forward pass, unchanged. There is no pose gradient.
     ///
     /// # Errors
     /// Without a forward pass before, or with another number of splats; and as `forward`.
@@ -24,12 +27,12 @@ impl GpuRenderer {
         splats: &GpuSplats,
         planes: UpstreamPlanes,
     ) -> Result<(), GpuError> {
-        let Some(Drawn { set, .. }) = self.drawn.filter(|drawn| drawn.set.count as usize == splats.len()) else {
-            return Err(GpuError::Failed("backward needs the splats that forward drew".into()));
+        let same_splats = |last: &LastForward| last.set.count as usize == splats.len();
+        let Some(LastForward { set, .. }) = self.last_forward.filter(same_splats) else {
+            return Err(GpuError::Failed("backward needs the splats of the last forward pass".into()));
         };
-        self.add_up_pairs(encoder, planes, Reduction::InOrder)?;
+        self.reduce_moments(encoder, planes, Reduction::Ordered)?;
         let gpu = &*self.gpu;
-        let (status, visible) = (&*self.status, &*self.of_splats.visible);
         let pass = &mut encoder.begin_compute_pass(&wgpu::ComputePassDescriptor::default());
         let set = gpu.uniform(&set);
         let [a, b, c, d] = splats.columns().banks();
@@ -41,8 +44,8 @@ impl GpuRenderer {
             (3, d),
             (4, &self.views),
             (5, &set),
-            (6, status),
-            (7, visible),
+            (6, &*self.status),
+            (7, &*self.entries.visible),
             (8, &*self.sums),
             (9, out_a),
             (10, out_b),
@@ -50,81 +53,86 @@ impl GpuRenderer {
             (12, out_d),
             (13, &*self.statistics),
         ];
-        self.kernels.project_backward.run_indirect(gpu, pass, &bindings, &self.args, args::SEEN);
+        self.kernels.project_backward.run_indirect(gpu, pass, &bindings, &self.args, args::VISIBLE_TRAINABLE);
         Ok(())
     }
 
-    /// The stages of [`backward`](Self::backward) before `project_backward`: sums of each splat over the pixels of each of the last views.
+    /// Encodes the stages of [`backward`](Self::backward) before `project_backward`: the moments of each trainable splat in each view.
     ///
     /// # Errors
     /// Without a forward pass before; and as `forward`.
-    pub fn add_up_pairs(
+    pub fn reduce_moments(
         &mut self,
         encoder: &mut wgpu::CommandEncoder,
         planes: UpstreamPlanes,
-        how: Reduction,
+        reduction: Reduction,
     ) -> Result<(), GpuError> {
-        let Some(Drawn { views, side, .. }) = self.drawn else {
-            return Err(GpuError::Failed("there is nothing to go back from before the first forward pass".into()));
+        let Some(LastForward { views, sorted, .. }) = self.last_forward else {
+            return Err(GpuError::Failed("backward needs a forward pass before it".into()));
         };
         if planes.depth && views.extras == 0 {
             return Err(GpuError::Failed("a gradient of depth needs a forward pass with extras".into()));
         }
         let gpu = &*self.gpu;
-        let by_atomics = match how {
-            Reduction::InOrder => None,
-            Reduction::ByAtomics => {
+        let atomic_kernel = match reduction {
+            Reduction::Ordered => None,
+            Reduction::Atomic => {
                 encoder.clear_buffer(&self.sums, 0, None);
                 Some(gpu.kernel(&shaders::RASTERIZE_BACKWARD_ATOMICS, "rasterize_backward")?)
             }
         };
-        let (kernels, status, args, pairs) = (&self.kernels, &*self.status, &*self.args, &self.of_pairs);
-        let OfSplats { records, tiles: tile_counts, first, visible, .. } = &self.of_splats;
+        let (kernels, entries, pairs) = (&self.kernels, &self.entries, &self.pairs);
         let pass = &mut encoder.begin_compute_pass(&wgpu::ComputePassDescriptor::default());
-        let planes = gpu.uniform(&shaders::Planes {
+        let planes = gpu.uniform(&shaders::UpstreamPlanes {
             transmittance: planes.transmittance.into(),
             depth: planes.depth.into(),
             padding: [0; 2],
         });
-        let sums_go_to = if by_atomics.is_some() { &self.sums } else { &pairs.moments };
+        let output = if atomic_kernel.is_some() { &self.sums } else { &pairs.moments };
         let bindings = [
             (0, &self.views),
             (1, &*self.tile_ranges),
-            (2, &*pairs.sides.values[side]),
-            (3, &*pairs.splat),
-            (4, records),
+            (2, &*pairs.sort.values[sorted]),
+            (3, &*pairs.entry),
+            (4, &*entries.records),
             (5, &*self.frame),
-            (6, &*self.last),
+            (6, &*self.last_pair),
             (7, &*self.upstream),
             (8, &planes),
-            (9, &**sums_go_to),
+            (9, &**output),
         ];
-        let kernel = by_atomics.as_ref().unwrap_or(&kernels.rasterize_backward);
+        let kernel = atomic_kernel.as_ref().unwrap_or(&kernels.rasterize_backward);
         kernel.run(gpu, pass, &bindings, views.tiles);
-        if how == Reduction::InOrder {
-            let bindings: [(u32, &wgpu::Buffer); 6] =
-                [(0, status), (1, visible), (2, first), (3, tile_counts), (4, &pairs.moments), (5, &self.sums)];
-            kernels.reduce.run_indirect(gpu, pass, &bindings, args, args::SEEN_REDUCE);
+        if reduction == Reduction::Ordered {
+            let bindings: [(u32, &wgpu::Buffer); 6] = [
+                (0, &self.status),
+                (1, &entries.visible),
+                (2, &entries.first_pair),
+                (3, &entries.tiles),
+                (4, &pairs.moments),
+                (5, &self.sums),
+            ];
+            kernels.reduce.run_indirect(gpu, pass, &bindings, &self.args, args::REDUCE);
         }
         Ok(())
     }
 
-    /// What [`add_up_pairs`](Self::add_up_pairs) came to, by splat and then by view: the moments of `rasterize_backward.wgsl`, zeros where it was not
-    /// seen.
+    /// Reads the result of [`reduce_moments`](Self::reduce_moments): the moments of each entry of a trainable splat, in the order of
+    /// `rasterize_backward.wgsl`; zero where it is not visible.
     ///
     /// # Errors
-    /// What went wrong until then, or without a forward pass.
-    pub fn read_sums(&self, how: Reduction) -> Result<Vec<[f32; MOMENTS as usize]>, GpuError> {
-        let own = self.drawn.map_or(0, |drawn| drawn.views.own as usize);
-        match how {
-            Reduction::ByAtomics => self.gpu.read(&self.sums, 0, own),
-            Reduction::InOrder => {
-                let seen = self.status()?.seen as usize;
-                let places: Vec<u32> = self.gpu.read(&self.of_splats.visible, 0, seen)?;
-                let sums: Vec<[f32; MOMENTS as usize]> = self.gpu.read(&self.sums, 0, seen)?;
-                let mut by_splat = vec![[0.0; MOMENTS as usize]; own];
-                places.iter().zip(sums).for_each(|(&i, sums)| by_splat[i as usize] = sums);
-                Ok(by_splat)
+    /// Any error of the submitted work.
+    pub fn read_splat_moments(&self, reduction: Reduction) -> Result<Vec<[f32; MOMENTS as usize]>, GpuError> {
+        let trainable = self.last_forward.map_or(0, |last| last.views.trainable_entries as usize);
+        match reduction {
+            Reduction::Atomic => self.gpu.read(&self.sums, 0, trainable),
+            Reduction::Ordered => {
+                let visible = self.status()?.visible_trainable as usize;
+                let indices: Vec<u32> = self.gpu.read(&self.entries.visible, 0, visible)?;
+                let sums: Vec<[f32; MOMENTS as usize]> = self.gpu.read(&self.sums, 0, visible)?;
+                let mut by_entry = vec![[0.0; MOMENTS as usize]; trainable];
+                indices.iter().zip(sums).for_each(|(&i, sums)| by_entry[i as usize] = sums);
+                Ok(by_entry)
             }
         }
     }

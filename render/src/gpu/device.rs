@@ -1,21 +1,21 @@
-//! The device: which adapter, with which limits, and how its errors reach the caller.
+//! The wgpu device: adapter choice, limits, submission and error reporting.
 //!
-//! wgpu reports most errors to a handler, not to who caused them. [`Gpu`] keeps them, and every operation that waits or submits
-//! returns them: a failed device never looks like a result.
+//! wgpu reports most errors to a handler instead of the call that caused them. [`Gpu`] collects them, and every operation that submits or
+//! waits returns them.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::Arc;
 use std::sync::atomic::AtomicU64;
-use std::sync::{Arc, Mutex};
 
-use super::error::{Faults, GpuError, one_line};
-use super::kernel::Kernels;
-use super::memory::Meter;
+use super::error::{DeviceErrors, GpuError, one_line};
+use super::memory_cap::MemoryCap;
 use super::options::{GpuOptions, Path};
-use super::watch::{CLOCK, Watch};
+use super::pipeline::PipelineCache;
+use super::timestamp_recorder::{TIMESTAMP_FEATURES, TimestampRecorder};
 
-/// Storage bindings of the stage that has most (`project_backward`).
+/// Storage bindings of `project_backward`, the stage with the most.
 const STORAGE_BINDINGS: u32 = 12;
-/// Workgroup memory of the stage that wants most (`rasterize_backward`), bytes.
+/// Workgroup memory of `rasterize_backward`, the stage with the most, bytes.
 const WORKGROUP_BYTES: u32 = 32 << 10;
 
 /// An open device.
@@ -26,20 +26,19 @@ pub struct Gpu {
     name: String,
     class: &'static str,
     path: Path,
-    faults: Arc<Faults>,
-    meter: Arc<Meter>,
-    /// Bytes handed to [`Gpu::upload`] that may still wait on the host.
+    errors: Arc<DeviceErrors>,
+    memory_cap: Arc<MemoryCap>,
+    /// Bytes passed to [`Gpu::upload`] that may still wait in host staging memory.
     staged: AtomicU64,
-    kernels: Kernels,
-    /// Who looks at the clock.
-    pub(super) watch: Mutex<Option<Watch>>,
+    pipelines: PipelineCache,
+    timestamps: TimestampRecorder,
 }
 
 impl Gpu {
-    /// Opens a device as the environment says, see [`GpuOptions::from_env`].
+    /// Opens a device with the options of the environment, see [`GpuOptions::from_env`].
     ///
     /// # Errors
-    /// Without an adapter, with one that cannot run the stages, or where the environment says what means nothing.
+    /// As [`open_with`](Self::open_with), or an invalid environment variable.
     pub fn open() -> Result<Arc<Self>, GpuError> {
         Self::open_with(&GpuOptions::from_env()?)
     }
@@ -47,7 +46,7 @@ impl Gpu {
     /// Opens a device.
     ///
     /// # Errors
-    /// Without an adapter, or with one that cannot run the stages.
+    /// If no adapter matches, or the adapter's limits are too small for the stages.
     pub fn open_with(options: &GpuOptions) -> Result<Arc<Self>, GpuError> {
         let instance = wgpu::Instance::new(wgpu::InstanceDescriptor::new_without_display_handle());
         let mut adapters = pollster::block_on(instance.enumerate_adapters(wgpu::Backends::PRIMARY));
@@ -61,7 +60,7 @@ impl Gpu {
             wgpu::DeviceType::Other => 3,
             wgpu::DeviceType::Cpu => 4,
         };
-        // Stable: of equals the first, so that the same machine gives the same adapter.
+        // A stable sort: the same machine always yields the same adapter.
         adapters.sort_by_key(power);
         let adapter = adapters.into_iter().next().ok_or_else(|| {
             let wanted = options.adapter.as_ref();
@@ -73,17 +72,18 @@ impl Gpu {
     fn on(adapter: &wgpu::Adapter, options: &GpuOptions) -> Result<Self, GpuError> {
         let info = adapter.get_info();
         let limits = adapter.limits();
-        for (what, has, needs) in [
+        for (what, limit, required) in [
             ("storage bindings", limits.max_storage_buffers_per_shader_stage, STORAGE_BINDINGS),
             ("bytes of workgroup memory", limits.max_compute_workgroup_storage_size, WORKGROUP_BYTES),
-            ("threads in a workgroup", limits.max_compute_invocations_per_workgroup, shaders::GROUP),
+            ("threads in a workgroup", limits.max_compute_invocations_per_workgroup, shaders::WORKGROUP_SIZE),
         ] {
-            if has < needs {
-                return Err(GpuError::TooSmall { adapter: info.name, what, has: has.into(), needs: needs.into() });
+            if limit < required {
+                let (limit, required) = (limit.into(), required.into());
+                return Err(GpuError::TooSmall { adapter: info.name, what, limit, required });
             }
         }
         let subgroups = options.path != Path::Portable && has_subgroups(adapter.features(), &info);
-        // Halves are packed, which nearly all can, and quickly those that compute with them.
+        // The stages only pack and unpack halves; SHADER_F16 selects the adapters that do so in hardware.
         let half = adapter.features().contains(wgpu::Features::SHADER_F16)
             && adapter.get_downlevel_capabilities().flags.contains(wgpu::DownlevelFlags::SHADER_F16_IN_F32);
         let path = match (options.path, subgroups) {
@@ -94,137 +94,143 @@ impl Gpu {
         };
         let descriptor = wgpu::DeviceDescriptor {
             label: Some("plat"),
-            required_features: adapter.features() & CLOCK
+            required_features: adapter.features() & TIMESTAMP_FEATURES
                 | if subgroups { wgpu::Features::SUBGROUP } else { wgpu::Features::empty() },
-            // All that the adapter has: what does not fit is refused with a reason (`room`), not by a smaller default.
+            // The adapter's full limits: `max_binding_bytes` reports what does not fit with a reason.
             required_limits: limits,
             ..Default::default()
         };
         let (device, queue) = pollster::block_on(adapter.request_device(&descriptor))
             .map_err(|e| GpuError::Failed(format!("{}: {e}", info.name)))?;
-        let faults = Arc::<Faults>::default();
-        let (of_errors, of_loss) = (Arc::clone(&faults), Arc::clone(&faults));
-        device.on_uncaptured_error(Arc::new(move |error: wgpu::Error| of_errors.caught(&error)));
-        device.set_device_lost_callback(move |_, message| of_loss.lost(&message));
+        let errors = Arc::<DeviceErrors>::default();
+        let (uncaptured, lost) = (Arc::clone(&errors), Arc::clone(&errors));
+        device.on_uncaptured_error(Arc::new(move |error: wgpu::Error| uncaptured.record(&error)));
+        device.set_device_lost_callback(move |_, message| lost.record_loss(&message));
         Ok(Self {
             name: name(&info, path),
             class: class(info.device_type),
             path,
-            faults,
-            meter: Meter::new(options.memory_bytes),
+            errors,
+            memory_cap: MemoryCap::new(options.memory_bytes),
             staged: AtomicU64::new(0),
-            kernels: Kernels::default(),
-            watch: Mutex::default(),
+            pipelines: PipelineCache::default(),
+            timestamps: TimestampRecorder::default(),
             device,
             queue,
         })
     }
 
-    /// "gpu-vulkan-llvmpipe-subgroups": the interface, the adapter without versions, and which stages run where not the portable
-    /// ones do: those have other bits.
+    /// The backend's name, such as "gpu-vulkan-llvmpipe-subgroups": API, adapter without versions, and the path unless it is the
+    /// portable one. Results are bit-identical only under the same name.
     pub fn name(&self) -> &str {
         &self.name
     }
 
-    /// True where a CPU pretends to be a GPU.
+    /// Whether the adapter is a software rasterizer on the CPU.
     pub fn is_software(&self) -> bool {
         self.class == class(wgpu::DeviceType::Cpu)
     }
 
-    /// What sort of adapter it is: `discrete`, `integrated`, `virtual`, `software` (a CPU pretends to be a GPU) or `other`.
+    /// The adapter class: `discrete`, `integrated`, `virtual`, `software` (runs on the CPU) or `other`.
     pub fn class(&self) -> &'static str {
         self.class
     }
 
-    /// True where [`shaders::SUBGROUPS`] run.
+    /// Whether the stages of [`shaders::SUBGROUPS`] run.
     pub fn has_subgroups(&self) -> bool {
         self.path != Path::Portable
     }
 
-    /// Which stages run.
+    /// The variant of the stages that runs.
     pub fn path(&self) -> Path {
         self.path
     }
 
-    /// The device, for what the helpers here do not do.
+    /// The wgpu device.
     pub fn device(&self) -> &wgpu::Device {
         &self.device
     }
 
-    /// The queue, likewise.
+    /// The wgpu queue.
     pub fn queue(&self) -> &wgpu::Queue {
         &self.queue
     }
 
-    pub(super) fn meter(&self) -> &Arc<Meter> {
-        &self.meter
+    pub(super) fn memory_cap(&self) -> &Arc<MemoryCap> {
+        &self.memory_cap
     }
 
     pub(super) fn staged(&self) -> &AtomicU64 {
         &self.staged
     }
 
-    pub(super) fn kernels(&self) -> &Kernels {
-        &self.kernels
+    pub(super) fn pipelines(&self) -> &PipelineCache {
+        &self.pipelines
     }
 
-    /// The first error that this thread has caused since its last call, if any; a lost device's at every call.
+    pub(super) fn timestamps(&self) -> &TimestampRecorder {
+        &self.timestamps
+    }
+
+    /// Returns and clears the first error that this thread caused since its last call. The loss of the device is returned at every
+    /// call.
     ///
     /// # Errors
-    /// That one.
+    /// That error.
     pub fn check(&self) -> Result<(), GpuError> {
-        self.faults.tell().map_err(|error| match error {
-            // A device that is going makes errors of all sorts before wgpu says that it is gone, which is when it is polled.
+        self.errors.take().map_err(|error| match error {
+            // A device that is being lost causes other errors first; wgpu reports the loss only in `poll`.
             GpuError::Failed(_) => {
                 let _ = catch_unwind(AssertUnwindSafe(|| self.device.poll(wgpu::PollType::Poll)));
-                self.faults.loss().unwrap_or(error)
+                self.errors.loss().unwrap_or(error)
             }
             error => error,
         })
     }
 
-    /// An empty list of commands.
+    /// An empty command encoder.
     pub fn encoder(&self) -> wgpu::CommandEncoder {
         self.device.create_command_encoder(&wgpu::CommandEncoderDescriptor { label: Some("plat") })
     }
 
-    /// Hands commands to the device, without waiting. Returns what to [wait](Self::wait_for) for.
+    /// Submits commands without waiting. [`wait_for`](Self::wait_for) waits for the returned index.
     ///
     /// # Errors
-    /// What went wrong until now.
+    /// A pending error of the device.
     pub fn submit(&self, encoder: wgpu::CommandEncoder) -> Result<wgpu::SubmissionIndex, GpuError> {
         let index = self.queue.submit([encoder.finish()]);
         self.check().map(|()| index)
     }
 
-    /// Waits for all that was submitted.
+    /// Waits for all submitted work.
     ///
     /// # Errors
-    /// What went wrong.
+    /// Any error of that work.
     pub fn wait(&self) -> Result<(), GpuError> {
         self.poll(wgpu::PollType::wait_indefinitely())
     }
 
-    /// Waits for a submission.
+    /// Waits for one submission.
     ///
     /// # Errors
-    /// What went wrong.
+    /// Any error until then.
     pub fn wait_for(&self, index: wgpu::SubmissionIndex) -> Result<(), GpuError> {
         self.poll(wgpu::PollType::Wait { submission_index: Some(index), timeout: None })
     }
 
     fn poll(&self, until: wgpu::PollType) -> Result<(), GpuError> {
-        // wgpu panics where a wait finds that the device is gone, after it has called the handler of that.
+        // wgpu panics if a wait finds the device lost, after it has called the device-lost handler.
         let polled = catch_unwind(AssertUnwindSafe(|| self.device.poll(until)));
         self.check()?;
         match polled {
             Ok(polled) => polled.map(|_| ()).map_err(|e| GpuError::Failed(one_line(&e.to_string()))),
-            Err(_) => Err(GpuError::Lost("it did not end what it was given".into())),
+            Err(_) => Err(GpuError::Lost("it did not finish the submitted work".into())),
         }
     }
 }
 
-/// Subgroups as the stages need them: of one size, as nothing says which of several a stage will have, and of at least eight lanes.
+/// Whether the adapter has subgroups as the stages need them: one fixed size (WebGPU does not tell which of several sizes a pipeline
+/// gets), a power of two from 8 to 128.
 fn has_subgroups(features: wgpu::Features, info: &wgpu::AdapterInfo) -> bool {
     let size = info.subgroup_min_size;
     features.contains(wgpu::Features::SUBGROUP)

@@ -1,42 +1,34 @@
-//! Compiled entry points, and how they are run.
-
-use std::collections::BTreeMap;
-use std::sync::{Mutex, PoisonError};
+//! Compiled entry points and their dispatch.
 
 use shaders::Stage;
 
 use super::device::Gpu;
 use super::error::GpuError;
 use super::options::Path;
+use super::pipeline::Pipeline;
 
-/// Workgroups in a row before a dispatch gets a second dimension.
-const GROUPS_IN_A_ROW: u32 = 1 << 15;
-
-/// What was compiled, by stage and entry point.
-pub(super) type Kernels = Mutex<BTreeMap<(&'static str, &'static str), Kernel>>;
+/// Workgroups in x before a dispatch uses y too; WebGPU allows 65,535 per dimension.
+const MAX_GROUPS_X: u32 = 1 << 15;
 
 impl Gpu {
-    /// An entry point of a stage, or of what takes its place on this device, compiled when it is first asked for.
+    /// An entry point of a stage, or of its replacement on this device's [`Path`]. Compiled on first use.
     ///
     /// # Errors
-    /// Where the driver refuses it.
+    /// If the driver rejects the shader.
     pub fn kernel(&self, stage: &Stage, entry: &'static str) -> Result<Kernel, GpuError> {
-        let mut kernels = self.kernels().lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some(kernel) = kernels.get(&(stage.name, entry)) {
-            return Ok(kernel.clone());
-        }
-        let twins = match self.path() {
+        let replacements = match self.path() {
             Path::Portable => [&[][..], &[]],
             Path::Fast => [&[], shaders::SUBGROUPS],
             Path::Half => [shaders::HALF, shaders::SUBGROUPS],
         };
-        let faster = twins.into_iter().flatten().find(|faster| faster.name == stage.name);
-        let kernel = self.compile(faster.unwrap_or(stage), entry)?;
-        kernels.insert((stage.name, entry), kernel.clone());
-        Ok(kernel)
+        let pipeline = self.pipelines().get_or_compile(stage.name, entry, || {
+            let replacement = replacements.into_iter().flatten().find(|replacement| replacement.name == stage.name);
+            self.compile(replacement.unwrap_or(stage), entry)
+        })?;
+        Ok(Kernel { entry, pipeline })
     }
 
-    fn compile(&self, stage: &Stage, entry: &'static str) -> Result<Kernel, GpuError> {
+    fn compile(&self, stage: &Stage, entry: &'static str) -> Result<Pipeline, GpuError> {
         let module = self.device().create_shader_module(wgpu::ShaderModuleDescriptor {
             label: Some(stage.name),
             source: wgpu::ShaderSource::Wgsl(stage.source().into()),
@@ -55,37 +47,37 @@ impl Gpu {
         });
         self.check()?;
         let layout = pipeline.get_bind_group_layout(0);
-        Ok(Kernel { entry, pipeline, layout })
+        Ok(Pipeline { pipeline, layout })
     }
 }
 
-/// A compiled entry point. Its bindings are those of group 0 that its text uses.
+/// A compiled entry point. Its bindings are those of group 0 that its WGSL uses.
 #[derive(Debug, Clone)]
 pub struct Kernel {
     entry: &'static str,
-    pipeline: wgpu::ComputePipeline,
-    layout: wgpu::BindGroupLayout,
+    pipeline: Pipeline,
 }
 
 impl Kernel {
-    /// Runs so many workgroups; `linear` in `view.wgsl` numbers their threads.
+    /// Dispatches this many workgroups; `thread_number` in `view.wgsl` numbers their threads.
     pub fn run(&self, gpu: &Gpu, pass: &mut wgpu::ComputePass, bindings: &[(u32, &wgpu::Buffer)], groups: u32) {
         self.bind(gpu, pass, bindings);
-        let columns = groups.clamp(1, GROUPS_IN_A_ROW);
-        gpu.dispatch(pass, self.entry, |pass| pass.dispatch_workgroups(columns, groups.div_ceil(columns), 1));
+        let columns = groups.clamp(1, MAX_GROUPS_X);
+        let rows = groups.div_ceil(columns);
+        gpu.timestamps().dispatch(pass, self.entry, |pass| pass.dispatch_workgroups(columns, rows, 1));
     }
 
-    /// Runs as many workgroups as entry `place` of `args` says.
+    /// Dispatches indirectly: the workgroup counts are entry `dispatch` of `args`, see [`shaders::args`].
     pub fn run_indirect(
         &self,
         gpu: &Gpu,
         pass: &mut wgpu::ComputePass,
         bindings: &[(u32, &wgpu::Buffer)],
         args: &wgpu::Buffer,
-        place: u64,
+        dispatch: u64,
     ) {
         self.bind(gpu, pass, bindings);
-        gpu.dispatch(pass, self.entry, |pass| pass.dispatch_workgroups_indirect(args, 12 * place));
+        gpu.timestamps().dispatch(pass, self.entry, |pass| pass.dispatch_workgroups_indirect(args, 12 * dispatch));
     }
 
     fn bind(&self, gpu: &Gpu, pass: &mut wgpu::ComputePass, bindings: &[(u32, &wgpu::Buffer)]) {
@@ -94,10 +86,10 @@ impl Kernel {
             .collect();
         let group = gpu.device().create_bind_group(&wgpu::BindGroupDescriptor {
             label: None,
-            layout: &self.layout,
+            layout: &self.pipeline.layout,
             entries: &entries,
         });
-        pass.set_pipeline(&self.pipeline);
+        pass.set_pipeline(&self.pipeline.pipeline);
         pass.set_bind_group(0, &group, &[]);
     }
 }

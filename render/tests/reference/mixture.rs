@@ -96,7 +96,7 @@ impl Tally {
             let difference = |a: &[f32], b: &[f64], i: usize| (f64::from(a[i]) - b[i]).abs();
             let mut error = (0..3).map(|c| difference(&frame.colour, &image.colour, c * area + i)).fold(0.0, f64::max);
             error = error.max(difference(&frame.transmittance, &image.transmittance, i));
-            error = error.max(difference(&frame.own, &image.own, i));
+            error = error.max(difference(&frame.trainable_alpha, &image.trainable_alpha, i));
             error = error.max(difference(&frame.depth, &image.depth, i) / far);
             self.pixels += 1;
             let unsure = image.margin[i] < 1e-3;

@@ -11,7 +11,7 @@ pub(crate) mod mixture;
 pub(crate) mod tensors;
 
 use glam::{DMat3, DQuat, DVec2, DVec3};
-use render::{ALPHA_MAX, ALPHA_MIN, BLUR, NEAR_METRES, Options, TRANSMITTANCE_MIN};
+use render::{ALPHA_MAX, ALPHA_MIN, LOW_PASS, NEAR_METRES, Options, TRANSMITTANCE_MIN};
 use scene::{Camera, Pinhole, Rigid, Splat, Splats, column};
 
 /// What is drawn, every number f64 so that it can be moved by a millionth.
@@ -20,7 +20,7 @@ pub(crate) struct Scene {
     /// As in [`scene::Splats`], trainable splats first, then the context.
     pub(crate) columns: Vec<Vec<f64>>,
     /// The number of trainable splats.
-    pub(crate) own: usize,
+    pub(crate) trainable: usize,
     /// Added to the projected means, pixels.
     pub(crate) shift: Vec<DVec2>,
     pub(crate) camera: Camera,
@@ -33,7 +33,7 @@ pub(crate) struct Image {
     pub(crate) colour: Vec<f64>,
     pub(crate) transmittance: Vec<f64>,
     pub(crate) depth: Vec<f64>,
-    pub(crate) own: Vec<f64>,
+    pub(crate) trainable_alpha: Vec<f64>,
     /// Σ αT of each splat.
     pub(crate) weight: Vec<f64>,
     /// For each pixel the relative distance to the nearest decision.
@@ -60,7 +60,7 @@ impl Scene {
             all.append(context);
         }
         let columns = all.columns().iter().map(|c| c.iter().map(|&v| f64::from(v)).collect()).collect();
-        Self { columns, own: splats.len(), shift: vec![DVec2::ZERO; all.len()], camera: *camera, options: *options }
+        Self { columns, trainable: splats.len(), shift: vec![DVec2::ZERO; all.len()], camera: *camera, options: *options }
     }
 
     pub(crate) fn render(&self) -> Image {
@@ -70,7 +70,7 @@ impl Scene {
             colour: vec![0.0; 3 * area],
             transmittance: vec![0.0; area],
             depth: vec![0.0; area],
-            own: vec![0.0; area],
+            trainable_alpha: vec![0.0; area],
             weight: vec![0.0; n],
             margin: vec![f64::INFINITY; area],
             splat_margin: f64::INFINITY,
@@ -125,7 +125,7 @@ impl Scene {
         // The determinant of A·Aᵀ as a sum of squares (Cauchy and Binet): no cancellation, even in needles.
         let minor = |c: usize, d: usize| (a.col(c).x * a.col(d).y - a.col(c).y * a.col(d).x).powi(2);
         let sharp = minor(0, 1) + minor(0, 2) + minor(1, 2);
-        let blur = f64::from(BLUR);
+        let blur = f64::from(LOW_PASS);
         let blurred = sharp + blur * (xx + yy) + blur * blur;
         let mut opacity = 1.0 / (1.0 + (-value(column::OPACITY)).exp());
         if self.options.antialiased {
@@ -178,8 +178,8 @@ impl Scene {
             colour += weight * e.colour;
             image.depth[pixel] += weight * e.z;
             image.weight[e.index] += weight;
-            if e.index < self.own {
-                image.own[pixel] += weight;
+            if e.index < self.trainable {
+                image.trainable_alpha[pixel] += weight;
             }
             (transmittance, last_z) = (next, e.z);
         }

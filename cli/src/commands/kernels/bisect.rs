@@ -75,7 +75,7 @@ impl Drawn {
         let frame = renderer.forward(&scene.splats, None, camera, options).clone();
         let upstream = Upstream { colour: noise(camera), ..Upstream::default() };
         let gradients = renderer.backward(&scene.splats, &upstream).clone();
-        Self { stages: renderer.stages(), frame, moments: renderer.moments(), gradients }
+        Self { stages: renderer.forward_intermediates(), frame, moments: renderer.backward_intermediates(), gradients }
     }
 
     fn on_gpu(
@@ -91,7 +91,7 @@ impl Drawn {
         renderer.backward(&mut encoder, splats, UpstreamPlanes::default())?;
         gpu.submit(encoder)?;
         let gradients = renderer.read_gradients(splats)?;
-        Ok(Self { stages: renderer.read_stages()?, frame, moments: renderer.read_moments()?, gradients })
+        Ok(Self { stages: renderer.read_forward_intermediates()?, frame, moments: renderer.read_backward_intermediates()?, gradients })
     }
 }
 

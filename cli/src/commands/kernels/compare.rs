@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use ::render::cpu::Stage;
-use ::render::{Frame, Gradients, MOMENTS, Moments, Stages};
+use ::render::{Frame, Gradients, MOMENTS, BackwardIntermediates, ForwardIntermediates};
 use serde::Serialize;
 
 /// The share of pixels, and one more, that may be off by more than [`error_allowed`], and that of the splats or pairs which one backend
@@ -27,9 +27,9 @@ fn error_allowed(stage: Stage) -> f64 {
 
 /// All that a view came to.
 pub(super) struct Drawn {
-    pub(super) stages: Stages,
+    pub(super) stages: ForwardIntermediates,
     pub(super) frame: Frame,
-    pub(super) moments: Moments,
+    pub(super) moments: BackwardIntermediates,
     pub(super) gradients: Gradients,
 }
 
@@ -69,14 +69,14 @@ impl Compared {
             Stage::Bin => self.tiles(view, &ours.stages, &theirs.stages),
             Stage::Rasterize => self.planes(view, &ours.frame, &theirs.frame),
             Stage::RasterizeBackward => {
-                let keyed = |moments: &Moments| {
+                let keyed = |moments: &BackwardIntermediates| {
                     moments.pairs.iter().map(|&(tile, splat, m)| ((tile, splat), m)).collect::<BTreeMap<_, _>>()
                 };
                 let place = |(tile, splat): &(u32, u32)| format!("splat {splat}, tile {tile}");
                 self.moments(view, &keyed(&ours.moments), &keyed(&theirs.moments), place);
             }
             Stage::Reduce => {
-                let keyed = |moments: &Moments| moments.splats.iter().copied().collect::<BTreeMap<_, _>>();
+                let keyed = |moments: &BackwardIntermediates| moments.splats.iter().copied().collect::<BTreeMap<_, _>>();
                 let place = |splat: &u32| format!("splat {splat}");
                 self.moments(view, &keyed(&ours.moments), &keyed(&theirs.moments), place);
             }
@@ -85,7 +85,7 @@ impl Compared {
     }
 
     /// Records by splat: x, y and so on, relative to one more than their size.
-    fn records(&mut self, view: usize, ours: &Stages, theirs: &Stages) {
+    fn records(&mut self, view: usize, ours: &ForwardIntermediates, theirs: &ForwardIntermediates) {
         const NAMES: [&str; 12] = [
             "mean x",
             "mean y",
@@ -100,7 +100,7 @@ impl Compared {
             "half width",
             "half height",
         ];
-        let by_splat = |stages: &Stages| -> BTreeMap<u32, [f32; 12]> {
+        let by_splat = |stages: &ForwardIntermediates| -> BTreeMap<u32, [f32; 12]> {
             stages.order.iter().copied().zip(stages.records.iter().copied()).collect()
         };
         let (ours, theirs) = (by_splat(ours), by_splat(theirs));
@@ -114,12 +114,12 @@ impl Compared {
     }
 
     /// The n-th depth of one and of the other, of the splats that both have: places may change where depths are alike.
-    fn order(&mut self, view: usize, ours: &Stages, theirs: &Stages) {
-        let splats = |stages: &Stages| -> BTreeSet<u32> { stages.order.iter().copied().collect() };
+    fn order(&mut self, view: usize, ours: &ForwardIntermediates, theirs: &ForwardIntermediates) {
+        let splats = |stages: &ForwardIntermediates| -> BTreeSet<u32> { stages.order.iter().copied().collect() };
         let (of_ours, of_theirs) = (splats(ours), splats(theirs));
         self.of += of_theirs.len() as u64;
         self.alone += of_ours.symmetric_difference(&of_theirs).count() as u64;
-        let depths = |stages: &Stages| -> Vec<(u32, f32)> {
+        let depths = |stages: &ForwardIntermediates| -> Vec<(u32, f32)> {
             let all = stages.order.iter().zip(&stages.records).map(|(&i, record)| (i, record[9]));
             all.filter(|(i, _)| of_ours.contains(i) && of_theirs.contains(i)).collect()
         };
@@ -129,15 +129,15 @@ impl Compared {
     }
 
     /// Which splats each tile has, front to back.
-    fn tiles(&mut self, view: usize, ours: &Stages, theirs: &Stages) {
-        let of_tile = |stages: &Stages, tile: usize| -> BTreeMap<u32, u32> {
+    fn tiles(&mut self, view: usize, ours: &ForwardIntermediates, theirs: &ForwardIntermediates) {
+        let of_tile = |stages: &ForwardIntermediates, tile: usize| -> BTreeMap<u32, u32> {
             let pairs = &stages.pairs[stages.start[tile] as usize..stages.start[tile + 1] as usize];
             pairs.iter().map(|&rank| (stages.order[rank as usize], rank)).collect()
         };
         for tile in 0..theirs.start.len().min(ours.start.len()).saturating_sub(1) {
             let before = self.alone;
             self.count_alone(&of_tile(ours, tile), &of_tile(theirs, tile));
-            let out_of_order = |stages: &Stages| {
+            let out_of_order = |stages: &ForwardIntermediates| {
                 let pairs = &stages.pairs[stages.start[tile] as usize..stages.start[tile + 1] as usize];
                 pairs.windows(2).filter(|w| w[0] >= w[1]).count()
             };
@@ -163,7 +163,7 @@ impl Compared {
         let others = [
             ("transmittance", (&ours.transmittance[..], &theirs.transmittance[..])),
             ("depth", (&ours.depth[..], &theirs.depth[..])),
-            ("own", (&ours.own[..], &theirs.own[..])),
+            ("own", (&ours.trainable_alpha[..], &theirs.trainable_alpha[..])),
         ];
         for (name, (ours, theirs)) in colours.chain(others) {
             for (i, (a, b)) in ours.iter().zip(theirs).enumerate() {
@@ -192,7 +192,7 @@ impl Compared {
 
     fn gradients(&mut self, view: usize, ours: &Gradients, theirs: &Gradients) {
         let columns = |gradients: &Gradients| -> Vec<Vec<f32>> {
-            let statistics = [&gradients.screen, &gradients.screen_abs, &gradients.weight];
+            let statistics = [&gradients.screen_gradient, &gradients.screen_gradient_abs, &gradients.weight];
             gradients.columns.iter().chain(statistics).cloned().collect()
         };
         let (ours_all, theirs_all) = (columns(ours), columns(theirs));

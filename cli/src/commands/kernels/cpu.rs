@@ -36,10 +36,10 @@ pub(super) fn time(args: &KernelsArgs, Scene { splats, options, cameras }: &Scen
             }
         };
         let pass_clock = Stopwatch::start();
-        renderer.forward_watched(splats, None, &cameras[pass % cameras.len()], options, &mut note);
+        renderer.forward_timed(splats, None, &cameras[pass % cameras.len()], options, &mut note);
         let forward = [pass_clock.cpu_seconds(), pass_clock.wall_seconds()];
         let pass_clock = Stopwatch::start();
-        renderer.backward_watched(splats, &upstream, &mut note);
+        renderer.backward_timed(splats, &upstream, &mut note);
         let backward = [pass_clock.cpu_seconds(), pass_clock.wall_seconds()];
         if counts {
             let taken = [forward[0], backward[0], forward[1], backward[1]];

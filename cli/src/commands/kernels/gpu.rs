@@ -105,14 +105,14 @@ impl<'a> Bench<'a> {
     fn new(gpu: &'a Arc<Gpu>, scene: &'a Scene) -> Result<Self, GpuError> {
         let renderer = GpuRenderer::new(gpu.clone())?;
         let splats = GpuSplats::upload(gpu, &scene.splats, 0)?;
-        Ok(Self { gpu, renderer, splats, scene, has_clock: gpu.has_clock() })
+        Ok(Self { gpu, renderer, splats, scene, has_clock: gpu.has_timestamps() })
     }
 
     fn pass(&mut self, cameras: &[Camera]) -> Result<Pass, GpuError> {
         // Makes room, so that what is timed is drawn.
         loop {
             self.once(Direction::Forward, cameras)?;
-            if !self.renderer.recover()? {
+            if !self.renderer.grow_after_overflow()? {
                 break;
             }
         }
@@ -133,9 +133,9 @@ impl<'a> Bench<'a> {
     /// CPU and wall milliseconds of all of it, and those of each stage.
     fn timed(&mut self, direction: Direction, cameras: &[Camera]) -> Result<([f64; 2], Stages), GpuError> {
         let all = self.once(direction, cameras)?;
-        self.gpu.watch(usize::MAX);
+        self.gpu.start_timing(usize::MAX);
         self.once(direction, cameras)?;
-        let dispatched = self.gpu.watched()?;
+        let dispatched = self.gpu.finish_timing()?;
         // The place of each stage's last dispatch.
         let mut ends: Vec<(Stage, usize)> = Vec::new();
         for (n, dispatch) in dispatched.iter().enumerate() {
@@ -166,9 +166,9 @@ impl<'a> Bench<'a> {
 
     /// Wall milliseconds of so many dispatches.
     fn up_to(&mut self, direction: Direction, cameras: &[Camera], most: usize) -> Result<f64, GpuError> {
-        self.gpu.watch(most);
+        self.gpu.start_timing(most);
         let [_, wall] = self.once(direction, cameras)?;
-        self.gpu.watched().map(|_| wall)
+        self.gpu.finish_timing().map(|_| wall)
     }
 
     /// CPU and wall milliseconds, from the first command to the end.
@@ -210,7 +210,7 @@ mod tests {
         let scene = Scene { splats: cloud(100), options: Options::default(), cameras: vec![camera] };
         let mut bench = Bench::new(&gpu, &scene).unwrap();
         let usual = bench.renderer.draw(&bench.splats, None, &camera, &scene.options).unwrap();
-        for has_clock in [gpu.has_clock(), false] {
+        for has_clock in [gpu.has_timestamps(), false] {
             bench.has_clock = has_clock;
             let pass = bench.pass(&[camera; 3]).unwrap();
             let stages: Vec<Stage> = pass.stages.iter().map(|(stage, _)| *stage).collect();

@@ -1,7 +1,9 @@
-//! The lanes in registers of x86-64: one of AVX-512, two of AVX2. What makes the intrinsics safe to call says [`super`].
+//! The lanes in x86-64 registers: one of AVX-512 or two of AVX2. The module [`simd`](super) explains why calling the intrinsics is safe.
 
-use super::{Add, Div, EXP2, Lanes, Mul, Neg, Sub};
 use std::arch::x86_64::*;
+use std::ops::{Add, Div, Mul, Neg, Sub};
+
+use super::lanes::{EXP2, Lanes, operators};
 
 /// One AVX-512 register.
 #[derive(Clone, Copy)]
@@ -76,7 +78,7 @@ impl Lanes for Avx512 {
     }
     #[inline(always)]
     fn exp2_at_most(self) -> Self {
-        // Scaling saturates by itself.
+        // `scalef` saturates.
         self.exp2_in_range()
     }
     #[inline(always)]
@@ -98,7 +100,7 @@ impl Lanes for Avx512 {
     }
     #[inline(always)]
     fn sums(v: &[Self; 16]) -> Self {
-        // A transpose that adds: after each round a register carries partial sums of twice as many vectors.
+        // A transposing reduction: after each round a register holds partial sums of twice as many vectors.
         let (low, high) = (Self::fold_eight(Self::fold_four(v, 0), Self::fold_four(v, 4)), {
             Self::fold_eight(Self::fold_four(v, 8), Self::fold_four(v, 12))
         });
@@ -218,7 +220,8 @@ impl Lanes for Avx2 {
     fn select(mask: u16, a: Self, b: Self) -> Self {
         unsafe { Self(_mm256_blendv_ps(b.0, a.0, Self::mask(mask)), _mm256_blendv_ps(b.1, a.1, Self::mask(mask >> 8))) }
     }
-    // Comparisons are vectors here: through sixteen bits and back takes longer than all else in a rasterizer's loop.
+    // AVX2 comparisons give vector masks. These overrides keep them, as the conversion to a 16-bit mask and back dominates a
+    // rasterizer's loop.
     #[inline(always)]
     fn where_le(self, a: Self, b: Self) -> Self {
         unsafe {

@@ -1,8 +1,8 @@
-//! Stage `contribute`: what each splat means to a view, for pruning.
+//! Contribution of each splat to a view, as a pruning score.
 //!
-//! A pixel's colour is affine in the α of each of its splats, so what the pixel would be without one splat is known
-//! exactly from one front-to-back walk: `δ = -α·dI/dα`, with `dI/dα = T·c - (what lies behind) / (1 - α)`. All sums here are
-//! over pixels, of squares, which a gradient of the loss (a sum of signed terms) cannot give.
+//! A pixel's colour is affine in the α of each of its splats. So one front-to-back pass gives the exact change of the pixel if a splat is
+//! removed: `δ = -α·dI/dα`, with `dI/dα = T·c - (colour behind) / (1 - α)`. The scores are sums of squares over pixels; a loss gradient
+//! cannot provide them, as it sums signed terms.
 
 use std::hint::cold_path;
 
@@ -10,12 +10,12 @@ use rayon::prelude::*;
 
 use super::bin::TILE;
 use super::project::at;
-use super::rasterize::{AHEAD, BLOCKS, Moments, Plane, Spread, TileInput, lane_offsets};
 use super::simd::Lanes;
+use super::tile::{BLOCKS, Moments, PREFETCH_DISTANCE, Plane, SplatLanes, TileInput, lane_offsets};
 use super::{CHUNK, Renderer, simd};
-use crate::{Contributions, TRANSMITTANCE_MIN, each, kernel};
+use crate::{Contributions, TRANSMITTANCE_MIN, kernel, unroll};
 
-/// Places of the sums in a pair's entry.
+/// Indices of the sums in a pair's moments.
 mod sum {
     pub(super) const WEIGHT: usize = 0;
     pub(super) const SQUARED: usize = 1;
@@ -23,13 +23,13 @@ mod sum {
 }
 
 impl Renderer {
-    /// What each trainable splat of the last [`forward`](Self::forward) means to that view. `weights` is what each pixel
-    /// counts, one plane, empty where all count 1.
+    /// Contributions of the trainable splats to the view of the last [`forward`](Self::forward). `weights` is one plane of pixel weights;
+    /// empty: all weights are 1.
     ///
     /// # Panics
-    /// Without a forward pass before, or with a plane of another size: both are errors of the caller.
+    /// Without a forward pass before, or if the plane has another size than the frame.
     pub fn contributions(&mut self, weights: &[f32]) -> &Contributions {
-        let (_, _, count) = self.drawn.expect("contributions follows forward");
+        let (_, _, count) = self.last_forward.expect("contributions follows forward");
         let area = self.frame.width * self.frame.height;
         assert!(weights.is_empty() || weights.len() == area, "a plane of the frame's size");
         let rows = |row: usize, plane: usize| {
@@ -48,15 +48,15 @@ impl Renderer {
                     colour: [0, 1, 2].map(|c| &frame.colour[rows(row, c)]),
                     weights: if weights.is_empty() { weights } else { &weights[rows(row, 0)] },
                 };
-                contribute(self.isa, tile, &band, out);
+                contributions(self.isa, tile, &band, out);
             },
         );
-        self.gather_contributions(count);
+        self.reduce_contributions(count);
         &self.contributions
     }
 
-    /// Adds up the pairs of each splat, in the order of its tiles.
-    fn gather_contributions(&mut self, count: usize) {
+    /// Sums the pairs of each splat, in the order of its tiles.
+    fn reduce_contributions(&mut self, count: usize) {
         self.rank_splats();
         let out = &mut self.contributions;
         for column in [&mut out.weight, &mut out.squared, &mut out.energy] {
@@ -71,8 +71,8 @@ impl Renderer {
                 let mut total = [0.0f32; 3];
                 if seen[i / simd::LANES] >> (i % simd::LANES) & 1 == 1 {
                     let rank = rank[i] as usize;
-                    for &place in &bins.place[bins.emitted[rank] as usize..bins.emitted[rank + 1] as usize] {
-                        total.iter_mut().zip(&moments[place as usize].0).for_each(|(total, part)| *total += part);
+                    for &position in &bins.position[bins.emitted[rank] as usize..bins.emitted[rank + 1] as usize] {
+                        total.iter_mut().zip(&moments[position as usize].0).for_each(|(total, part)| *total += part);
                     }
                 }
                 weight[n] = total[sum::WEIGHT];
@@ -83,19 +83,19 @@ impl Renderer {
     }
 }
 
-/// Sixteen rows of what the sums are made of.
+/// The rows of a tile row.
 struct Band<'a> {
     colour: [&'a [f32]; 3],
-    /// Empty where all pixels count 1.
+    /// Pixel weights; empty: all are 1.
     weights: &'a [f32],
 }
 
-kernel!(fn contribute(tile: &TileInput, band: &Band, out: &mut [Moments]) = contribute_lanes);
+kernel!(fn contributions(tile: &TileInput, band: &Band, out: &mut [Moments]) = contributions_lanes);
 
 #[inline(always)]
-fn contribute_lanes<L: Lanes>(tile: &TileInput, band: &Band, out: &mut [Moments]) {
+fn contributions_lanes<L: Lanes>(tile: &TileInput, band: &Band, out: &mut [Moments]) {
     let (mut live, mut alive) = tile.start();
-    // The colour behind the splats seen so far; at first all of it.
+    // The colour behind the splats blended so far; initially the pixel's final colour.
     let mut behind = [Plane::filled(0.0); 3];
     let mut weights = Plane::filled(1.0);
     for c in 0..3 {
@@ -106,17 +106,17 @@ fn contribute_lanes<L: Lanes>(tile: &TileInput, band: &Band, out: &mut [Moments]
     let mut alphas = Plane::filled(0.0);
     let (lane_x, lane_y) = lane_offsets::<L>();
     for (n, (pair, out)) in tile.pairs.iter().zip(out).enumerate() {
-        tile.fetch(n + AHEAD);
+        tile.prefetch_pair(n + PREFETCH_DISTANCE);
         *out = Moments::default();
         let mut blocks = u32::from(pair.blocks) & alive;
         if blocks == 0 {
             continue;
         }
         let r = &tile.ranked[pair.rank as usize].0;
-        let spread = Spread::<L>::new(r, tile);
-        let own = r[at::OWN] > 0.0;
+        let lanes = SplatLanes::<L>::new(r, tile);
+        let trainable = r[at::TRAINABLE] > 0.0;
         let opacity = L::splat(r[at::LOG2_OPACITY]).exp2();
-        spread.alphas(blocks, lane_x, lane_y, &mut alphas);
+        lanes.alphas(blocks, lane_x, lane_y, &mut alphas);
         let mut sums = [L::zero(); 16];
         while blocks != 0 {
             let b = blocks.trailing_zeros() as usize & (BLOCKS - 1);
@@ -132,18 +132,18 @@ fn contribute_lanes<L: Lanes>(tile: &TileInput, band: &Band, out: &mut [Moments]
                 cold_path();
                 alive &= !(1 << b);
             }
-            let rest = each!(c in [0, 1, 2] => {
+            let rest = unroll!(c in [0, 1, 2] => {
                 let rest = L::load(&behind[c][b]) - weight * L::splat(r[at::RED + c]);
                 rest.store(&mut behind[c][b]);
                 rest
             });
-            if !own {
+            if !trainable {
                 continue;
             }
-            // The pixel's change with α, and without the splat.
-            let open = (L::splat(1.0) - alpha).recip();
-            let d = each!(c in [0, 1, 2] => {
-                (t * L::splat(r[at::RED + c]) - rest[c] * open).unless_le(next, end).unless_le(alpha, L::zero())
+            // dI/dα of the pixel.
+            let inv_open = (L::splat(1.0) - alpha).recip();
+            let d = unroll!(c in [0, 1, 2] => {
+                (t * L::splat(r[at::RED + c]) - rest[c] * inv_open).unless_le(next, end).unless_le(alpha, L::zero())
             });
             let count = L::load(&weights[b]);
             let d2 = count * d[0].fma(d[0], d[1].fma(d[1], d[2] * d[2]));
@@ -151,7 +151,7 @@ fn contribute_lanes<L: Lanes>(tile: &TileInput, band: &Band, out: &mut [Moments]
             sums[sum::SQUARED] = (opacity * opacity).fma(d2, sums[sum::SQUARED]);
             sums[sum::ENERGY] = (alpha * alpha).fma(d2, sums[sum::ENERGY]);
         }
-        if own {
+        if trainable {
             L::sums(&sums).store(&mut out.0);
         }
     }

@@ -5,6 +5,6 @@ struct Thread {
 }
 
 // 0 to 255, each once.
-fn place_of(thread: Thread) -> u32 {
+fn local_index(thread: Thread) -> u32 {
     return thread.local;
 }

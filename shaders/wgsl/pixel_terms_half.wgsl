@@ -9,10 +9,10 @@ var<workgroup> halves: array<u32, 2048>;
 const LARGEST_HALF: f32 = 65504.0;
 
 // `pixels` are those of the view: a loss is a mean over them, and a half has no digits for what is so small.
-fn put_touch(at: u32, v: f32, w: f32, pixels: f32) {
+fn store_pixel_terms(at: u32, v: f32, w: f32, pixels: f32) {
     halves[at] = pack2x16float(vec2<f32>(clamp(v * pixels, -LARGEST_HALF, LARGEST_HALF), w));
 }
 
-fn touch_at(at: u32, pixels: f32) -> vec2<f32> {
+fn load_pixel_terms(at: u32, pixels: f32) -> vec2<f32> {
     return unpack2x16float(halves[at]) * vec2<f32>(1.0 / pixels, 1.0);
 }

@@ -1,13 +1,13 @@
-// The sum of the 32 parts of each moment of each pair: eight lanes by three exchanges, then four eights through workgroup memory.
+// The sum of the 32 parts of each moment of each pair: eight lanes by three exchanges, then four partial_sums through workgroup memory.
 // At each exchange a lane gives away half of the moments that it has and keeps the sums of the others. The 32 parts are the leaves
 // of one binary tree whatever the size of the subgroups, so that this has the same bits with any.
 
 // Moment m of eight n, 0 to 3, of pair k at 4 (16 k + m) + n.
-var<workgroup> eights: array<f32, 512>;
+var<workgroup> partial_sums: array<f32, 512>;
 
 // All threads must come here: thread 32 k + part with what that part of pair k came to.
-fn add_up_parts(m: Moments, count: u32, thread: Thread) {
-    let local = place_of(thread);
+fn reduce_parts(m: Moments, count: u32, thread: Thread) {
+    let local = local_index(thread);
     let upper = vec3<bool>((local & 1u) != 0u, (local & 2u) != 0u, (local & 4u) != 0u);
     let d = vec4<f32>(m.d, 0.0, 0.0, 0.0);
     let one = select(m.a, m.c, upper.x) + subgroupShuffleXor(select(m.c, m.a, upper.x), 1u);
@@ -16,13 +16,13 @@ fn add_up_parts(m: Moments, count: u32, thread: Thread) {
     let last = select(four.xy, four.zw, upper.z) + subgroupShuffleXor(select(four.zw, four.xy, upper.z), 4u);
     let moment = 8u * u32(upper.x) + 4u * u32(upper.y) + 2u * u32(upper.z);
     let to = 4u * (16u * (local / PARTS) + moment) + (local % PARTS) / 8u;
-    eights[to] = last.x;
-    eights[to + 4u] = last.y;
+    partial_sums[to] = last.x;
+    partial_sums[to + 4u] = last.y;
     workgroupBarrier();
     let k = local / 16u;
-    if k < count && local % 16u < MOMENTS && owns[k] != 0u {
+    if k < count && local % 16u < MOMENTS && is_trainable[k] != 0u {
         let at = 4u * local;
-        leave(pairs[k] * MOMENTS + local % 16u, (eights[at] + eights[at + 1u]) + (eights[at + 2u] + eights[at + 3u]));
+        write_moment(output_slots[k] * MOMENTS + local % 16u, (partial_sums[at] + partial_sums[at + 1u]) + (partial_sums[at + 2u] + partial_sums[at + 3u]));
     }
     workgroupBarrier();
 }

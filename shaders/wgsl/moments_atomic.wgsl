@@ -5,11 +5,11 @@
 @group(0) @binding(9) var<storage, read_write> moments: array<atomic<u32>>;
 
 // Whose sums those of this pair are.
-fn owner_of(pair: u32, splat: u32) -> u32 {
+fn output_slot(pair: u32, splat: u32) -> u32 {
     return splat;
 }
 
-fn leave(at: u32, total: f32) {
+fn write_moment(at: u32, total: f32) {
     if total == 0.0 {
         return;
     }
@@ -24,5 +24,5 @@ fn leave(at: u32, total: f32) {
 }
 
 // Pairs that no pixel blended add nothing.
-fn leave_nothing(first: u32, end: u32, local: u32) {
+fn clear_moments(first: u32, end: u32, local: u32) {
 }

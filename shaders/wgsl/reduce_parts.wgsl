@@ -3,8 +3,8 @@
 const STRIDE: u32 = 33u; // not 32: threads that add up different moments read different memory banks
 
 // All threads must come here: thread 32 k + part with what that part of pair k came to.
-fn add_up_parts(m: Moments, count: u32, thread: Thread) {
-    let local = place_of(thread);
+fn reduce_parts(m: Moments, count: u32, thread: Thread) {
+    let local = local_index(thread);
     let k = local / PARTS;
     workgroupBarrier();
     if k < count {
@@ -24,12 +24,12 @@ fn add_up_parts(m: Moments, count: u32, thread: Thread) {
         shared_[to + 12u * STRIDE] = m.d;
     }
     workgroupBarrier();
-    if local < count * MOMENTS && owns[local / MOMENTS] != 0u {
+    if local < count * MOMENTS && is_trainable[local / MOMENTS] != 0u {
         var total = 0.0;
         for (var p = 0u; p < PARTS; p++) {
             total += shared_[local * STRIDE + p];
         }
-        leave(pairs[local / MOMENTS] * MOMENTS + local % MOMENTS, total);
+        write_moment(output_slots[local / MOMENTS] * MOMENTS + local % MOMENTS, total);
     }
     workgroupBarrier();
 }

@@ -4,11 +4,11 @@
 var<workgroup> shared_: array<f32, 4096>;
 
 // `pixels` are those of the view.
-fn put_touch(at: u32, v: f32, w: f32, pixels: f32) {
+fn store_pixel_terms(at: u32, v: f32, w: f32, pixels: f32) {
     shared_[at] = v;
     shared_[2048u + at] = w;
 }
 
-fn touch_at(at: u32, pixels: f32) -> vec2<f32> {
+fn load_pixel_terms(at: u32, pixels: f32) -> vec2<f32> {
     return vec2<f32>(shared_[at], shared_[2048u + at]);
 }

@@ -3,17 +3,17 @@
 var<workgroup> partial: array<u32, 256>;
 
 // The sum of `value` over the threads before this one; all threads must come here.
-fn exclusive(value: u32, thread: Thread) -> u32 {
-    let local = place_of(thread);
+fn exclusive_scan(value: u32, thread: Thread) -> u32 {
+    let local = local_index(thread);
     partial[local] = value;
     workgroupBarrier();
-    for (var reach = 1u; reach < 256u; reach *= 2u) {
+    for (var distance = 1u; distance < 256u; distance *= 2u) {
         var before = 0u;
-        if local >= reach {
-            before = partial[local - reach];
+        if local >= distance {
+            before = partial[local - distance];
         }
         workgroupBarrier();
-        partial[local] = add(before, partial[local]);
+        partial[local] = saturating_add(before, partial[local]);
         workgroupBarrier();
     }
     if local == 0u {
@@ -22,7 +22,7 @@ fn exclusive(value: u32, thread: Thread) -> u32 {
     return partial[local - 1u];
 }
 
-// The sum over all threads, after `exclusive`.
-fn total(thread: Thread) -> u32 {
+// The sum over all threads, after `exclusive_scan`.
+fn scan_total(thread: Thread) -> u32 {
     return partial[255];
 }
