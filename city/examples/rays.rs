@@ -10,9 +10,9 @@ use std::time::Instant;
 use city::{
     City, CitySettings, Class, Mesh,
     random::Random,
-    sense::{Shot, looking, pinhole},
-    stage,
-    trace::{Meets, Moment, Options, Ray, World, frame},
+    sense::{Shot, camera_towards, pinhole},
+    test_scene,
+    trace::{Moment, Ray, RayMask, RenderOptions, World, render_frame},
 };
 use glam::{DVec3, Vec2, Vec3, vec3};
 
@@ -41,7 +41,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     ];
     let (mut rays_of_all, mut seconds_of_all) = (0.0, 0.0);
     for (name, centre, forward) in places {
-        let shot = Shot::new(name.into(), name, 1.0, looking(lens, centre, forward, DVec3::Y));
+        let shot = Shot::new(name.into(), name, 1.0, camera_towards(lens, centre, forward, DVec3::Y));
         let rays = rays(&shot);
         let start = busy();
         let mut shadows = Vec::new();
@@ -56,7 +56,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
             .count();
         let primary = busy() - start;
         let start = busy();
-        let dark = shadows.iter().filter(|ray| moment.is_blocked(ray)).count();
+        let dark = shadows.iter().filter(|ray| moment.is_occluded(ray)).count();
         let secondary = busy() - start;
         let rate = |count: usize, seconds: f64| count as f64 / seconds / 1e6;
         rays_of_all += (rays.len() + shadows.len()) as f64;
@@ -68,7 +68,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
             rate(rays.len() + shadows.len(), primary + secondary),
         );
         let start = Instant::now();
-        let picture = frame(&world, &shot, &Options::default())?;
+        let picture = render_frame(&world, &shot, &RenderOptions::default())?;
         let seconds = start.elapsed().as_secs_f64();
         println!(
             "        a whole frame of {} × {} in {seconds:.2} s, {} threads",
@@ -102,20 +102,25 @@ fn rays(shot: &Shot) -> Vec<Ray> {
 }
 
 fn shadow(moment: &Moment, ray: &Ray) -> Option<Ray> {
-    let hit = moment.cast(ray, Meets::Everything)?;
+    let hit = moment.cast(ray, RayMask::All)?;
     Some(Ray::new(ray.at(hit.distance) + 2e-3 * hit.normal, vec3(0.435_194_5, -0.340_587, 0.833_475_6)))
 }
 
 fn town() -> City {
-    let mut city = stage::city();
+    let mut city = test_scene::city();
     let van = city.actors.pop().expect("the stage has a van");
     city.actors.clear();
     city.streets = vec![vec![DVec3::new(-300.0, 0.0, 0.0), DVec3::X * 400.0]];
     city.extent_metres = 1000.0;
     let mut random = Random::new(7);
-    let ground =
-        stage::rectangle(vec3(-1000.0, -1000.0, 0.0), Vec3::X * 2000.0, Vec3::Y * 2000.0, stage::ASPHALT, Class::Road);
-    stage::put(&mut city, "ground", ground, Class::Road, 0, DVec3::ZERO);
+    let ground = test_scene::rectangle(
+        vec3(-1000.0, -1000.0, 0.0),
+        Vec3::X * 2000.0,
+        Vec3::Y * 2000.0,
+        test_scene::ASPHALT,
+        Class::Road,
+    );
+    test_scene::add_actor(&mut city, "ground", ground, Class::Road, 0, DVec3::ZERO);
     let first = city.assets.len() as u32;
     city.assets.extend((0..20).map(|i| city::Asset { name: format!("house {i}"), mesh: house(&mut random.fork(i)) }));
     city.assets.extend((0..5).map(|i| city::Asset { name: format!("tree {i}"), mesh: tree(&mut random.fork(90 + i)) }));
@@ -127,7 +132,7 @@ fn town() -> City {
             asset,
             class,
             instance: i as u32 + 1,
-            world_from_asset: stage::place(at.extend(0.0).as_dvec3()),
+            world_from_asset: test_scene::pose_at_point(at.extend(0.0).as_dvec3()),
             trajectory: None,
         };
         if !street {
@@ -153,26 +158,29 @@ fn town() -> City {
 fn house(random: &mut Random) -> Mesh {
     let (side, storeys) = (PITCH, 3 + random.below(5));
     let top = 3.1 * storeys as f32;
-    let mut mesh = stage::cuboid(Vec3::ZERO, vec3(side, side, top), stage::BRICK, Class::Building);
+    let mut mesh = test_scene::cuboid(Vec3::ZERO, vec3(side, side, top), test_scene::BRICK, Class::Building);
     for storey in 0..storeys {
         for bay in 0..5 {
             let (x, z) = (1.0 + 2.9 * bay as f32, 0.9 + 3.1 * storey as f32);
             for y in [-0.06, side] {
                 let bar = |x0: f32, z0: f32, x1: f32, z1: f32| {
-                    stage::cuboid(
+                    test_scene::cuboid(
                         vec3(x + x0, y, z + z0),
                         vec3(x + x1, y + 0.06, z + z1),
-                        stage::PLASTER,
+                        test_scene::PLASTER,
                         Class::Building,
                     )
                 };
                 for part in
                     [bar(0.0, 0.0, 0.1, 1.5), bar(1.1, 0.0, 1.2, 1.5), bar(0.1, 0.0, 1.1, 0.1), bar(0.1, 1.4, 1.1, 1.5)]
                 {
-                    stage::join(&mut mesh, &part);
+                    test_scene::append(&mut mesh, &part);
                 }
                 let pane = vec3(x + 0.1, y + 0.03, z + 0.1);
-                stage::join(&mut mesh, &stage::rectangle(pane, Vec3::X, Vec3::Z * 1.3, stage::GLASS, Class::Building));
+                test_scene::append(
+                    &mut mesh,
+                    &test_scene::rectangle(pane, Vec3::X, Vec3::Z * 1.3, test_scene::GLASS, Class::Building),
+                );
             }
         }
     }
@@ -181,13 +189,14 @@ fn house(random: &mut Random) -> Mesh {
 
 /// A trunk and 1,000 leaves of two triangles in a ball.
 fn tree(random: &mut Random) -> Mesh {
-    let mut mesh = stage::cuboid(vec3(-0.15, -0.15, 0.0), vec3(0.15, 0.15, 3.0), stage::BRICK, Class::Vegetation);
+    let mut mesh =
+        test_scene::cuboid(vec3(-0.15, -0.15, 0.0), vec3(0.15, 0.15, 3.0), test_scene::BRICK, Class::Vegetation);
     for _ in 0..1000 {
         let out = vec3(random.normal(), random.normal(), random.normal()).normalize_or(Vec3::Z);
         let at = out * 2.4 * random.unit().powf(0.4) + 4.6 * Vec3::Z;
         let along = vec3(random.normal(), random.normal(), random.normal()).normalize_or(Vec3::X) * 0.3;
         let up = along.cross(out).normalize_or(Vec3::Z) * 0.2;
-        stage::join(&mut mesh, &stage::rectangle(at, along, up, stage::LEAF, Class::Vegetation));
+        test_scene::append(&mut mesh, &test_scene::rectangle(at, along, up, test_scene::LEAF, Class::Vegetation));
     }
     mesh
 }

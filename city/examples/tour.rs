@@ -5,8 +5,8 @@ use std::{path::Path, time::Instant};
 
 use city::{
     City, CitySettings,
-    faults::{Fault, Kind},
-    occupancy::{FREE, Grid, voxels},
+    faults::{Fault, FaultKind},
+    occupancy::{FREE, Grid, voxelize},
     sense::{
         Shot,
         lidar::Lidar,
@@ -14,7 +14,7 @@ use city::{
         rig::{Rig, drive},
         survey::{Fixed, Survey, fixed, survey},
     },
-    trace::{Options, World, frame},
+    trace::{RenderOptions, World, render_frame},
 };
 use glam::{DQuat, DVec2, DVec3, UVec3};
 use image::{Rgb, RgbImage};
@@ -41,8 +41,9 @@ fn main() -> Result<()> {
     let start = Instant::now();
     let world = World::new(&city)?;
     println!("indexed in {:.2} s", start.elapsed().as_secs_f64());
-    let day = Options::default();
-    let trouble = |kind| Options { faults: vec![Fault { kind, strength: 1.0, seed: 3 }], ..Options::default() };
+    let day = RenderOptions::default();
+    let trouble =
+        |kind| RenderOptions { faults: vec![Fault { kind, strength: 1.0, seed: 3 }], ..RenderOptions::default() };
 
     let street = drive(&city, &Rig { width: 1408, height: 600, ..Rig::default() })?;
     println!("{} shots of a drive", street.len());
@@ -59,9 +60,9 @@ fn main() -> Result<()> {
     let other = &street[street.len() / 5 / 6 * 6];
     for (what, options) in [
         ("street", &day),
-        ("night", &trouble(Kind::Night)),
-        ("rain", &trouble(Kind::Rain)),
-        ("fog", &trouble(Kind::Fog)),
+        ("night", &trouble(FaultKind::Night)),
+        ("rain", &trouble(FaultKind::Rain)),
+        ("fog", &trouble(FaultKind::Fog)),
     ] {
         take(&world, other, options, folder, what)?;
     }
@@ -113,10 +114,10 @@ fn plan(world: &World, pose: &Rigid, here: &Shot, folder: &Path) -> Result<()> {
     points.save(folder.join("lidar-radar.png"))?;
     let start = Instant::now();
     let grid = Grid::new(*pose, DVec3::new(-40.0, -40.0, -3.0), DVec3::new(40.0, 40.0, 9.8), 0.1)?;
-    let filled = voxels(world.city(), here.seconds, &grid)?;
+    let filled = voxelize(world.city(), here.seconds, &grid)?;
     println!(
         "occupancy: {} of {} voxels in {:.2} s",
-        filled.taken(),
+        filled.occupied_count(),
         filled.semantic.len(),
         start.elapsed().as_secs_f64()
     );
@@ -133,9 +134,9 @@ fn plan(world: &World, pose: &Rigid, here: &Shot, folder: &Path) -> Result<()> {
     Ok(image.save(folder.join("occupancy.png"))?)
 }
 
-fn take(world: &World, shot: &Shot, options: &Options, folder: &Path, what: &str) -> Result<()> {
+fn take(world: &World, shot: &Shot, options: &RenderOptions, folder: &Path, what: &str) -> Result<()> {
     let start = Instant::now();
-    let picture = frame(world, shot, options)?;
+    let picture = render_frame(world, shot, options)?;
     println!("{what}: {} in {:.2} s", shot.name, start.elapsed().as_secs_f64());
     let image =
         image::RgbImage::from_raw(picture.width, picture.height, picture.rgb).ok_or("a picture of another size")?;

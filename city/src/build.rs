@@ -12,7 +12,7 @@ pub(crate) mod vehicle;
 use glam::{Affine3A, Vec2, Vec3};
 
 use crate::materials::{self, Surface};
-use crate::words::{Asset, Class, Mesh};
+use crate::types::{Asset, Class, Mesh};
 
 /// A mesh in the making.
 #[derive(Debug, Clone)]

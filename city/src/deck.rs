@@ -2,11 +2,11 @@
 
 use glam::{Affine3A, DVec2, DVec3, Vec3};
 
-use crate::build::ground::{Layer, Line, Piece, uv};
+use crate::build::ground::{GroundBuilder, Piece, Polyline, uv};
 use crate::materials as m;
 use crate::roads::{Roads, Step};
 use crate::terrain::Terrain;
-use crate::words::Class;
+use crate::types::Class;
 
 /// Half the carriageway on the deck; two lanes each way.
 const HALF: f64 = 6.2;
@@ -25,7 +25,7 @@ const CLOSED: f64 = 2.6;
 
 /// Where the deck runs and how high.
 pub(crate) struct Deck<'a> {
-    line: Line,
+    line: Polyline,
     terrain: &'a Terrain,
     /// Stretches of the line that lie over crossings.
     crossings: Vec<[f64; 2]>,
@@ -43,7 +43,7 @@ impl<'a> Deck<'a> {
             }
         }
         let ring = roads.ring(&walk, &|_| 0.0).0;
-        let line = Line::through(&ring.iter().map(|p| p.at).collect::<Vec<_>>());
+        let line = Polyline::through(&ring.iter().map(|p| p.at).collect::<Vec<_>>());
         let mut crossings: Vec<[f64; 2]> = Vec::new();
         let mut s = 0.0;
         for (k, point) in ring.iter().enumerate() {
@@ -92,7 +92,7 @@ impl<'a> Deck<'a> {
     }
 
     /// The way around: out on the outer lane, a turn at the ramp's foot, and back.
-    pub(crate) fn round(&self) -> Vec<DVec3> {
+    pub(crate) fn route(&self) -> Vec<DVec3> {
         let [from, to] = [FOOT - 5.0, self.line.length - FOOT + 5.0];
         let radius = LANES[1];
         let count = ((to - from) / 4.0) as usize;
@@ -101,11 +101,11 @@ impl<'a> Deck<'a> {
             let angle = std::f64::consts::PI * k as f64 / 8.0;
             self.at(s + way * radius * angle.sin(), -way * radius * angle.cos())
         };
-        let mut round: Vec<DVec3> = (0..=count).map(|k| lane(k, -radius)).collect();
-        round.extend((1..8).map(|k| turn(to, 1.0, k)));
-        round.extend((0..=count).rev().map(|k| lane(k, radius)));
-        round.extend((1..8).map(|k| turn(from, -1.0, k)));
-        round
+        let mut route: Vec<DVec3> = (0..=count).map(|k| lane(k, -radius)).collect();
+        route.extend((1..8).map(|k| turn(to, 1.0, k)));
+        route.extend((0..=count).rev().map(|k| lane(k, radius)));
+        route.extend((1..8).map(|k| turn(from, -1.0, k)));
+        route
     }
 
     /// The deck in pieces of about 60 m.
@@ -117,7 +117,7 @@ impl<'a> Deck<'a> {
     }
 
     fn piece(&self, stations: &[f64], number: usize) -> Piece {
-        let mut layer = Layer::new(self.terrain, self.line.at(stations[0]).0, Class::Bridge);
+        let mut layer = GroundBuilder::new(self.terrain, self.line.at(stations[0]).0, Class::Bridge);
         self.surface(&mut layer, stations);
         for pair in stations.windows(2) {
             self.sides(&mut layer, [pair[0], pair[1]]);
@@ -137,11 +137,11 @@ impl<'a> Deck<'a> {
         layer.finish(format!("deck {number}"))
     }
 
-    fn local(&self, layer: &Layer, s: f64, side: f64, above: f64) -> Vec3 {
+    fn local(&self, layer: &GroundBuilder, s: f64, side: f64, above: f64) -> Vec3 {
         (self.at(s, side) + DVec3::Z * above - layer.origin).as_vec3()
     }
 
-    fn surface(&self, layer: &mut Layer, stations: &[f64]) {
+    fn surface(&self, layer: &mut GroundBuilder, stations: &[f64]) {
         let mut strip = |surface, class, sides: &[f64], above: f64, every: usize, dash: bool| {
             layer.builder.paint(surface).class(class);
             for (k, pair) in stations.windows(2).enumerate() {
@@ -170,7 +170,7 @@ impl<'a> Deck<'a> {
     }
 
     /// The outer faces and the underside between two stations.
-    fn sides(&self, layer: &mut Layer, [a, b]: [f64; 2]) {
+    fn sides(&self, layer: &mut GroundBuilder, [a, b]: [f64; 2]) {
         let edge = HALF + BARRIER;
         let closed = self.lift(a) < CLOSED;
         let bottom = |s: f64, side: f64| {
@@ -191,7 +191,7 @@ impl<'a> Deck<'a> {
     }
 
     /// A concrete foot, posts and a steel beam.
-    fn guardrail(&self, layer: &mut Layer, stations: &[f64], side: f64) {
+    fn guardrail(&self, layer: &mut GroundBuilder, stations: &[f64], side: f64) {
         layer.builder.class(Class::GuardRail);
         let (inner, outer) = (side * HALF, side * (HALF + BARRIER));
         for pair in stations.windows(2) {
@@ -204,7 +204,14 @@ impl<'a> Deck<'a> {
     }
 
     /// A bar of four faces between two stations.
-    fn bar(&self, layer: &mut Layer, [a, b]: [f64; 2], sides: [f64; 2], heights: [f64; 2], surface: m::Surface) {
+    fn bar(
+        &self,
+        layer: &mut GroundBuilder,
+        [a, b]: [f64; 2],
+        sides: [f64; 2],
+        heights: [f64; 2],
+        surface: m::Surface,
+    ) {
         let right = sides[0].min(sides[1]);
         let left = sides[0].max(sides[1]);
         let p = |s: f64, side: f64, above: f64| self.local(layer, s, side, above);
@@ -220,7 +227,7 @@ impl<'a> Deck<'a> {
     }
 
     /// Pillars with heads, clear of crossings.
-    fn piers(&self, layer: &mut Layer, low: f64, high: f64) {
+    fn piers(&self, layer: &mut GroundBuilder, low: f64, high: f64) {
         const EVERY: f64 = 22.0;
         let first = (low / EVERY).ceil() as usize;
         for s in (first..).map(|k| k as f64 * EVERY).take_while(|&s| s < high) {
@@ -241,7 +248,7 @@ impl<'a> Deck<'a> {
     }
 
     /// The wall across where a ramp becomes a bridge; `east` is where it looks.
-    fn abutment(&self, layer: &mut Layer, s: f64, east: bool) {
+    fn abutment(&self, layer: &mut GroundBuilder, s: f64, east: bool) {
         let edge = HALF + BARRIER;
         let p = |side: f64, top: bool| {
             let at = self.at(s, side);

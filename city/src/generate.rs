@@ -10,16 +10,16 @@ use crate::build::furniture;
 use crate::build::ground::{self, Piece};
 use crate::build::person;
 use crate::deck::Deck;
+use crate::lattice::lay_roads;
 use crate::materials;
 use crate::parcels::{Parcel, Placement, upright};
 use crate::props::Prop;
 use crate::random::Random;
-use crate::lattice::lay_roads;
 use crate::roads::Roads;
 use crate::settings::CitySettings;
 use crate::terrain::Terrain;
 use crate::traffic::{self, Mover};
-use crate::words::{Actor, City, Class, Trajectory};
+use crate::types::{Actor, City, Class, Trajectory};
 
 impl City {
     /// Generates a city. Streets, trees and all follow from the settings alone.
@@ -67,7 +67,7 @@ impl City {
             self.add_ground(piece, Class::Road);
         }
         let extent = settings.extent_metres();
-        for piece in ground::country(roads, terrain, 0.5 * extent, settings.plain * extent) {
+        for piece in ground::countryside(roads, terrain, 0.5 * extent, settings.plain * extent) {
             self.add_ground(piece, Class::Terrain);
         }
         for piece in deck.iter().flat_map(|deck| deck.pieces()) {
@@ -85,7 +85,7 @@ impl City {
     /// Builds each shared asset that is used, once, and puts it wherever it stands or moves.
     fn populate(&mut self, placements: &[Placement], movers: Vec<Mover>, seed: &Random) {
         let used: BTreeSet<Prop> =
-            placements.iter().map(|p| p.prop).chain(movers.iter().flat_map(|m| phases(m.prop))).collect();
+            placements.iter().map(|p| p.prop).chain(movers.iter().flat_map(|m| gait_phases(m.prop))).collect();
         let used: Vec<Prop> = used.into_iter().collect();
         let rows: BTreeMap<Prop, u32> = used.iter().copied().zip(self.assets.len() as u32..).collect();
         self.assets.par_extend(used.par_iter().map(|prop| prop.build(seed)));
@@ -100,8 +100,11 @@ impl City {
         self.actors.extend(placements.iter().map(|p| actor(p.prop, p.pose, None)));
         self.actors.extend(movers.into_iter().filter_map(|mover| {
             let pose = mover.waypoints.first()?.world_from_asset;
-            let gait =
-                if mover.gait_seconds.is_some() { phases(mover.prop).map(|p| rows[&p]).collect() } else { Vec::new() };
+            let gait = if mover.gait_seconds.is_some() {
+                gait_phases(mover.prop).map(|p| rows[&p]).collect()
+            } else {
+                Vec::new()
+            };
             let gait_seconds = mover.gait_seconds.unwrap_or(0.0);
             Some(actor(mover.prop, pose, Some(Trajectory { waypoints: mover.waypoints, gait, gait_seconds })))
         }));
@@ -109,7 +112,7 @@ impl City {
 }
 
 /// All shapes that a thing takes as it moves.
-fn phases(prop: Prop) -> impl Iterator<Item = Prop> {
+fn gait_phases(prop: Prop) -> impl Iterator<Item = Prop> {
     let count = if matches!(prop, Prop::Walker { .. }) { person::PHASES as u8 } else { 1 };
     (0..count).map(move |k| match prop {
         Prop::Walker { build, .. } => Prop::Walker { build, phase: k },
@@ -130,8 +133,9 @@ impl Plan {
     fn block(&self, block: usize) -> (Piece, Vec<Placement>) {
         let variants = (3.0 + 2.0 * self.settings.area_km2).min(12.0) as u8;
         let mut parcel = Parcel::new(&self.roads, &self.terrain, block, variants, &self.random);
-        let piece = ground::block(&self.roads, &self.terrain, &parcel.walk, parcel.cover(), format!("block {block}"));
-        parcel.houses();
+        let piece =
+            ground::block_ground(&self.roads, &self.terrain, &parcel.walk, parcel.cover(), format!("block {block}"));
+        parcel.place_houses();
         parcel.furnish();
         (piece, parcel.placements)
     }

@@ -4,7 +4,7 @@ use glam::DVec2;
 use rayon::prelude::*;
 
 use crate::random::Random;
-use crate::roads::{Block, Edge, Quarter, RoadKind, Roads, STEP};
+use crate::roads::{Block, Edge, Quarter, RoadKind, Roads, SAMPLE_METRES};
 use crate::settings::{CitySettings, Layout};
 
 /// Cities narrower than this have no room for three alleys to a cell, nor, unless compact, for bends, metres.
@@ -15,12 +15,12 @@ const MIN_DECK_SPAN: f64 = 128.0;
 /// Lays out the road network of a city.
 pub(crate) fn lay_roads(settings: &CitySettings, random: &Random) -> Roads {
     let mut lattice = Lattice::new(settings, random);
-    let mut roads = lattice.cut();
+    let mut roads = lattice.assign_blocks();
     for index in 0..roads.edges.len() {
         let kind = roads.kind_of(index);
         roads.edges[index] = kind.map(|kind| Edge { profile: kind.profile(), path: Vec::new() });
     }
-    lattice.draw(&mut roads);
+    lattice.draw_paths(&mut roads);
     roads
 }
 
@@ -114,7 +114,7 @@ impl Lattice {
     }
 
     /// Quarters, some of them joined, and blocks.
-    fn cut(&mut self) -> Roads {
+    fn assign_blocks(&mut self) -> Roads {
         let fine = self.fine;
         let cells = [self.xs.len() - 1, self.ys.len() - 1];
         let (columns, rows) = (cells[0] / fine, cells[1] / fine);
@@ -205,19 +205,20 @@ impl Lattice {
     }
 
     /// Lays centre lines through the lattice, cut back at crossings.
-    fn draw(&self, roads: &mut Roads) {
+    fn draw_paths(&self, roads: &mut Roads) {
         let place = |i: usize, j: usize| self.bend(self.xs[i], self.ys[j]);
         let [nx, ny] = roads.cells;
         roads.nodes = (0..=ny).flat_map(|j| (0..=nx).map(move |i| (i, j))).map(|(i, j)| place(i, j)).collect();
-        let lines: Vec<Vec<DVec2>> = (0..roads.edges.len()).map(|e| self.line(roads, e)).collect();
+        let lines: Vec<Vec<DVec2>> = (0..roads.edges.len()).map(|e| self.edge_line(roads, e)).collect();
         let cuts: Vec<[f64; 4]> = {
             let roads: &Roads = roads;
-            (0..roads.nodes.len()).into_par_iter().map(|n| cuts(roads, &lines, n)).collect()
+            (0..roads.nodes.len()).into_par_iter().map(|n| arm_cuts(roads, &lines, n)).collect()
         };
         // as many samples on every edge of a column (of a row), so that the sides of a block match
         let lengths: Vec<f64> = lines.iter().map(|l| l.windows(2).map(|w| w[0].distance(w[1])).sum()).collect();
-        let longest = |edges: &mut dyn Iterator<Item = usize>| edges.fold(STEP, |most, e| lengths[e].max(most));
-        let count = |length: f64| (length / STEP).ceil() as usize;
+        let longest =
+            |edges: &mut dyn Iterator<Item = usize>| edges.fold(SAMPLE_METRES, |most, e| lengths[e].max(most));
+        let count = |length: f64| (length / SAMPLE_METRES).ceil() as usize;
         for i in 0..nx {
             let samples = count(longest(&mut (0..=ny).map(|j| roads.horizontal(i, j))));
             for j in 0..=ny {
@@ -237,7 +238,7 @@ impl Lattice {
     }
 
     /// An edge's whole line from node to node, finely.
-    fn line(&self, roads: &Roads, edge: usize) -> Vec<DVec2> {
+    fn edge_line(&self, roads: &Roads, edge: usize) -> Vec<DVec2> {
         const FINE: usize = 48;
         let horizontals = self.horizontals(roads);
         let t = (0..=FINE).map(|k| k as f64 / FINE as f64);
@@ -410,7 +411,7 @@ impl Arm {
 }
 
 /// How far from a node each of its arms begins: where its fronts have left its neighbours'.
-fn cuts(roads: &Roads, lines: &[Vec<DVec2>], node: usize) -> [f64; 4] {
+fn arm_cuts(roads: &Roads, lines: &[Vec<DVec2>], node: usize) -> [f64; 4] {
     let mut cuts = [0.0f64; 4];
     let arms: Vec<Arm> = (0..4).filter_map(|arm| Arm::new(roads, lines, node, arm)).collect();
     for k in 0..arms.len() {

@@ -23,12 +23,12 @@ pub mod random;
 mod roads;
 pub mod sense;
 pub mod settings;
-pub mod stage;
-mod streetside;
+mod street_furniture;
 mod terrain;
+pub mod test_scene;
 pub mod trace;
 mod traffic;
-pub mod words;
+pub mod types;
 
 pub use settings::{CitySettings, Layout, Traffic};
-pub use words::{Actor, Asset, City, Class, Material, Mesh, Pattern, Trajectory, Waypoint};
+pub use types::{Actor, Asset, City, Class, Material, Mesh, Pattern, Trajectory, Waypoint};

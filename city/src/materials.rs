@@ -9,7 +9,7 @@
 use glam::{Vec2, Vec3};
 
 use crate::random::Random;
-use crate::words::{Material, Pattern};
+use crate::types::{Material, Pattern};
 
 /// A row of the table.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -150,7 +150,7 @@ const fn is_glass(surface: Surface) -> bool {
 const FIRST_TEXT: u16 = PLASTIC_RED.0 + 1;
 
 /// What signs say: words, ink, ground, in groups.
-type Words = (&'static str, [f32; 3], [f32; 3]);
+type SignText = (&'static str, [f32; 3], [f32; 3]);
 
 const WHITE: [f32; 3] = [0.85, 0.85, 0.83];
 const BLACK: [f32; 3] = [0.02, 0.02, 0.02];
@@ -161,7 +161,7 @@ const CREAM: [f32; 3] = [0.75, 0.65, 0.45];
 const GOLD: [f32; 3] = [0.7, 0.45, 0.08];
 
 /// Names over shops.
-const SHOPS: [Words; 16] = [
+const SHOPS: [SignText; 16] = [
     ("BAKERY", GOLD, [0.12, 0.06, 0.03]),
     ("CAFE LUNA", WHITE, GREEN),
     ("BOOKS & MAPS", BLACK, CREAM),
@@ -180,7 +180,7 @@ const SHOPS: [Words; 16] = [
     ("RECORDS", RED, BLACK),
 ];
 /// Names of streets.
-const STREETS: [Words; 12] = [
+const STREETS: [SignText; 12] = [
     ("LIME STREET", WHITE, BLUE),
     ("MILL LANE", WHITE, BLUE),
     ("STATION ROAD", WHITE, BLUE),
@@ -195,7 +195,7 @@ const STREETS: [Words; 12] = [
     ("FOUNDRY LANE", WHITE, BLUE),
 ];
 /// What traffic signs say.
-const ORDERS: [Words; 6] = [
+const TRAFFIC_SIGNS: [SignText; 6] = [
     ("STOP", WHITE, RED),
     ("30", BLACK, WHITE),
     ("50", BLACK, WHITE),
@@ -204,10 +204,10 @@ const ORDERS: [Words; 6] = [
     ("TAXI", BLACK, GOLD),
 ];
 /// Number plates.
-const PLATES: [Words; 4] =
+const PLATES: [SignText; 4] =
     [("PL 4711", BLACK, WHITE), ("AT 2026", BLACK, WHITE), ("GS 3141", BLACK, WHITE), ("KX 1618", BLACK, WHITE)];
 /// Routes and advertisements.
-const POSTERS: [Words; 6] = [
+const POSTERS: [SignText; 6] = [
     ("12 CENTRAL", GOLD, BLACK),
     ("42 HARBOUR", GOLD, BLACK),
     ("CIRCUS!", RED, CREAM),
@@ -216,8 +216,8 @@ const POSTERS: [Words; 6] = [
     ("JAZZ FRIDAY", GOLD, [0.08, 0.03, 0.2]),
 ];
 
-fn words() -> impl Iterator<Item = Words> {
-    SHOPS.into_iter().chain(STREETS).chain(ORDERS).chain(PLATES).chain(POSTERS)
+fn sign_texts() -> impl Iterator<Item = SignText> {
+    SHOPS.into_iter().chain(STREETS).chain(TRAFFIC_SIGNS).chain(PLATES).chain(POSTERS)
 }
 
 fn text(group: usize, k: usize) -> Surface {
@@ -234,24 +234,24 @@ pub(crate) fn street_names() -> impl Iterator<Item = Surface> {
 }
 
 /// 0 stop, 1 thirty, 2 fifty, 3 parking, 4 bus, 5 taxi.
-pub(crate) fn order(k: usize) -> Surface {
-    text(SHOPS.len() + STREETS.len(), k.min(ORDERS.len() - 1))
+pub(crate) fn traffic_sign(k: usize) -> Surface {
+    text(SHOPS.len() + STREETS.len(), k.min(TRAFFIC_SIGNS.len() - 1))
 }
 
 pub(crate) fn number_plate(random: &mut Random) -> Surface {
-    text(SHOPS.len() + STREETS.len() + ORDERS.len(), random.below(PLATES.len()))
+    text(SHOPS.len() + STREETS.len() + TRAFFIC_SIGNS.len(), random.below(PLATES.len()))
 }
 
 /// 0 and 1 are bus routes, the others advertisements.
 pub(crate) fn poster(k: usize) -> Surface {
-    text(SHOPS.len() + STREETS.len() + ORDERS.len() + PLATES.len(), k.min(POSTERS.len() - 1))
+    text(SHOPS.len() + STREETS.len() + TRAFFIC_SIGNS.len() + PLATES.len(), k.min(POSTERS.len() - 1))
 }
 
 /// The whole table, and what its texts say.
 pub(crate) fn table() -> (Vec<Material>, Vec<String>) {
     let mut materials = rows();
-    let texts: Vec<String> = words().map(|(text, ..)| text.to_owned()).collect();
-    materials.extend(words().enumerate().map(|(row, (text, ink, ground))| Material {
+    let texts: Vec<String> = sign_texts().map(|(text, ..)| text.to_owned()).collect();
+    materials.extend(sign_texts().enumerate().map(|(row, (text, ink, ground))| Material {
         name: format!("sign, {text}"),
         base_colour: Vec3::from(ground),
         roughness: 0.45,
@@ -285,7 +285,7 @@ mod tests {
         }
         let named = |s: Surface| materials[usize::from(s.0)].name.clone();
         assert_eq!(
-            [named(order(0)), named(poster(5)), named(GLASS)],
+            [named(traffic_sign(0)), named(poster(5)), named(GLASS)],
             ["sign, STOP", "sign, JAZZ FRIDAY", "window glass"]
         );
         assert_eq!(street_names().map(named).next().unwrap(), "sign, LIME STREET");

@@ -21,7 +21,7 @@ use crate::{
 /// [`Voxels::semantic`] of a free voxel.
 pub const FREE: u8 = 255;
 /// The most voxels of a grid.
-pub const MOST_VOXELS: u64 = 1 << 29;
+pub const MAX_VOXELS: u64 = 1 << 29;
 
 /// Where voxels are: cubes along the axes of a frame.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -42,7 +42,7 @@ impl Grid {
     ///
     /// # Errors
     /// [`GridError`] for a block that cannot be.
-    pub fn of_block(low: DVec3, high: DVec3, voxel_metres: f64) -> Result<Self, GridError> {
+    pub fn world_aligned(low: DVec3, high: DVec3, voxel_metres: f64) -> Result<Self, GridError> {
         Self::new(Rigid::IDENTITY, low, high, voxel_metres)
     }
 
@@ -54,7 +54,7 @@ impl Grid {
         // a hair less, so that 51.2 m are 512 voxels of 0.1 m whatever the rounding
         let cells = ((high - low) / voxel_metres - 1e-6).ceil();
         if !(cells.is_finite() && cells.min_element() >= 1.0 && cells.max_element() < 1e6) {
-            return Err(GridError::Setting);
+            return Err(GridError::OutOfRange);
         }
         let grid = Self { world_from_grid, low, size: cells.as_uvec3(), voxel_metres };
         grid.check()?;
@@ -62,26 +62,26 @@ impl Grid {
     }
 
     /// # Errors
-    /// [`GridError`] for numbers that are none and for more voxels than [`MOST_VOXELS`].
+    /// [`GridError`] for numbers that are none and for more voxels than [`MAX_VOXELS`].
     pub fn check(&self) -> Result<(), GridError> {
         let voxels = self.size.to_array().iter().try_fold(1u64, |product, &n| product.checked_mul(u64::from(n)));
-        if voxels.is_none_or(|n| n > MOST_VOXELS) {
+        if voxels.is_none_or(|n| n > MAX_VOXELS) {
             return Err(GridError::TooLarge);
         }
         let sane = self.world_from_grid.is_sane() && self.low.is_finite() && self.low.abs().max_element() < 1e7;
-        if sane && (1e-3..=1e3).contains(&self.voxel_metres) { Ok(()) } else { Err(GridError::Setting) }
+        if sane && (1e-3..=1e3).contains(&self.voxel_metres) { Ok(()) } else { Err(GridError::OutOfRange) }
     }
 }
 
 /// A grid that cannot be filled.
 #[derive(Debug, thiserror::Error, Clone, Copy, PartialEq, Eq)]
 pub enum GridError {
-    /// More than [`MOST_VOXELS`].
-    #[error("more than {MOST_VOXELS} voxels")]
+    /// More than [`MAX_VOXELS`].
+    #[error("more than {MAX_VOXELS} voxels")]
     TooLarge,
     /// A number that is none, or out of its range.
     #[error("a grid's corners, pose or voxel is out of range")]
-    Setting,
+    OutOfRange,
 }
 
 /// What is in each voxel, x fastest, then y, then z.
@@ -104,7 +104,7 @@ impl Voxels {
     }
 
     /// How many voxels are taken.
-    pub fn taken(&self) -> usize {
+    pub fn occupied_count(&self) -> usize {
         self.semantic.iter().filter(|&&class| class != FREE).count()
     }
 }
@@ -113,7 +113,7 @@ impl Voxels {
 ///
 /// # Errors
 /// [`GridError`] for a grid that cannot be filled.
-pub fn voxels(city: &City, seconds: f64, grid: &Grid) -> Result<Voxels, GridError> {
+pub fn voxelize(city: &City, seconds: f64, grid: &Grid) -> Result<Voxels, GridError> {
     grid.check()?;
     let faces = faces(city, seconds, grid);
     let layer = grid.size.x as usize * grid.size.y as usize;
@@ -121,8 +121,8 @@ pub fn voxels(city: &City, seconds: f64, grid: &Grid) -> Result<Voxels, GridErro
     let (mut semantic, mut instance, mut rank) = (vec![FREE; total], vec![0u32; total], vec![0u8; total]);
     let layers = semantic.par_chunks_mut(layer).zip(instance.par_chunks_mut(layer)).zip(rank.par_chunks_mut(layer));
     layers.enumerate().for_each(|(z, ((semantic, instance), rank))| {
-        for face in faces.iter().filter(|face| face.reaches(z)) {
-            face.fill(grid.size, z, |i| {
+        for face in faces.iter().filter(|face| face.overlaps_layer(z)) {
+            face.for_each_voxel(grid.size, z, |i| {
                 if face.rank > rank[i] {
                     (semantic[i], instance[i], rank[i]) = (face.class as u8, face.instance, face.rank);
                 }
@@ -200,18 +200,18 @@ fn rank(class: Class, instance: u32) -> u8 {
 }
 
 impl Face {
-    fn reaches(&self, z: usize) -> bool {
+    fn overlaps_layer(&self, z: usize) -> bool {
         self.low.z < (z + 1) as f64 && self.high.z >= z as f64
     }
 
     /// Calls for each voxel of a layer that the triangle meets.
-    fn fill(&self, size: UVec3, z: usize, mut call: impl FnMut(usize)) {
+    fn for_each_voxel(&self, size: UVec3, z: usize, mut call: impl FnMut(usize)) {
         let first = |low: f64| low.floor().max(0.0) as u32;
         let end = |high: f64, n: u32| (high.floor() + 1.0).clamp(0.0, f64::from(n)) as u32;
         for y in first(self.low.y)..end(self.high.y, size.y) {
-            let Some((from, to)) = self.span(f64::from(y), z as f64) else { continue };
+            let Some((from, to)) = self.row_span(f64::from(y), z as f64) else { continue };
             for x in first(self.low.x.max(from))..end(self.high.x.min(to), size.x) {
-                if self.meets(DVec3::new(f64::from(x), f64::from(y), z as f64)) {
+                if self.intersects(DVec3::new(f64::from(x), f64::from(y), z as f64)) {
                     call((y * size.x + x) as usize);
                 }
             }
@@ -219,7 +219,7 @@ impl Face {
     }
 
     /// Where, along a row of voxels, the triangle's plane can be; so that a large slope costs what its surface is.
-    fn span(&self, y: f64, z: f64) -> Option<(f64, f64)> {
+    fn row_span(&self, y: f64, z: f64) -> Option<(f64, f64)> {
         let [a, b, c] = self.corners;
         let n = (b - a).cross(c - a);
         if n.x.abs() < 0.1 * n.abs().max_element() {
@@ -232,7 +232,7 @@ impl Face {
     }
 
     /// Whether the triangle meets the voxel with this lowest corner.
-    fn meets(&self, voxel: DVec3) -> bool {
+    fn intersects(&self, voxel: DVec3) -> bool {
         // along the voxel's own axes: half-open
         let top = voxel + 1.0;
         if self.low.cmpge(top).any() || self.high.cmplt(voxel).any() {
@@ -254,22 +254,22 @@ impl Face {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::stage;
+    use crate::test_scene;
     use glam::{DQuat, Vec3, vec3};
 
     /// A box from (0.33, 0.33, 0.33) to (1.77, 1.27, 2.12).
     fn boxed() -> City {
-        let mut city = City { materials: stage::city().materials, ..City::default() };
-        let mesh = stage::cuboid(vec3(0.33, 0.33, 0.33), vec3(1.77, 1.27, 2.12), 0, Class::Car);
-        stage::put(&mut city, "box", mesh, Class::Car, 5, DVec3::ZERO);
+        let mut city = City { materials: test_scene::city().materials, ..City::default() };
+        let mesh = test_scene::cuboid(vec3(0.33, 0.33, 0.33), vec3(1.77, 1.27, 2.12), 0, Class::Car);
+        test_scene::add_actor(&mut city, "box", mesh, Class::Car, 5, DVec3::ZERO);
         city
     }
 
     #[test]
     fn a_known_box_takes_exactly_the_shell_of_its_voxels() {
         for voxel in [0.05, 0.1, 0.5] {
-            let grid = Grid::of_block(DVec3::splat(-0.5), DVec3::new(2.5, 2.0, 3.0), voxel).unwrap();
-            let filled = voxels(&boxed(), 0.0, &grid).unwrap();
+            let grid = Grid::world_aligned(DVec3::splat(-0.5), DVec3::new(2.5, 2.0, 3.0), voxel).unwrap();
+            let filled = voxelize(&boxed(), 0.0, &grid).unwrap();
             let cell = |metres: f64| ((metres + 0.5) / voxel).floor() as u32;
             let low = UVec3::splat(cell(0.33));
             let high = UVec3::new(cell(1.77), cell(1.27), cell(2.12));
@@ -291,14 +291,14 @@ mod tests {
     #[test]
     fn a_slope_takes_no_voxel_that_it_does_not_meet() {
         // the plane x + y + z = 3.3 within the first octant, against its own arithmetic
-        let mut city = City { materials: stage::city().materials, ..City::default() };
-        let mut mesh = stage::rectangle(Vec3::ZERO, Vec3::X, Vec3::Y, 0, Class::Wall);
+        let mut city = City { materials: test_scene::city().materials, ..City::default() };
+        let mut mesh = test_scene::rectangle(Vec3::ZERO, Vec3::X, Vec3::Y, 0, Class::Wall);
         mesh.positions = vec![Vec3::X * 3.3, Vec3::Y * 3.3, Vec3::Z * 3.3];
         mesh.uvs.truncate(3);
         (mesh.triangles, mesh.materials, mesh.classes) = (vec![[0, 1, 2]], vec![0], vec![Class::Wall]);
-        stage::put(&mut city, "slope", mesh, Class::Wall, 1, DVec3::ZERO);
-        let grid = Grid::of_block(DVec3::ZERO, DVec3::splat(4.0), 0.5).unwrap();
-        let filled = voxels(&city, 0.0, &grid).unwrap();
+        test_scene::add_actor(&mut city, "slope", mesh, Class::Wall, 1, DVec3::ZERO);
+        let grid = Grid::world_aligned(DVec3::ZERO, DVec3::splat(4.0), 0.5).unwrap();
+        let filled = voxelize(&city, 0.0, &grid).unwrap();
         for i in 0..512u32 {
             let at = UVec3::new(i % 8, i / 8 % 8, i / 64);
             let low = at.as_dvec3().element_sum() * 0.5;
@@ -308,13 +308,13 @@ mod tests {
 
     #[test]
     fn around_a_pose_the_grid_turns_with_it() {
-        let city = stage::city();
+        let city = test_scene::city();
         let pose = Rigid {
             rotation: DQuat::from_rotation_z(std::f64::consts::FRAC_PI_2),
             translation: DVec3::new(0.0, -1.0, 0.0),
         };
         let grid = Grid::new(pose, DVec3::new(0.05, -4.0, -0.95), DVec3::new(16.05, 4.0, 4.05), 0.1).unwrap();
-        let filled = voxels(&city, 100.0, &grid).unwrap();
+        let filled = voxelize(&city, 100.0, &grid).unwrap();
         // ahead of the pose is +y: the pane 11 m ahead, the wall 13 m ahead
         let at = |x: f64, y: f64, z: f64| filled.index(((DVec3::new(x, y, z) - grid.low) / 0.1).as_uvec3());
         assert_eq!(
@@ -325,17 +325,17 @@ mod tests {
         assert_eq!(filled.semantic[at(12.0, 0.0, 1.5)], FREE);
         assert_eq!(filled.semantic[at(5.0, 0.0, 0.0)], Class::Road as u8);
         let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
-        assert_eq!(pool.install(|| voxels(&city, 100.0, &grid).unwrap()), filled);
+        assert_eq!(pool.install(|| voxelize(&city, 100.0, &grid).unwrap()), filled);
     }
 
     #[test]
     fn grids_that_cannot_be_are_refused() {
-        let block = |high: f64, voxel: f64| Grid::of_block(DVec3::ZERO, DVec3::splat(high), voxel);
+        let block = |high: f64, voxel: f64| Grid::world_aligned(DVec3::ZERO, DVec3::splat(high), voxel);
         assert_eq!(block(1000.0, 0.05), Err(GridError::TooLarge));
-        assert_eq!(block(10.0, 0.0), Err(GridError::Setting));
-        assert_eq!(block(-1.0, 0.1), Err(GridError::Setting));
-        assert_eq!(block(f64::NAN, 0.1), Err(GridError::Setting));
+        assert_eq!(block(10.0, 0.0), Err(GridError::OutOfRange));
+        assert_eq!(block(-1.0, 0.1), Err(GridError::OutOfRange));
+        assert_eq!(block(f64::NAN, 0.1), Err(GridError::OutOfRange));
         let huge = Grid { size: UVec3::MAX, ..block(1.0, 0.1).unwrap() };
-        assert_eq!(voxels(&City::default(), 0.0, &huge).unwrap_err(), GridError::TooLarge);
+        assert_eq!(voxelize(&City::default(), 0.0, &huge).unwrap_err(), GridError::TooLarge);
     }
 }

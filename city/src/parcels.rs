@@ -3,15 +3,15 @@
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use scene::Rigid;
 
-use crate::build::ground::{Cover, Line};
+use crate::build::ground::{Cover, Polyline};
 use crate::build::house::{HouseKind, PLINTH, WIDTHS};
 use crate::materials as m;
 use crate::props::Prop;
 use crate::random::Random;
-use crate::roads::{CORNER, Profile, RoadKind, Roads, Step};
+use crate::roads::{CORNER_POINTS, Profile, RoadKind, Roads, Step};
 use crate::settings::Layout;
 use crate::terrain::Terrain;
-use crate::words::Class;
+use crate::types::Class;
 
 /// A shared asset at a place.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -20,9 +20,9 @@ pub(crate) struct Placement {
     pub(crate) pose: Rigid,
 }
 
-/// What a block is used for.
+/// What a block is land_use for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Use {
+pub(crate) enum LandUse {
     Houses,
     Park,
     Square,
@@ -35,7 +35,7 @@ pub(crate) struct Parcel<'a> {
     pub(crate) terrain: &'a Terrain,
     pub(crate) walk: Vec<Step>,
     pub(crate) layout: Layout,
-    pub(crate) used: Use,
+    pub(crate) land_use: LandUse,
     pub(crate) random: Random,
     /// Variants of each kind and width of house.
     pub(crate) variants: u8,
@@ -60,7 +60,7 @@ impl Footprint {
     }
 
     /// Whether two come closer than this (separating axes; negative allows an overlap).
-    pub(crate) fn meets(&self, other: &Self, gap: f64) -> bool {
+    pub(crate) fn overlaps(&self, other: &Self, gap: f64) -> bool {
         let between = other.centre - self.centre;
         [self.along, self.along.perp(), other.along, other.along.perp()].into_iter().all(|axis| {
             let reach = |f: &Self| f.half.x * axis.dot(f.along).abs() + f.half.y * axis.dot(f.along.perp()).abs();
@@ -94,28 +94,38 @@ impl<'a> Parcel<'a> {
     pub(crate) fn new(roads: &'a Roads, terrain: &'a Terrain, block: usize, variants: u8, random: &Random) -> Self {
         let layout = roads.quarters[roads.blocks[block].quarter].layout;
         let mut random = random.fork(0xB10C).fork(block as u64);
-        let used = match (layout, random.unit()) {
+        let land_use = match (layout, random.unit()) {
             // a compact city has too few blocks to give one away
-            _ if roads.is_compact => Use::Houses,
-            (Layout::CurvedCorridor, _) => Use::Houses,
-            (Layout::Alley, u) if u < 0.05 => Use::Square,
-            (Layout::Alley, _) => Use::Houses,
-            (_, u) if u < 0.08 => Use::Park,
-            (_, u) if u < 0.12 => Use::Square,
-            (_, u) if u < 0.17 => Use::CarPark,
-            _ => Use::Houses,
+            _ if roads.is_compact => LandUse::Houses,
+            (Layout::CurvedCorridor, _) => LandUse::Houses,
+            (Layout::Alley, u) if u < 0.05 => LandUse::Square,
+            (Layout::Alley, _) => LandUse::Houses,
+            (_, u) if u < 0.08 => LandUse::Park,
+            (_, u) if u < 0.12 => LandUse::Square,
+            (_, u) if u < 0.17 => LandUse::CarPark,
+            _ => LandUse::Houses,
         };
-        let walk = roads.around(roads.blocks[block].lines);
-        Self { roads, terrain, walk, layout, used, random, variants, footprints: Vec::new(), placements: Vec::new() }
+        let walk = roads.walk_around(roads.blocks[block].lines);
+        Self {
+            roads,
+            terrain,
+            walk,
+            layout,
+            land_use,
+            random,
+            variants,
+            footprints: Vec::new(),
+            placements: Vec::new(),
+        }
     }
 
     /// What covers the block's ground.
     pub(crate) fn cover(&self) -> Cover {
         let lawn = (m::LAWN, Class::Terrain);
-        let (ground, rim) = match (self.used, self.layout) {
-            (Use::Park, _) => (lawn, lawn),
-            (Use::Square, _) => ((m::PAVERS, Class::Sidewalk), (m::SLABS, Class::Sidewalk)),
-            (Use::CarPark, _) => ((m::ASPHALT_FRESH, Class::Terrain), (m::GRAVEL, Class::Terrain)),
+        let (ground, rim) = match (self.land_use, self.layout) {
+            (LandUse::Park, _) => (lawn, lawn),
+            (LandUse::Square, _) => ((m::PAVERS, Class::Sidewalk), (m::SLABS, Class::Sidewalk)),
+            (LandUse::CarPark, _) => ((m::ASPHALT_FRESH, Class::Terrain), (m::GRAVEL, Class::Terrain)),
             (_, Layout::Winding) => (lawn, lawn),
             (_, Layout::Alley) => ((m::GRAVEL, Class::Terrain), (m::PAVERS, Class::Terrain)),
             _ => (lawn, (m::GRAVEL, Class::Terrain)),
@@ -139,43 +149,43 @@ impl<'a> Parcel<'a> {
         .curb
     }
 
-    pub(crate) fn put(&mut self, prop: Prop, pose: Rigid) {
+    pub(crate) fn place(&mut self, prop: Prop, pose: Rigid) {
         self.placements.push(Placement { prop, pose });
     }
 
     /// The four sides without their corners, at a distance from the centre lines: counter-clockwise, the block on the left.
-    pub(crate) fn sides(&self, distance: &dyn Fn(&Profile) -> f64) -> Vec<(Line, Profile)> {
+    pub(crate) fn sides(&self, distance: &dyn Fn(&Profile) -> f64) -> Vec<(Polyline, Profile)> {
         let (ring, turns) = self.roads.ring(&self.walk, distance);
         let count = ring.len();
         (0..turns.len())
             .map(|s| {
                 let (before, turn) = (turns[(s + turns.len() - 1) % turns.len()], turns[s]);
-                let from = before + CORNER / 2 + 1;
-                let to = turn - CORNER / 2 - 1;
+                let from = before + CORNER_POINTS / 2 + 1;
+                let to = turn - CORNER_POINTS / 2 - 1;
                 let from = if from > to { from - count } else { from };
                 let points: Vec<DVec2> = (from..=to).map(|k| ring[k % count].at).collect();
-                (Line::through(&points), ring[from.midpoint(to) % count].profile)
+                (Polyline::through(&points), ring[from.midpoint(to) % count].profile)
             })
             .collect()
     }
 
     /// Rows of houses on all four sides.
-    pub(crate) fn houses(&mut self) {
-        if self.used != Use::Houses {
+    pub(crate) fn place_houses(&mut self) {
+        if self.land_use != LandUse::Houses {
             return;
         }
         let outline: Vec<DVec2> = self.roads.ring(&self.walk, &Profile::front).0.iter().map(|p| p.at).collect();
         let mut sides = self.sides(&Profile::front);
         if self.roads.is_compact {
-            // blocks are not deep enough for houses on all sides: those on the widest road come first
+            // blocks are not deep enough for houses on all sides: those on the fitting_widths road come first
             sides.sort_by(|a, b| b.1.front().total_cmp(&a.1.front()));
         }
         for (line, profile) in sides {
-            self.row(&line, &profile, &outline);
+            self.place_row(&line, &profile, &outline);
         }
     }
 
-    fn kind(&mut self, profile: &Profile) -> HouseKind {
+    fn house_kind(&mut self, profile: &Profile) -> HouseKind {
         let unit = self.random.unit();
         match (self.layout, profile.kind) {
             (Layout::Winding, _) => HouseKind::Villa,
@@ -192,24 +202,24 @@ impl<'a> Parcel<'a> {
     }
 
     /// Houses along a front.
-    fn row(&mut self, line: &Line, profile: &Profile, outline: &[DVec2]) {
+    fn place_row(&mut self, line: &Polyline, profile: &Profile, outline: &[DVec2]) {
         let villas = self.layout == Layout::Winding;
         let mut s = if villas { self.random.range(1.0, 4.0).into() } else { 0.0 };
         while s + f64::from(WIDTHS[0]) <= line.length {
-            let kind = self.kind(profile);
-            let least = match kind {
+            let kind = self.house_kind(profile);
+            let min_width = match kind {
                 HouseKind::Tower => 4,
                 HouseKind::Villa => 2,
                 _ => 0,
             };
-            let widest = WIDTHS.iter().filter(|&&w| f64::from(w) <= line.length - s).count();
-            if widest <= least {
+            let fitting_widths = WIDTHS.iter().filter(|&&w| f64::from(w) <= line.length - s).count();
+            if fitting_widths <= min_width {
                 break;
             }
-            let most = if kind == HouseKind::Old { widest.min(4) } else { widest };
-            let width = least + self.random.below(most - least);
+            let max_width = if kind == HouseKind::Old { fitting_widths.min(4) } else { fitting_widths };
+            let width = min_width + self.random.below(max_width - min_width);
             let back = if villas { self.random.range(3.0, 6.5) } else { 0.0 };
-            self.lot(line, s, kind, width, back.into(), outline);
+            self.place_house(line, s, kind, width, back.into(), outline);
             s += f64::from(WIDTHS[width]);
             s += match kind {
                 HouseKind::Villa => self.random.range(4.0, 9.0).into(),
@@ -222,7 +232,7 @@ impl<'a> Parcel<'a> {
     }
 
     /// A house at `s` along a front, if there is room for it behind.
-    fn lot(&mut self, line: &Line, s: f64, kind: HouseKind, width: usize, back: f64, outline: &[DVec2]) {
+    fn place_house(&mut self, line: &Polyline, s: f64, kind: HouseKind, width: usize, back: f64, outline: &[DVec2]) {
         let size = DVec2::new(WIDTHS[width].into(), kind.depth().into());
         let points: Vec<DVec2> = (0..=4).map(|k| line.at(s + size.x * f64::from(k) / 4.0).0).collect();
         let along = (points[4] - points[0]).normalize_or(DVec2::X);
@@ -233,7 +243,7 @@ impl<'a> Parcel<'a> {
         let footprint = Footprint { centre: front + 0.5 * size.y * inwards, along, half: 0.5 * size };
         let overlap = if kind == HouseKind::Villa { 1.5 } else { -1.4 };
         let inside = footprint.corners().iter().all(|c| contains(outline, c.lerp(footprint.centre, 0.02)));
-        if !inside || self.footprints.iter().any(|other| footprint.meets(other, overlap)) {
+        if !inside || self.footprints.iter().any(|other| footprint.overlaps(other, overlap)) {
             return;
         }
         let high = points.iter().map(|&p| self.ground(p + behind * inwards).z).fold(f64::NEG_INFINITY, f64::max);
@@ -243,7 +253,7 @@ impl<'a> Parcel<'a> {
         }
         let variant = self.random.below(usize::from(self.variants)) as u8;
         self.footprints.push(footprint);
-        self.put(Prop::House { kind, width: width as u8, variant }, upright(front.extend(high), along));
+        self.place(Prop::House { kind, width: width as u8, variant }, upright(front.extend(high), along));
     }
 }
 

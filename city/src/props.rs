@@ -6,7 +6,7 @@ use crate::build::person;
 use crate::build::tree;
 use crate::build::vehicle::{self, VehicleKind};
 use crate::random::Random;
-use crate::words::{Asset, Class};
+use crate::types::{Asset, Class};
 
 /// A shared asset's name.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]

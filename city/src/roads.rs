@@ -118,9 +118,9 @@ pub(crate) struct Roads {
 }
 
 /// Points of a rounded corner between the roads that meet in it, without its ends: odd, so that one is the middle.
-pub(crate) const CORNER: usize = 5;
+pub(crate) const CORNER_POINTS: usize = 5;
 /// Sampling of roads, metres.
-pub(crate) const STEP: f64 = 4.0;
+pub(crate) const SAMPLE_METRES: f64 = 4.0;
 
 /// A point of a ring.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -161,7 +161,7 @@ impl Roads {
     }
 
     /// The end of an arm at its node: place, direction away from the node, profile.
-    pub(crate) fn mouth(&self, node: usize, arm: usize) -> Option<(DVec2, DVec2, Profile)> {
+    pub(crate) fn arm_end(&self, node: usize, arm: usize) -> Option<(DVec2, DVec2, Profile)> {
         let (index, away) = self.arm(node, arm)?;
         let edge = self.edges[index].as_ref()?;
         let (at, direction) = *if away { edge.path.first() } else { edge.path.last() }?;
@@ -169,7 +169,7 @@ impl Roads {
     }
 
     /// The two quarters beside an edge.
-    fn beside(&self, index: usize) -> [Option<usize>; 2] {
+    fn adjacent_blocks(&self, index: usize) -> [Option<usize>; 2] {
         let horizontals = self.cells[0] * (self.cells[1] + 1);
         let cell = |i: usize, j: usize| (i < self.cells[0] && j < self.cells[1]).then(|| self.block_at(i, j));
         if index < horizontals {
@@ -195,7 +195,7 @@ impl Roads {
         let horizontals = self.cells[0] * (self.cells[1] + 1);
         let line =
             if index < horizontals { index / self.cells[0] } else { (index - horizontals) % (self.cells[0] + 1) };
-        let sides = self.beside(index);
+        let sides = self.adjacent_blocks(index);
         if sides[0] == sides[1] {
             return None;
         }
@@ -217,7 +217,7 @@ impl Roads {
     }
 
     /// The walk around a rectangle of lattice lines with it on the left; the four corners are its 'turns'.
-    pub(crate) fn around(&self, [west, east, south, north]: [usize; 4]) -> Vec<Step> {
+    pub(crate) fn walk_around(&self, [west, east, south, north]: [usize; 4]) -> Vec<Step> {
         let mut steps = Vec::new();
         let mut side = |count: usize, arm: usize, edge: &dyn Fn(usize) -> usize, node: &dyn Fn(usize) -> usize| {
             for k in 0..count {
@@ -236,8 +236,8 @@ impl Roads {
     }
 
     /// The walk around the whole city with the country on the left.
-    pub(crate) fn outside(&self) -> Vec<Step> {
-        let mut steps = self.around([0, self.cells[0], 0, self.cells[1]]);
+    pub(crate) fn walk_outside(&self) -> Vec<Step> {
+        let mut steps = self.walk_around([0, self.cells[0], 0, self.cells[1]]);
         // the last corner is the first of the way back
         steps.reverse();
         steps.rotate_left(1);
@@ -270,7 +270,7 @@ impl Roads {
                 }
                 Step::Through { node, from, to, turn } => {
                     if turn {
-                        turns.push(ring.len() + CORNER / 2);
+                        turns.push(ring.len() + CORNER_POINTS / 2);
                     }
                     ring.extend(self.corner(node, from, to, distance).map(|at| RingPoint { at, profile, step }));
                 }
@@ -288,7 +288,7 @@ impl Roads {
         distance: &dyn Fn(&Profile) -> f64,
     ) -> impl Iterator<Item = DVec2> + use<> {
         let end = |arm: usize, side: f64| {
-            self.mouth(node, arm).map(|(at, out, profile)| (at + side * distance(&profile) * out.perp(), out))
+            self.arm_end(node, arm).map(|(at, out, profile)| (at + side * distance(&profile) * out.perp(), out))
         };
         // to the left of who comes in is to the right of who looks out
         let ends = end(from, -1.0).zip(end(to, 1.0));
@@ -300,8 +300,8 @@ impl Roads {
             let near = cross.abs() > 0.15 && (meet - middle).length() < (b - a).length();
             (a, if near { meet } else { middle }, b)
         });
-        (1..=CORNER).map(move |k| {
-            let t = k as f64 / (CORNER + 1) as f64;
+        (1..=CORNER_POINTS).map(move |k| {
+            let t = k as f64 / (CORNER_POINTS + 1) as f64;
             a.lerp(control, t).lerp(control.lerp(b, t), t)
         })
     }
@@ -341,14 +341,14 @@ mod tests {
             0.5 * pairs.map(|(a, b)| a.perp_dot(b)).sum::<f64>()
         };
         for block in &roads.blocks {
-            let walk = roads.around(block.lines);
+            let walk = roads.walk_around(block.lines);
             let (curb, turns) = roads.ring(&walk, &|p| p.half);
             let (front, _) = roads.ring(&walk, &Profile::front);
             let side = |k: usize| (turns[k] + curb.len() - turns[(k + 3) % 4]) % curb.len();
             assert_eq!((side(0), side(1)), (side(2), side(3)));
             assert!(area(&curb) > area(&front) && area(&front) > 0.0, "{block:?}");
         }
-        let (outside, turns) = roads.ring(&roads.outside(), &Profile::front);
+        let (outside, turns) = roads.ring(&roads.walk_outside(), &Profile::front);
         assert!(area(&outside) < 0.0 && turns.len() == 4);
     }
 

@@ -75,7 +75,7 @@ impl CitySettings {
 }
 
 /// An enum whose values have names in lower case with hyphens.
-macro_rules! named {
+macro_rules! named_enum {
     ($(#[$meta:meta])* $type:ident, $what:literal, { $($(#[$doc:meta])* $variant:ident = $name:literal),+ $(,)? }) => {
         $(#[$meta])*
         #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
@@ -110,9 +110,9 @@ macro_rules! named {
         }
     };
 }
-pub(crate) use named;
+pub(crate) use named_enum;
 
-named!(
+named_enum!(
     /// How streets run: a plain grid, the four layouts that reconstruction finds hard (SDG, section 2.2), and all of them.
     Layout, "layout", {
         /// Streets at right angles.
@@ -130,7 +130,7 @@ named!(
     }
 );
 
-named!(
+named_enum!(
     /// How much moves (the levels of CarlaOcc, supplement 1.1). Parked vehicles stay at every level.
     Traffic, "traffic", {
         /// Nothing moves, nobody walks.

@@ -1,6 +1,6 @@
 //! Who moves: vehicles that go around quarters, walkers that go around blocks.
 //!
-//! Everybody on one round moves alike, only later: distances hold by construction, at corners too. Rounds go clockwise, on the
+//! Everybody on one route moves alike, only later: distances hold by construction, at corners too. Rounds go clockwise, on the
 //! right, in the lane beside the quarter; quarters do not overlap, so rounds neither share a lane nor cross. Vehicles go
 //! around the quarters of every second row; the lanes beside the other rows are for who drives with sensors
 //! ([`City::streets`]).
@@ -18,9 +18,9 @@ use crate::props::Prop;
 use crate::random::Random;
 use crate::roads::{Profile, Quarter, RoadKind, Roads, Step};
 use crate::settings::{Layout, Traffic};
-use crate::streetside::some_car;
+use crate::street_furniture::random_car;
 use crate::terrain::Terrain;
-use crate::words::Waypoint;
+use crate::types::Waypoint;
 
 /// Trajectories last this long.
 pub(crate) const SECONDS: f64 = 630.0;
@@ -29,13 +29,13 @@ pub(crate) const SECONDS: f64 = 630.0;
 pub(crate) struct Mover {
     pub(crate) prop: Prop,
     pub(crate) waypoints: Vec<Waypoint>,
-    /// Seconds for a round of the gait; `None` for vehicles.
+    /// Seconds for a route of the gait; `None` for vehicles.
     pub(crate) gait_seconds: Option<f64>,
 }
 
 /// What a level of traffic means.
-struct Level {
-    /// Seconds between vehicles of a round.
+struct TrafficLevel {
+    /// Seconds between vehicles of a route.
     headway: f64,
     /// Metres per second on a straight: from, to.
     speed: [f32; 2],
@@ -43,30 +43,30 @@ struct Level {
     walkers: f64,
 }
 
-fn level(traffic: Traffic) -> Option<Level> {
+fn traffic_level(traffic: Traffic) -> Option<TrafficLevel> {
     match traffic {
         Traffic::None => None,
-        Traffic::Light => Some(Level { headway: 45.0, speed: [10.0, 13.5], walkers: 220.0 }),
-        Traffic::Medium => Some(Level { headway: 16.0, speed: [8.0, 12.0], walkers: 90.0 }),
-        Traffic::Heavy => Some(Level { headway: 6.5, speed: [4.5, 10.0], walkers: 40.0 }),
+        Traffic::Light => Some(TrafficLevel { headway: 45.0, speed: [10.0, 13.5], walkers: 220.0 }),
+        Traffic::Medium => Some(TrafficLevel { headway: 16.0, speed: [8.0, 12.0], walkers: 90.0 }),
+        Traffic::Heavy => Some(TrafficLevel { headway: 6.5, speed: [4.5, 10.0], walkers: 40.0 }),
     }
 }
 
 /// Whether vehicles go around a quarter.
-fn has_round(quarter: &Quarter) -> bool {
+fn has_traffic(quarter: &Quarter) -> bool {
     quarter.row.is_multiple_of(2)
 }
 
 /// A closed way with a timetable.
-struct Round {
+struct Route {
     /// Places and upright-ness: pose of who is there.
     poses: Vec<Rigid>,
-    /// Seconds since the start at each, and for the whole round.
+    /// Seconds since the start at each, and for the duration route.
     times: Vec<f64>,
-    whole: f64,
+    duration: f64,
 }
 
-impl Round {
+impl Route {
     /// A timetable for a closed way: no faster than `speed`, slower in bends, with gentle changes.
     fn new(points: &[DVec3], poses: Vec<Rigid>, speed: f64) -> Self {
         const SIDEWAYS: f64 = 2.2;
@@ -94,17 +94,17 @@ impl Round {
         for k in 0..count {
             times.push(times[k] + 2.0 * step(k) / (speeds[k] + speeds[(k + 1) % count]));
         }
-        let whole = times.pop().unwrap_or(1.0).max(1.0);
-        Self { poses, times, whole }
+        let duration = times.pop().unwrap_or(1.0).max(1.0);
+        Self { poses, times, duration }
     }
 
-    /// The waypoints of somebody who was at the start `ahead` seconds ago, from 0 to the end of time.
-    fn waypoints(&self, ahead: f64) -> Vec<Waypoint> {
-        let mut k = self.times.partition_point(|&t| t <= ahead).saturating_sub(1);
+    /// The waypoints of somebody who was at the start `elapsed` seconds ago, from 0 to the end of time.
+    fn waypoints(&self, elapsed: f64) -> Vec<Waypoint> {
+        let mut k = self.times.partition_point(|&t| t <= elapsed).saturating_sub(1);
         let mut lap = 0.0;
-        let mut waypoints = Vec::with_capacity((SECONDS / self.whole * self.times.len() as f64) as usize + 3);
+        let mut waypoints = Vec::with_capacity((SECONDS / self.duration * self.times.len() as f64) as usize + 3);
         loop {
-            let seconds = self.times[k] + lap - ahead;
+            let seconds = self.times[k] + lap - elapsed;
             waypoints.push(Waypoint { seconds, world_from_asset: self.poses[k] });
             if seconds > SECONDS {
                 return waypoints;
@@ -112,27 +112,27 @@ impl Round {
             k += 1;
             if k == self.times.len() {
                 k = 0;
-                lap += self.whole;
+                lap += self.duration;
             }
         }
     }
 
     /// So many starts around the round, unevenly by a share of their distance.
-    fn starts(&self, count: usize, uneven: f64, random: &mut Random) -> Vec<f64> {
-        let start = |k: usize, jitter: f64| (k as f64 + uneven * jitter) / count as f64 * self.whole;
+    fn start_times(&self, count: usize, uneven: f64, random: &mut Random) -> Vec<f64> {
+        let start = |k: usize, jitter: f64| (k as f64 + uneven * jitter) / count as f64 * self.duration;
         (0..count).map(|k| start(k, random.unit().into())).collect()
     }
 }
 
 /// The lane beside a rectangle of lattice lines, clockwise.
-fn lane(roads: &Roads, lines: [usize; 4], terrain: &Terrain) -> Vec<DVec3> {
-    let mut ring = roads.ring(&roads.around(lines), &|p| p.lane).0;
+fn quarter_lane(roads: &Roads, lines: [usize; 4], terrain: &Terrain) -> Vec<DVec3> {
+    let mut ring = roads.ring(&roads.walk_around(lines), &|p| p.lane).0;
     ring.reverse();
-    thin(ring.iter().map(|p| terrain.at(p.at)).collect())
+    thin_points(ring.iter().map(|p| terrain.at(p.at)).collect())
 }
 
 /// Leaves out every second point where a closed way is straight, and points that lie on their neighbours.
-fn thin(points: Vec<DVec3>) -> Vec<DVec3> {
+fn thin_points(points: Vec<DVec3>) -> Vec<DVec3> {
     let mut kept: Vec<DVec3> = Vec::with_capacity(points.len());
     let mut skipped = false;
     for (k, &p) in points.iter().enumerate() {
@@ -160,7 +160,7 @@ fn heading(points: &[DVec3], k: usize) -> DVec3 {
 }
 
 /// Poses along a closed way of who leans with the road.
-fn leaning(points: &[DVec3]) -> Vec<Rigid> {
+fn poses_on_slope(points: &[DVec3]) -> Vec<Rigid> {
     (0..points.len())
         .map(|k| {
             let x = heading(points, k);
@@ -181,39 +181,45 @@ pub(crate) fn vehicles(
 ) -> Vec<Mover> {
     let mut random = random.fork(0x7AFF).fork(quarter as u64);
     let quarter = &roads.quarters[quarter];
-    let Some(level) = level(traffic).filter(|_| has_round(quarter)) else { return Vec::new() };
-    let points = lane(roads, quarter.lines, terrain);
+    let Some(level) = traffic_level(traffic).filter(|_| has_traffic(quarter)) else { return Vec::new() };
+    let points = quarter_lane(roads, quarter.lines, terrain);
     let pace = if matches!(quarter.layout, Layout::Alley | Layout::Winding) { 0.6 } else { 1.0 };
     // rounds of a compact city are short: light traffic could be none
-    drive(&points, &level, pace, usize::from(roads.is_compact), &mut random)
+    vehicles_on_route(&points, &level, pace, usize::from(roads.is_compact), &mut random)
 }
 
 /// The vehicles on the deck.
 pub(crate) fn deck_vehicles(deck: &Deck, traffic: Traffic, random: &Random) -> Vec<Mover> {
-    let Some(level) = level(traffic) else { return Vec::new() };
+    let Some(level) = traffic_level(traffic) else { return Vec::new() };
     // ramps bend upwards: all points stay
-    drive(&deck.round(), &level, 1.0, 0, &mut random.fork(0xDEC4))
+    vehicles_on_route(&deck.route(), &level, 1.0, 0, &mut random.fork(0xDEC4))
 }
 
 /// Vehicles one after another on a round, with a factor on their speed. Buses and lorries do not drive: they would swing into
 /// the other lane at corners.
-fn drive(points: &[DVec3], level: &Level, pace: f64, min_count: usize, random: &mut Random) -> Vec<Mover> {
+fn vehicles_on_route(
+    points: &[DVec3],
+    level: &TrafficLevel,
+    pace: f64,
+    min_count: usize,
+    random: &mut Random,
+) -> Vec<Mover> {
     let speed = pace * f64::from(random.range(level.speed[0], level.speed[1]));
-    let round = Round::new(points, leaning(points), speed);
-    let count = ((round.whole / level.headway + f64::from(random.unit())) as usize).max(min_count);
-    let starts = round.starts(count, 0.25, random);
+    let route = Route::new(points, poses_on_slope(points), speed);
+    let count = ((route.duration / level.headway + f64::from(random.unit())) as usize).max(min_count);
+    let starts = route.start_times(count, 0.25, random);
     starts
         .into_iter()
-        .map(|ahead| Mover { prop: some_vehicle(random), waypoints: round.waypoints(ahead), gait_seconds: None })
+        .map(|elapsed| Mover { prop: random_vehicle(random), waypoints: route.waypoints(elapsed), gait_seconds: None })
         .collect()
 }
 
-fn some_vehicle(random: &mut Random) -> Prop {
+fn random_vehicle(random: &mut Random) -> Prop {
     let kind = match random.below(12) {
         0 => VehicleKind::Taxi,
         1 => VehicleKind::Motorcycle,
         2 => VehicleKind::Bicycle,
-        _ => return some_car(random),
+        _ => return random_car(random),
     };
     Prop::Vehicle(kind, random.below(PAINTS) as u8)
 }
@@ -221,25 +227,25 @@ fn some_vehicle(random: &mut Random) -> Prop {
 /// The walkers on the pavement of a block.
 pub(crate) fn walkers(roads: &Roads, terrain: &Terrain, block: usize, traffic: Traffic, random: &Random) -> Vec<Mover> {
     let mut random = random.fork(0x3A1C).fork(block as u64);
-    let Some(level) = level(traffic) else { return Vec::new() };
-    let walk = roads.around(roads.blocks[block].lines);
+    let Some(level) = traffic_level(traffic) else { return Vec::new() };
+    let walk = roads.walk_around(roads.blocks[block].lines);
     let alley = roads.quarters[roads.blocks[block].quarter].layout == Layout::Alley;
     let share = if alley { 1.8 } else { 1.0 };
     let beside_front = |p: &Profile| p.front() - (0.5 * p.pavement).min(0.6);
     let beside_trees = |p: &Profile| p.half + 1.5;
-    let mut movers = promenade(roads, terrain, &walk, &beside_front, false, level.walkers * share, &mut random);
+    let mut movers = walkers_on_route(roads, terrain, &walk, &beside_front, false, level.walkers * share, &mut random);
     let wide = walk.iter().all(|step| match step {
         Step::Along { edge, .. } => roads.edges[*edge].as_ref().is_some_and(|e| e.profile.pavement > 2.5),
         Step::Through { .. } => true,
     });
     if wide {
-        movers.extend(promenade(roads, terrain, &walk, &beside_trees, true, level.walkers * share, &mut random));
+        movers.extend(walkers_on_route(roads, terrain, &walk, &beside_trees, true, level.walkers * share, &mut random));
     }
     movers
 }
 
 /// Walkers one after another around a block.
-fn promenade(
+fn walkers_on_route(
     roads: &Roads,
     terrain: &Terrain,
     walk: &[Step],
@@ -253,20 +259,20 @@ fn promenade(
     if clockwise {
         points.reverse();
     }
-    let points = thin(points);
+    let points = thin_points(points);
     let length: f64 = (0..points.len()).map(|k| points[k].distance(points[(k + 1) % points.len()])).sum();
     let count = (length / gap + f64::from(random.unit())) as usize;
     let speed = f64::from(random.range(1.0, 1.6));
     let poses = (0..points.len()).map(|k| upright(points[k], heading(&points, k).truncate())).collect();
-    let round = Round::new(&points, poses, speed);
-    let starts = round.starts(count, 0.7, random);
+    let route = Route::new(&points, poses, speed);
+    let starts = route.start_times(count, 0.7, random);
     starts
         .into_iter()
-        .map(|ahead| {
+        .map(|elapsed| {
             let build = random.below(person::BUILDS);
             let gait_seconds = person::STRIDE * person::scale(build) / speed;
             let prop = Prop::Walker { build: build as u8, phase: 0 };
-            Mover { prop, waypoints: round.waypoints(ahead), gait_seconds: Some(gait_seconds) }
+            Mover { prop, waypoints: route.waypoints(elapsed), gait_seconds: Some(gait_seconds) }
         })
         .collect()
 }
@@ -282,19 +288,19 @@ pub(crate) fn free_lanes(roads: &Roads, terrain: &Terrain, deck: Option<&Deck>) 
     let mut lanes = Vec::new();
     for row in (1..rows).step_by(2) {
         let lines = [0, roads.cells[0], row * roads.fine, (row + 1) * roads.fine];
-        lanes.push(close(lane(roads, lines, terrain)));
+        lanes.push(close(quarter_lane(roads, lines, terrain)));
         // in a compact city a row may be one quarter, which has been driven around
         let mut quarters = roads.quarters.iter().filter(|q| q.row == row && !(roads.is_compact && q.lines == lines));
         while let Some(quarter) = quarters.next() {
-            lanes.push(close(lane(roads, quarter.lines, terrain)));
+            lanes.push(close(quarter_lane(roads, quarter.lines, terrain)));
             quarters.next();
         }
     }
     if roads.is_compact {
         // the outer lane of the roads at the edge, counter-clockwise, so that every road is driven
-        let mut ring = roads.ring(&roads.outside(), &|p| p.lane).0;
+        let mut ring = roads.ring(&roads.walk_outside(), &|p| p.lane).0;
         ring.reverse();
-        lanes.push(close(thin(ring.iter().map(|p| terrain.at(p.at)).collect())));
+        lanes.push(close(thin_points(ring.iter().map(|p| terrain.at(p.at)).collect())));
     }
     lanes.extend(deck.into_iter().flat_map(|deck| [deck.lane(LANES[0], true), deck.lane(LANES[0], false)]));
     lanes.extend(alleys(roads, terrain));

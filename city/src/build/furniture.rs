@@ -7,7 +7,7 @@ use glam::{Vec2, Vec3};
 use super::Builder;
 use crate::materials::{self as m, Surface};
 use crate::random::Random;
-use crate::words::{Asset, Class};
+use crate::types::{Asset, Class};
 
 /// Kinds of street furniture.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -122,7 +122,7 @@ fn sign(b: &mut Builder, k: usize) {
     }
     let half = if k == 0 { 0.3 } else { 0.2 };
     let tall = if k == 3 { 0.26 } else { 0.15 };
-    board(b, m::order(k), [-half, half], [2.5 - tall, 2.5 + tall], 0.06);
+    board(b, m::traffic_sign(k), [-half, half], [2.5 - tall, 2.5 + tall], 0.06);
 }
 
 fn give_way(b: &mut Builder) {

@@ -7,16 +7,16 @@ use glam::{DVec2, DVec3, Vec2, Vec3};
 use super::Builder;
 use crate::materials::{self as m, Surface};
 use crate::random::Random;
-use crate::roads::{CORNER, Edge, Profile, RingPoint, RoadKind, Roads, Step};
+use crate::roads::{CORNER_POINTS, Edge, Profile, RingPoint, RoadKind, Roads, Step};
 use crate::terrain::Terrain;
-use crate::words::{Asset, Class};
+use crate::types::{Asset, Class};
 
 /// Paint lies this much above the road, metres.
-pub(crate) const PAINT: f64 = 0.005;
+pub(crate) const PAINT_HEIGHT: f64 = 0.005;
 /// Width of a curb stone.
 const CURB_STONE: f64 = 0.15;
 /// How far the country goes beyond the city.
-const COUNTRY: f64 = 420.0;
+const COUNTRYSIDE_METRES: f64 = 420.0;
 
 /// A ground mesh and where its frame's origin is.
 pub(crate) struct Piece {
@@ -25,13 +25,13 @@ pub(crate) struct Piece {
 }
 
 /// Lays ground in a frame that stands at `origin`.
-pub(crate) struct Layer<'a> {
+pub(crate) struct GroundBuilder<'a> {
     pub(crate) builder: Builder,
     pub(crate) terrain: &'a Terrain,
     pub(crate) origin: DVec3,
 }
 
-impl<'a> Layer<'a> {
+impl<'a> GroundBuilder<'a> {
     pub(crate) fn new(terrain: &'a Terrain, at: DVec2, class: Class) -> Self {
         Self { builder: Builder::new(class), terrain, origin: terrain.at(at) }
     }
@@ -52,7 +52,7 @@ impl<'a> Layer<'a> {
     }
 
     /// A grid of corners (`rows[k][c]`), its faces up where c grows to the left of growing k.
-    fn sheet(&mut self, rows: &[Vec<u32>], mut paint: impl FnMut(&mut Builder, usize, usize)) {
+    fn grid_faces(&mut self, rows: &[Vec<u32>], mut paint: impl FnMut(&mut Builder, usize, usize)) {
         for (k, pair) in rows.windows(2).enumerate() {
             for c in 0..pair[0].len().min(pair[1].len()).saturating_sub(1) {
                 paint(&mut self.builder, k, c);
@@ -66,11 +66,11 @@ impl<'a> Layer<'a> {
 
 /// A crossing with the roads that go out of it to the east and north.
 pub(crate) fn crossing(roads: &Roads, terrain: &Terrain, node: usize, random: &Random) -> Option<Piece> {
-    let arms: Vec<(usize, Profile)> = (0..4).filter_map(|arm| Some((arm, roads.mouth(node, arm)?.2))).collect();
+    let arms: Vec<(usize, Profile)> = (0..4).filter_map(|arm| Some((arm, roads.arm_end(node, arm)?.2))).collect();
     if arms.is_empty() {
         return None;
     }
-    let mut layer = Layer::new(terrain, roads.nodes[node], Class::Road);
+    let mut layer = GroundBuilder::new(terrain, roads.nodes[node], Class::Road);
     junction(&mut layer, roads, node, &arms);
     for arm in [0, 1] {
         let Some((index, true)) = roads.arm(node, arm) else { continue };
@@ -85,7 +85,7 @@ pub(crate) fn crossing(roads: &Roads, terrain: &Terrain, node: usize, random: &R
 
 /// Whether streets meet in a node: where only alleys join, a street goes on.
 fn is_crossing(roads: &Roads, node: usize) -> bool {
-    let street = |arm| roads.mouth(node, arm).is_some_and(|m| m.2.kind != RoadKind::Alley);
+    let street = |arm| roads.arm_end(node, arm).is_some_and(|m| m.2.kind != RoadKind::Alley);
     (0..4).filter(|&arm| street(arm)).count() > 2
 }
 
@@ -95,16 +95,16 @@ fn strips(profile: &Profile) -> usize {
 }
 
 /// Where a cross-section's corners are, from the right to the left.
-fn across(profile: &Profile) -> impl Iterator<Item = f64> + use<> {
+fn cross_section(profile: &Profile) -> impl Iterator<Item = f64> + use<> {
     let (half, count) = (profile.half, strips(profile));
     (0..=count).map(move |c| half * (2.0 * c as f64 / count as f64 - 1.0))
 }
 
-fn junction(layer: &mut Layer, roads: &Roads, node: usize, arms: &[(usize, Profile)]) {
+fn junction(layer: &mut GroundBuilder, roads: &Roads, node: usize, arms: &[(usize, Profile)]) {
     let mut rim = Vec::new();
     for (k, &(arm, profile)) in arms.iter().enumerate() {
-        let Some((at, out, _)) = roads.mouth(node, arm) else { continue };
-        rim.extend(across(&profile).map(|side| at + side * out.perp()));
+        let Some((at, out, _)) = roads.arm_end(node, arm) else { continue };
+        rim.extend(cross_section(&profile).map(|side| at + side * out.perp()));
         let next = arms[(k + 1) % arms.len()].0;
         let corner: Vec<DVec2> = roads.corner(node, next, arm, &|p| p.half).collect();
         rim.extend(corner.into_iter().rev());
@@ -113,7 +113,7 @@ fn junction(layer: &mut Layer, roads: &Roads, node: usize, arms: &[(usize, Profi
     let middle = roads.nodes[node];
     let paved = if arms.iter().all(|a| a.1.kind == RoadKind::Alley) { m::COBBLES } else { m::ASPHALT };
     layer.builder.class(Class::Road).paint(paved);
-    let ring = |layer: &mut Layer, share: f64| -> Vec<u32> {
+    let ring = |layer: &mut GroundBuilder, share: f64| -> Vec<u32> {
         rim.iter().map(|&p| layer.corner(middle.lerp(p, share), 0.0)).collect()
     };
     let reach = rim.iter().map(|p| p.distance(middle)).fold(0.0, f64::max);
@@ -134,7 +134,7 @@ fn junction(layer: &mut Layer, roads: &Roads, node: usize, arms: &[(usize, Profi
     }
 }
 
-fn road(layer: &mut Layer, edge: &Edge, crossed: [bool; 2], random: &mut Random) {
+fn road(layer: &mut GroundBuilder, edge: &Edge, crossed: [bool; 2], random: &mut Random) {
     let profile = edge.profile;
     let paved = match profile.kind {
         RoadKind::Alley => m::COBBLES,
@@ -146,30 +146,30 @@ fn road(layer: &mut Layer, edge: &Edge, crossed: [bool; 2], random: &mut Random)
     let rows: Vec<Vec<u32>> = edge
         .path
         .iter()
-        .map(|&(p, d)| across(&profile).map(|side| layer.corner(p + side * d.perp(), 0.0)).collect())
+        .map(|&(p, d)| cross_section(&profile).map(|side| layer.corner(p + side * d.perp(), 0.0)).collect())
         .collect();
-    layer.sheet(&rows, |_, _, _| {});
-    let line = Line::new(&edge.path);
+    layer.grid_faces(&rows, |_, _, _| {});
+    let line = Polyline::new(&edge.path);
     if paved == m::ASPHALT {
         for _ in 0..random.below(4) {
             let (s, side) =
                 (random.range(0.1, 0.9) as f64 * line.length, random.range(-0.7, 0.5) as f64 * profile.half);
             let (long, wide) = (random.range(1.0, 4.0) as f64, random.range(0.6, 1.6) as f64);
             layer.builder.paint(m::ASPHALT_PATCH);
-            layer.stripe(&line, [s, (s + long).min(line.length)], [side, side + wide], 0.4 * PAINT);
+            layer.stripe(&line, [s, (s + long).min(line.length)], [side, side + wide], 0.4 * PAINT_HEIGHT);
         }
     }
     layer.builder.class(Class::RoadMarking).paint(m::PAINT_WHITE);
     markings(layer, &line, &profile, crossed);
 }
 
-fn markings(layer: &mut Layer, line: &Line, profile: &Profile, crossed: [bool; 2]) {
+fn markings(layer: &mut GroundBuilder, line: &Polyline, profile: &Profile, crossed: [bool; 2]) {
     let (half, length) = (profile.half, line.length);
     // lines keep clear of zebra crossings
     let clear = crossed.map(|c| if c { 7.0 } else { 0.0 });
     let (start, end) = (clear[0], length - clear[1]);
-    let solid = |layer: &mut Layer, side: f64, from: f64, to: f64| {
-        layer.stripe(line, [from, to], [side - 0.06, side + 0.06], PAINT);
+    let solid = |layer: &mut GroundBuilder, side: f64, from: f64, to: f64| {
+        layer.stripe(line, [from, to], [side - 0.06, side + 0.06], PAINT_HEIGHT);
     };
     match profile.kind {
         RoadKind::Alley | RoadKind::Lane => return,
@@ -201,16 +201,16 @@ fn markings(layer: &mut Layer, line: &Line, profile: &Profile, crossed: [bool; 2
     for ([zebra, stop, way], _) in ends.into_iter().zip(crossed).filter(|end| end.1) {
         for k in 0..bars {
             let side = -0.5 * bars as f64 + 0.25 + k as f64;
-            layer.stripe(line, [zebra, zebra + 3.0], [side, side + 0.5], PAINT);
+            layer.stripe(line, [zebra, zebra + 3.0], [side, side + 0.5], PAINT_HEIGHT);
         }
         let lane: [f64; 2] = if way > 0.0 { [-(half - 2.3), -0.2] } else { [0.2, half - 2.3] };
-        layer.stripe(line, [stop, stop + 0.4], lane, PAINT);
+        layer.stripe(line, [stop, stop + 0.4], lane, PAINT_HEIGHT);
     }
 }
 
-impl Layer<'_> {
+impl GroundBuilder<'_> {
     /// A stripe on a road between two distances along its line and two beside it (left positive).
-    pub(crate) fn stripe(&mut self, line: &Line, [from, to]: [f64; 2], sides: [f64; 2], above: f64) {
+    pub(crate) fn stripe(&mut self, line: &Polyline, [from, to]: [f64; 2], sides: [f64; 2], above: f64) {
         let count = ((to - from) / 2.0).ceil().max(1.0) as usize;
         let rows: Vec<Vec<u32>> = (0..=count)
             .map(|k| {
@@ -218,18 +218,18 @@ impl Layer<'_> {
                 sides.map(|side| self.corner(p + side * d.perp(), above)).to_vec()
             })
             .collect();
-        self.sheet(&rows, |_, _, _| {});
+        self.grid_faces(&rows, |_, _, _| {});
     }
 }
 
 /// A polyline by the distance along it.
-pub(crate) struct Line {
+pub(crate) struct Polyline {
     points: Vec<(DVec2, DVec2)>,
     along: Vec<f64>,
     pub(crate) length: f64,
 }
 
-impl Line {
+impl Polyline {
     pub(crate) fn new(points: &[(DVec2, DVec2)]) -> Self {
         let mut along = vec![0.0];
         for pair in points.windows(2) {
@@ -270,13 +270,13 @@ pub(crate) struct Cover {
 }
 
 /// A block's pavement and inside.
-pub(crate) fn block(roads: &Roads, terrain: &Terrain, walk: &[Step], cover: Cover, name: String) -> Piece {
+pub(crate) fn block_ground(roads: &Roads, terrain: &Terrain, walk: &[Step], cover: Cover, name: String) -> Piece {
     let rings = Rings::new(roads, walk);
     let count = rings.front.len();
     let middle = rings.front.iter().map(|p| p.at).sum::<DVec2>() / count as f64;
-    let mut layer = Layer::new(terrain, middle, Class::Sidewalk);
+    let mut layer = GroundBuilder::new(terrain, middle, Class::Sidewalk);
     rings.pavement(&mut layer, 0, count);
-    inside(&mut layer, &rings, cover);
+    block_interior(&mut layer, &rings, cover);
     layer.finish(name)
 }
 
@@ -297,9 +297,9 @@ impl Rings {
     }
 
     /// Curb and slabs between two points of the ring.
-    fn pavement(&self, layer: &mut Layer, from: usize, to: usize) {
+    fn pavement(&self, layer: &mut GroundBuilder, from: usize, to: usize) {
         let count = self.foot.len();
-        let row = |layer: &mut Layer, ring: &[RingPoint], high: bool| -> Vec<u32> {
+        let row = |layer: &mut GroundBuilder, ring: &[RingPoint], high: bool| -> Vec<u32> {
             let corner = |k: usize| (ring[k % count].at, if high { ring[k % count].profile.curb } else { 0.0 });
             (from..=to).map(corner).map(|(p, above)| layer.corner(p, above)).collect()
         };
@@ -321,7 +321,7 @@ impl Rings {
 }
 
 /// The ground behind the fronts: a Coons patch between the four sides.
-fn inside(layer: &mut Layer, rings: &Rings, cover: Cover) {
+fn block_interior(layer: &mut GroundBuilder, rings: &Rings, cover: Cover) {
     let Ok(turns) = <[usize; 4]>::try_from(rings.turns.clone()) else { return };
     let count = rings.front.len();
     let side = |from: usize, to: usize| -> Vec<DVec3> {
@@ -346,7 +346,7 @@ fn inside(layer: &mut Layer, rings: &Rings, cover: Cover) {
                 .collect()
         })
         .collect();
-    layer.sheet(&rows, |builder, i, j| {
+    layer.grid_faces(&rows, |builder, i, j| {
         let rim = i < 2 || j < 2 || i + 2 >= nu || j + 2 >= nv;
         let (surface, class) = if rim { cover.rim } else { cover.ground };
         builder.paint(surface).class(class);
@@ -354,18 +354,18 @@ fn inside(layer: &mut Layer, rings: &Rings, cover: Cover) {
 }
 
 /// The pavement around the city and the country beyond it, in pieces.
-pub(crate) fn country(roads: &Roads, terrain: &Terrain, half: f64, west_gap: f64) -> Vec<Piece> {
+pub(crate) fn countryside(roads: &Roads, terrain: &Terrain, half: f64, west_gap: f64) -> Vec<Piece> {
     const PIECE: usize = 24;
-    let walk = roads.outside();
+    let walk = roads.walk_outside();
     let rings = Rings::new(roads, &walk);
     let count = rings.front.len();
-    let far = horizon(&rings, half);
-    let shares = rows(west_gap);
+    let far = countryside_rim(&rings, half);
+    let shares = radial_shares(west_gap);
     (0..count)
         .step_by(PIECE)
         .map(|from| {
             let to = (from + PIECE).min(count);
-            let mut layer = Layer::new(terrain, rings.front[from].at, Class::Sidewalk);
+            let mut layer = GroundBuilder::new(terrain, rings.front[from].at, Class::Sidewalk);
             rings.pavement(&mut layer, from, to);
             layer.builder.class(Class::Terrain);
             let place = |k: usize, share: f64| rings.front[k % count].at.lerp(far[k % count], share);
@@ -376,7 +376,7 @@ pub(crate) fn country(roads: &Roads, terrain: &Terrain, half: f64, west_gap: f64
                     shares.iter().map(at).map(|(p, above)| layer.corner(p, above)).collect()
                 })
                 .collect();
-            layer.sheet(&sheet, |builder, k, c| {
+            layer.grid_faces(&sheet, |builder, k, c| {
                 let bare = west_gap > 0.0 && place(from + k, shares[c]).x < west_gap - half;
                 builder.paint(if bare { m::PASTURE } else { m::MEADOW });
             });
@@ -386,9 +386,9 @@ pub(crate) fn country(roads: &Roads, terrain: &Terrain, half: f64, west_gap: f64
 }
 
 /// Where the country ends, for each point of the outer ring: on a square.
-fn horizon(rings: &Rings, half: f64) -> Vec<DVec2> {
+fn countryside_rim(rings: &Rings, half: f64) -> Vec<DVec2> {
     let count = rings.front.len();
-    let far = half + COUNTRY;
+    let far = half + COUNTRYSIDE_METRES;
     // the walk with the country on the left: turns at the corners of the square in this order
     let mut targets = vec![DVec2::ZERO; count];
     for k in 0..rings.turns.len() {
@@ -403,7 +403,7 @@ fn horizon(rings: &Rings, half: f64) -> Vec<DVec2> {
             // straight out, but for a fan at each corner: so lines to the horizon do not cross a bending side
             let out = if a.x == b.x { DVec2::new(a.x, p.y) } else { DVec2::new(p.x, a.y) };
             let (near, steps) = if i - from <= to - i { (a, i - from) } else { (b, to - i) };
-            targets[i % count] = out.lerp(near, (1.0 - steps as f64 / (CORNER + 2) as f64).max(0.0));
+            targets[i % count] = out.lerp(near, (1.0 - steps as f64 / (CORNER_POINTS + 2) as f64).max(0.0));
         }
     }
     targets
@@ -416,7 +416,7 @@ impl Rings {
 }
 
 /// Shares of the way to the horizon at which the country has corners: close together near the city, and across a plain.
-fn rows(west_gap: f64) -> Vec<f64> {
+fn radial_shares(west_gap: f64) -> Vec<f64> {
     let count = 14 + ((west_gap / 40.0) as usize).min(60);
     let power = if west_gap > 0.0 { 1.3 } else { 2.0 };
     (0..=count).map(|k| (k as f64 / count as f64).powf(power)).collect()

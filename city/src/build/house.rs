@@ -8,7 +8,7 @@ use glam::{Affine3A, Vec2, Vec3};
 use super::Builder;
 use crate::materials::{self as m, Surface};
 use crate::random::Random;
-use crate::words::{Asset, Class};
+use crate::types::{Asset, Class};
 
 /// Kinds of houses, by where they stand.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -45,7 +45,7 @@ impl HouseKind {
 }
 
 /// How a house looks.
-struct Look {
+struct Style {
     kind: HouseKind,
     wall: Surface,
     frame: Surface,
@@ -56,7 +56,7 @@ struct Look {
     bay: f32,
     window: Vec2,
     sills: bool,
-    seed: Random,
+    random: Random,
 }
 
 const WALLS: [Surface; 12] = [
@@ -74,7 +74,7 @@ const WALLS: [Surface; 12] = [
     m::STONE,
 ];
 
-impl Look {
+impl Style {
     fn new(kind: HouseKind, mut random: Random) -> Self {
         let (low, high) = match kind {
             HouseKind::Town => (3, 6),
@@ -106,7 +106,7 @@ impl Look {
                 Vec2::new(random.range(0.95, 1.35), random.range(1.35, 1.7))
             },
             sills: !tower && random.chance(0.7),
-            seed: random,
+            random,
         }
     }
 
@@ -122,7 +122,7 @@ impl Look {
 
 /// Builds a house of one of [`WIDTHS`].
 pub(crate) fn house(kind: HouseKind, width: f32, random: Random, name: String) -> Asset {
-    let mut look = Look::new(kind, random);
+    let mut style = Style::new(kind, random);
     let depth = kind.depth();
     let mut b = Builder::new(Class::Building);
     let half = 0.5 * width;
@@ -134,9 +134,9 @@ pub(crate) fn house(kind: HouseKind, width: f32, random: Random, name: String) -
     ];
     for (corner, turns, length, wall) in sides {
         let frame = Affine3A::from_translation(corner) * Affine3A::from_rotation_z(turns * std::f32::consts::TAU);
-        b.within(frame, |b| facade(b, &mut look, length, wall));
+        b.within(frame, |b| facade(b, &mut style, length, wall));
     }
-    roof(&mut b, &mut look, width, depth);
+    roof(&mut b, &mut style, width, depth);
     b.finish(name)
 }
 
@@ -148,41 +148,41 @@ enum Wall {
 }
 
 /// A wall in its own frame: x from 0 to `length`, facing -y.
-fn facade(b: &mut Builder, look: &mut Look, length: f32, wall: Wall) {
+fn facade(b: &mut Builder, style: &mut Style, length: f32, wall: Wall) {
     b.paint(m::PLINTH).panel([0.0, length], [-PLINTH, 0.0], 0.0);
-    let bays = ((length / look.bay) as usize).max(1);
+    let bays = ((length / style.bay) as usize).max(1);
     let bay = length / bays as f32;
     // party walls are blank but for some houses' at corners and gaps
     let open = match wall {
         Wall::Front | Wall::Back => true,
-        Wall::Side => look.kind == HouseKind::Villa || look.kind == HouseKind::Tower || look.seed.chance(0.3),
+        Wall::Side => style.kind == HouseKind::Villa || style.kind == HouseKind::Tower || style.random.chance(0.3),
     };
-    let door = look.seed.below(bays);
-    let balconies = wall != Wall::Side && look.kind != HouseKind::Tower && look.seed.chance(0.4);
-    let balcony_bay = look.seed.below(bays);
-    for floor in 0..look.floors {
-        let heights = [look.level(floor), look.level(floor + 1)];
+    let door = style.random.below(bays);
+    let balconies = wall != Wall::Side && style.kind != HouseKind::Tower && style.random.chance(0.4);
+    let balcony_bay = style.random.below(bays);
+    for floor in 0..style.floors {
+        let heights = [style.level(floor), style.level(floor + 1)];
         if !open {
-            b.paint(look.wall).panel([0.0, length], heights, 0.0);
+            b.paint(style.wall).panel([0.0, length], heights, 0.0);
             continue;
         }
-        if floor == 0 && look.shop && wall == Wall::Front {
-            shop(b, look, length, heights[1], bays, door);
+        if floor == 0 && style.shop && wall == Wall::Front {
+            shop(b, style, length, heights[1], bays, door);
             continue;
         }
         for k in 0..bays {
             let across = [k as f32 * bay, (k + 1) as f32 * bay];
             if floor == 0 && wall == Wall::Front && k == door {
-                doorway(b, look, across, heights);
+                doorway(b, style, across, heights);
             } else {
-                window(b, look, across, heights);
+                window(b, style, across, heights);
             }
         }
         if balconies && floor > 0 {
-            balcony(b, look, [balcony_bay as f32 * bay + 0.15, (balcony_bay + 1) as f32 * bay - 0.15], heights[0]);
+            balcony(b, style, [balcony_bay as f32 * bay + 0.15, (balcony_bay + 1) as f32 * bay - 0.15], heights[0]);
         }
     }
-    b.paint(look.wall).panel([0.0, length], [look.level(look.floors), look.eaves()], 0.0);
+    b.paint(style.wall).panel([0.0, length], [style.level(style.floors), style.eaves()], 0.0);
 }
 
 /// A bay of wall with an opening in it.
@@ -204,12 +204,12 @@ fn recess(b: &mut Builder, low: Vec2, high: Vec2, [y0, y1]: [f32; 2]) {
 }
 
 /// A framed pane `inset` behind the wall, and a back plane behind the pane.
-fn pane(b: &mut Builder, look: &mut Look, low: Vec2, high: Vec2, bars: [usize; 2], behind: Surface, room: f32) {
+fn pane(b: &mut Builder, style: &mut Style, low: Vec2, high: Vec2, bars: [usize; 2], behind: Surface, room: f32) {
     const FRAME: f32 = 0.06;
-    let inset = if look.kind == HouseKind::Tower { 0.05 } else { look.seed.range(0.08, 0.15) };
-    b.paint(look.wall);
+    let inset = if style.kind == HouseKind::Tower { 0.05 } else { style.random.range(0.08, 0.15) };
+    b.paint(style.wall);
     recess(b, low, high, [0.0, inset]);
-    b.paint(look.frame);
+    b.paint(style.frame);
     let (inner_low, inner_high) = (low + FRAME, high - FRAME);
     b.panel([low.x, high.x], [low.y, inner_low.y], inset);
     b.panel([low.x, high.x], [inner_high.y, high.y], inset);
@@ -230,62 +230,62 @@ fn pane(b: &mut Builder, look: &mut Look, low: Vec2, high: Vec2, bars: [usize; 2
     b.paint(behind).panel([low.x, high.x], [low.y, high.y], inset + room);
 }
 
-fn window(b: &mut Builder, look: &mut Look, across: [f32; 2], heights: [f32; 2]) {
+fn window(b: &mut Builder, style: &mut Style, across: [f32; 2], heights: [f32; 2]) {
     let middle = 0.5 * (across[0] + across[1]);
-    let half = (0.5 * look.window.x).min(0.5 * (across[1] - across[0]) - 0.12);
-    let sill = if look.kind == HouseKind::Tower { 0.6 } else { 0.9 };
-    let top = (heights[0] + sill + look.window.y).min(heights[1] - 0.25);
+    let half = (0.5 * style.window.x).min(0.5 * (across[1] - across[0]) - 0.12);
+    let sill = if style.kind == HouseKind::Tower { 0.6 } else { 0.9 };
+    let top = (heights[0] + sill + style.window.y).min(heights[1] - 0.25);
     let (low, high) = (Vec2::new(middle - half, heights[0] + sill), Vec2::new(middle + half, top));
-    around(b, look.wall, across, heights, low, high);
-    let behind = *look.seed.one_of(&[m::CURTAIN, m::CURTAIN, m::ROOM_DARK, m::ROOM_DARK, m::ROOM_WARM]);
-    let room = if behind == m::CURTAIN { 0.3 } else { look.seed.range(0.6, 1.0) };
-    let bars = if look.kind == HouseKind::Tower { [0, 0] } else { [1, usize::from(look.frame == m::FRAME_WHITE)] };
-    pane(b, look, low, high, bars, behind, room);
-    if look.sills {
+    around(b, style.wall, across, heights, low, high);
+    let behind = *style.random.one_of(&[m::CURTAIN, m::CURTAIN, m::ROOM_DARK, m::ROOM_DARK, m::ROOM_WARM]);
+    let room = if behind == m::CURTAIN { 0.3 } else { style.random.range(0.6, 1.0) };
+    let bars = if style.kind == HouseKind::Tower { [0, 0] } else { [1, usize::from(style.frame == m::FRAME_WHITE)] };
+    pane(b, style, low, high, bars, behind, room);
+    if style.sills {
         b.paint(m::CONCRETE_SMOOTH);
         b.cuboid(Vec3::new(low.x - 0.08, -0.08, low.y - 0.07), Vec3::new(high.x + 0.08, 0.0, low.y));
     }
 }
 
-fn doorway(b: &mut Builder, look: &mut Look, across: [f32; 2], heights: [f32; 2]) {
+fn doorway(b: &mut Builder, style: &mut Style, across: [f32; 2], heights: [f32; 2]) {
     let middle = 0.5 * (across[0] + across[1]);
     let (low, high) = (Vec2::new(middle - 0.5, heights[0] + 0.02), Vec2::new(middle + 0.5, heights[0] + 2.2));
-    around(b, look.wall, across, heights, low, high);
-    b.paint(look.wall);
+    around(b, style.wall, across, heights, low, high);
+    b.paint(style.wall);
     recess(b, low, high, [0.0, 0.2]);
-    let leaf = *look.seed.one_of(&[m::DOOR_GREEN, m::DOOR_RED, m::TIMBER, m::FRAME_DARK]);
+    let leaf = *style.random.one_of(&[m::DOOR_GREEN, m::DOOR_RED, m::TIMBER, m::FRAME_DARK]);
     b.paint(leaf).panel([low.x, high.x], [low.y, high.y], 0.2);
     b.paint(m::RIM).cuboid(Vec3::new(high.x - 0.14, 0.14, low.y + 1.0), Vec3::new(high.x - 0.1, 0.2, low.y + 1.12));
 }
 
 /// A ground floor of glass with a door in it and a name above.
-fn shop(b: &mut Builder, look: &mut Look, length: f32, height: f32, bays: usize, door: usize) {
+fn shop(b: &mut Builder, style: &mut Style, length: f32, height: f32, bays: usize, door: usize) {
     let bay = length / bays as f32;
     for k in 0..bays {
         let across = [k as f32 * bay, (k + 1) as f32 * bay];
         if k == door {
-            doorway(b, look, across, [0.0, height]);
+            doorway(b, style, across, [0.0, height]);
             continue;
         }
         let (low, high) = (Vec2::new(across[0] + 0.12, 0.45), Vec2::new(across[1] - 0.12, 2.75));
-        around(b, look.wall, across, [0.0, height], low, high);
-        pane(b, look, low, high, [0, 0], m::GOODS, 0.9);
+        around(b, style.wall, across, [0.0, height], low, high);
+        pane(b, style, low, high, [0, 0], m::GOODS, 0.9);
     }
     let half = (0.5 * length - 0.4).min(3.2);
     let middle = 0.5 * length;
     b.paint(m::FRAME_DARK).cuboid(Vec3::new(middle - half, -0.08, 2.95), Vec3::new(middle + half, 0.0, 3.6));
-    b.paint(m::shop_name(&mut look.seed));
+    b.paint(m::shop_name(&mut style.random));
     let p = |x: f32, z: f32| Vec3::new(middle + x * (half - 0.06), -0.085, z);
     b.plate([p(-1.0, 3.0), p(1.0, 3.0), p(1.0, 3.55), p(-1.0, 3.55)]);
-    if look.kind != HouseKind::Old && look.seed.chance(0.4) {
+    if style.kind != HouseKind::Old && style.random.chance(0.4) {
         b.paint(m::AWNING_RED);
         let p = |x: f32, y: f32, z: f32| Vec3::new(middle + x * half, y, z);
         b.plank([p(-1.0, -1.1, 2.5), p(1.0, -1.1, 2.5), p(1.0, -0.02, 2.9), p(-1.0, -0.02, 2.9)], 0.03);
     }
 }
 
-fn balcony(b: &mut Builder, look: &mut Look, [x0, x1]: [f32; 2], z: f32) {
-    let out = if look.kind == HouseKind::Old { 0.55 } else { 1.1 };
+fn balcony(b: &mut Builder, style: &mut Style, [x0, x1]: [f32; 2], z: f32) {
+    let out = if style.kind == HouseKind::Old { 0.55 } else { 1.1 };
     b.paint(m::CONCRETE).cuboid(Vec3::new(x0, -out, z - 0.12), Vec3::new(x1, 0.0, z + 0.04));
     b.paint(m::IRON);
     let mut rail = |from: Vec2, to: Vec2| {
@@ -303,34 +303,34 @@ fn balcony(b: &mut Builder, look: &mut Look, [x0, x1]: [f32; 2], z: f32) {
     rail(Vec2::new(x1 - 0.03, front), Vec2::new(x1 - 0.03, -0.03));
 }
 
-fn roof(b: &mut Builder, look: &mut Look, width: f32, depth: f32) {
-    let tiles = *look.seed.one_of(&[m::TILES_RED, m::TILES_RED, m::TILES_DARK, m::SLATE]);
-    let pick = look.seed.unit();
-    match look.kind {
-        HouseKind::Tower => flat(b, look, width, depth),
-        HouseKind::Villa if pick < 0.45 => hip(b, look, tiles, width, depth),
-        HouseKind::Villa if pick < 0.9 => gable(b, look, tiles, width, depth),
-        HouseKind::Old if pick < 0.75 => gable(b, look, tiles, width, depth),
-        HouseKind::Town if pick < 0.4 => gable(b, look, tiles, width, depth),
-        HouseKind::Town | HouseKind::Tall if pick < 0.7 => mansard(b, look, width, depth),
-        _ => flat(b, look, width, depth),
+fn roof(b: &mut Builder, style: &mut Style, width: f32, depth: f32) {
+    let tiles = *style.random.one_of(&[m::TILES_RED, m::TILES_RED, m::TILES_DARK, m::SLATE]);
+    let pick = style.random.unit();
+    match style.kind {
+        HouseKind::Tower => flat(b, style, width, depth),
+        HouseKind::Villa if pick < 0.45 => hip(b, style, tiles, width, depth),
+        HouseKind::Villa if pick < 0.9 => gable(b, style, tiles, width, depth),
+        HouseKind::Old if pick < 0.75 => gable(b, style, tiles, width, depth),
+        HouseKind::Town if pick < 0.4 => gable(b, style, tiles, width, depth),
+        HouseKind::Town | HouseKind::Tall if pick < 0.7 => mansard(b, style, width, depth),
+        _ => flat(b, style, width, depth),
     }
 }
 
 /// Two slopes, the ridge along the street.
-fn gable(b: &mut Builder, look: &mut Look, tiles: Surface, width: f32, depth: f32) {
-    let (half, eaves) = (0.5 * width, look.eaves());
-    let rise = look.seed.range(0.33, 0.5) * depth;
+fn gable(b: &mut Builder, style: &mut Style, tiles: Surface, width: f32, depth: f32) {
+    let (half, eaves) = (0.5 * width, style.eaves());
+    let rise = style.random.range(0.33, 0.5) * depth;
     let ridge = eaves + rise;
     let slope = rise / (0.5 * depth);
-    b.paint(look.wall);
+    b.paint(style.wall);
     for x in [-half, half] {
         let (low, high) = if x < 0.0 { (depth, 0.0) } else { (0.0, depth) };
         b.triangle([Vec3::new(x, low, eaves), Vec3::new(x, high, eaves), Vec3::new(x, 0.5 * depth, ridge)]);
     }
     b.paint(tiles);
     let over = 0.35;
-    let side = if look.kind == HouseKind::Villa { 0.3 } else { 0.02 };
+    let side = if style.kind == HouseKind::Villa { 0.3 } else { 0.02 };
     let (low, x) = (eaves - over * slope + 0.12, half + side);
     let p = |x: f32, y: f32, z: f32| Vec3::new(x, y, z);
     let top = ridge + 0.12;
@@ -338,8 +338,8 @@ fn gable(b: &mut Builder, look: &mut Look, tiles: Surface, width: f32, depth: f3
     let back = depth + over;
     b.plank([p(x, back, low), p(-x, back, low), p(-x, 0.5 * depth, top), p(x, 0.5 * depth, top)], 0.12);
     gutter(b, half, -over - 0.05, low - 0.1);
-    let y = 0.5 * depth + look.seed.range(-1.0, 1.0);
-    chimney(b, look, half, y, ridge);
+    let y = 0.5 * depth + style.random.range(-1.0, 1.0);
+    chimney(b, style, half, y, ridge);
 }
 
 fn gutter(b: &mut Builder, half: f32, y: f32, z: f32) {
@@ -347,10 +347,10 @@ fn gutter(b: &mut Builder, half: f32, y: f32, z: f32) {
     b.tube(Vec3::new(half - 0.2, -0.06, 0.0), Vec3::new(half - 0.2, -0.06, z), [0.045, 0.045], 6);
 }
 
-fn chimney(b: &mut Builder, look: &mut Look, half: f32, y: f32, ridge: f32) {
-    for _ in 0..1 + look.seed.below(2) {
-        let at = Vec2::new(look.seed.range(0.6 - half, half - 0.6), y);
-        let size = Vec2::new(look.seed.range(0.25, 0.5), 0.3);
+fn chimney(b: &mut Builder, style: &mut Style, half: f32, y: f32, ridge: f32) {
+    for _ in 0..1 + style.random.below(2) {
+        let at = Vec2::new(style.random.range(0.6 - half, half - 0.6), y);
+        let size = Vec2::new(style.random.range(0.25, 0.5), 0.3);
         b.paint(m::BRICK_BROWN).block((at - size).extend(ridge - 1.2), (at + size).extend(ridge + 0.8));
         b.paint(m::CONCRETE).cuboid((at - size - 0.06).extend(ridge + 0.8), (at + size + 0.06).extend(ridge + 0.9));
         b.paint(m::BRICK_RED).tube(at.extend(ridge + 0.9), at.extend(ridge + 1.3), [0.13, 0.11], 8);
@@ -358,8 +358,8 @@ fn chimney(b: &mut Builder, look: &mut Look, half: f32, y: f32, ridge: f32) {
 }
 
 /// Four slopes.
-fn hip(b: &mut Builder, look: &mut Look, tiles: Surface, width: f32, depth: f32) {
-    let (over, eaves) = (0.45, look.eaves());
+fn hip(b: &mut Builder, style: &mut Style, tiles: Surface, width: f32, depth: f32) {
+    let (over, eaves) = (0.45, style.eaves());
     let (half, rise) = (0.5 * width, 0.4 * depth.min(width));
     let inset = 0.48 * depth.min(width);
     let low = [Vec2::new(-half - over, -over), Vec2::new(half + over, depth + over)];
@@ -370,12 +370,12 @@ fn hip(b: &mut Builder, look: &mut Look, tiles: Surface, width: f32, depth: f32)
     let [l, h] = low;
     let p = |x: f32, y: f32| Vec3::new(x, y, eaves);
     b.quad([p(l.x, h.y), p(h.x, h.y), p(h.x, l.y), p(l.x, l.y)]);
-    chimney(b, look, 0.5 * half + 0.6, 0.5 * depth, eaves + 0.8 * rise);
+    chimney(b, style, 0.5 * half + 0.6, 0.5 * depth, eaves + 0.8 * rise);
 }
 
 /// A steep slope with dormers, flat on top.
-fn mansard(b: &mut Builder, look: &mut Look, width: f32, depth: f32) {
-    let (half, eaves, rise) = (0.5 * width, look.eaves(), 2.9);
+fn mansard(b: &mut Builder, style: &mut Style, width: f32, depth: f32) {
+    let (half, eaves, rise) = (0.5 * width, style.eaves(), 2.9);
     b.paint(m::STONE).cuboid(Vec3::new(-half, -0.25, eaves - 0.25), Vec3::new(half, 0.0, eaves));
     let low = [Vec2::new(-half, 0.0), Vec2::new(half, depth)];
     let inset = Vec2::new(0.02, 1.1);
@@ -386,9 +386,9 @@ fn mansard(b: &mut Builder, look: &mut Look, width: f32, depth: f32) {
         let frame = Affine3A::from_translation(Vec3::new(x - 0.75, 0.22, eaves + 0.15));
         b.within(frame, |b| {
             let (low, high) = (Vec2::new(0.2, 0.4), Vec2::new(1.3, 1.75));
-            let wall = look.wall;
+            let wall = style.wall;
             around(b, wall, [0.0, 1.5], [0.0, 2.0], low, high);
-            pane(b, look, low, high, [1, 0], m::CURTAIN, 0.3);
+            pane(b, style, low, high, [1, 0], m::CURTAIN, 0.3);
             let p = |x: f32, y: f32, z: f32| Vec3::new(x, y, z);
             b.paint(m::ZINC);
             b.quad([p(1.5, 0.0, 0.0), p(1.5, 1.0, 0.0), p(1.5, 1.0, 2.0), p(1.5, 0.0, 2.0)]);
@@ -396,30 +396,30 @@ fn mansard(b: &mut Builder, look: &mut Look, width: f32, depth: f32) {
             b.plank([p(-0.1, -0.15, 2.06), p(1.6, -0.15, 2.06), p(1.6, 1.2, 2.16), p(-0.1, 1.2, 2.16)], 0.06);
         });
     }
-    chimney(b, look, half, depth - 1.6, eaves + rise);
+    chimney(b, style, half, depth - 1.6, eaves + rise);
 }
 
 /// A parapet around a flat roof with what stands on it.
-fn flat(b: &mut Builder, look: &mut Look, width: f32, depth: f32) {
-    let (half, eaves, thick) = (0.5 * width, look.eaves(), 0.25);
-    let top = eaves + look.seed.range(0.4, 1.0);
+fn flat(b: &mut Builder, style: &mut Style, width: f32, depth: f32) {
+    let (half, eaves, thick) = (0.5 * width, style.eaves(), 0.25);
+    let top = eaves + style.random.range(0.4, 1.0);
     let (low, high) = (Vec2::new(-half, 0.0), Vec2::new(half, depth));
-    b.paint(look.wall);
+    b.paint(style.wall);
     b.block(low.extend(eaves), Vec3::new(high.x, low.y + thick, top));
     b.block(Vec3::new(low.x, high.y - thick, eaves), high.extend(top));
     b.block(Vec3::new(low.x, low.y + thick, eaves), Vec3::new(low.x + thick, high.y - thick, top));
     b.block(Vec3::new(high.x - thick, low.y + thick, eaves), Vec3::new(high.x, high.y - thick, top));
     let p = |x: f32, y: f32| Vec3::new(x, y, eaves + 0.05);
     b.paint(m::ROOFING).quad([p(low.x, low.y), p(high.x, low.y), p(high.x, high.y), p(low.x, high.y)]);
-    for _ in 0..2 + look.seed.below(3) {
-        let size = Vec2::new(look.seed.range(0.5, 1.1), look.seed.range(0.5, 1.1));
-        let at = look.seed.between(low + size + 0.4, high - size - 0.4);
-        let tall = look.seed.range(0.6, 1.5);
+    for _ in 0..2 + style.random.below(3) {
+        let size = Vec2::new(style.random.range(0.5, 1.1), style.random.range(0.5, 1.1));
+        let at = style.random.between(low + size + 0.4, high - size - 0.4);
+        let tall = style.random.range(0.6, 1.5);
         b.paint(m::STEEL).block((at - size).extend(eaves), (at + size).extend(eaves + tall));
     }
-    let hut = look.seed.between(low + 2.0, high - 2.0);
-    b.paint(look.wall).block((hut - 1.4).extend(eaves), (hut + 1.4).extend(eaves + 2.4));
-    let mast = look.seed.between(low + 0.5, high - 0.5);
+    let hut = style.random.between(low + 2.0, high - 2.0);
+    b.paint(style.wall).block((hut - 1.4).extend(eaves), (hut + 1.4).extend(eaves + 2.4));
+    let mast = style.random.between(low + 0.5, high - 0.5);
     b.paint(m::STEEL).tube(mast.extend(eaves), mast.extend(top + 2.5), [0.03, 0.02], 5);
 }
 

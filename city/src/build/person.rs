@@ -10,7 +10,7 @@ use glam::{Affine3A, Vec3};
 
 use super::Builder;
 use crate::materials::{self as m, Surface};
-use crate::words::{Asset, Class};
+use crate::types::{Asset, Class};
 
 /// Phases of a gait.
 pub(crate) const PHASES: usize = 16;
@@ -20,7 +20,7 @@ pub(crate) const BUILDS: usize = 8;
 pub(crate) const STRIDE: f64 = 1.4;
 
 /// What somebody looks like.
-struct Look {
+struct Appearance {
     height: f32,
     girth: f32,
     top: Surface,
@@ -31,25 +31,32 @@ struct Look {
     hat: bool,
 }
 
-const fn look(height: f32, girth: f32, top: Surface, trousers: Surface, skin: Surface, extras: [bool; 3]) -> Look {
+const fn appearance(
+    height: f32,
+    girth: f32,
+    top: Surface,
+    trousers: Surface,
+    skin: Surface,
+    extras: [bool; 3],
+) -> Appearance {
     let [skirt, bag, hat] = extras;
-    Look { height, girth, top, trousers, skin, skirt, bag, hat }
+    Appearance { height, girth, top, trousers, skin, skirt, bag, hat }
 }
 
-const LOOKS: [Look; BUILDS] = [
-    look(1.78, 1.0, m::CLOTH_BLUE, m::DENIM, m::SKIN_LIGHT, [false, true, false]),
-    look(1.66, 0.9, m::CLOTH_RED, m::CLOTH_BLACK, m::SKIN_LIGHT, [true, false, false]),
-    look(1.85, 1.1, m::CLOTH_GREY, m::CLOTH_BLACK, m::SKIN_DARK, [false, false, true]),
-    look(1.70, 1.2, m::CLOTH_BEIGE, m::CLOTH_GREY, m::SKIN_LIGHT, [false, true, true]),
-    look(1.62, 0.95, m::CLOTH_GREEN, m::DENIM, m::SKIN_DARK, [false, false, false]),
-    look(1.20, 0.75, m::PLASTIC_RED, m::DENIM, m::SKIN_LIGHT, [false, true, false]),
-    look(1.73, 1.0, m::CLOTH_WHITE, m::CLOTH_BEIGE, m::SKIN_DARK, [true, true, false]),
-    look(1.80, 1.05, m::CLOTH_BLACK, m::CLOTH_GREY, m::SKIN_LIGHT, [false, false, true]),
+const APPEARANCES: [Appearance; BUILDS] = [
+    appearance(1.78, 1.0, m::CLOTH_BLUE, m::DENIM, m::SKIN_LIGHT, [false, true, false]),
+    appearance(1.66, 0.9, m::CLOTH_RED, m::CLOTH_BLACK, m::SKIN_LIGHT, [true, false, false]),
+    appearance(1.85, 1.1, m::CLOTH_GREY, m::CLOTH_BLACK, m::SKIN_DARK, [false, false, true]),
+    appearance(1.70, 1.2, m::CLOTH_BEIGE, m::CLOTH_GREY, m::SKIN_LIGHT, [false, true, true]),
+    appearance(1.62, 0.95, m::CLOTH_GREEN, m::DENIM, m::SKIN_DARK, [false, false, false]),
+    appearance(1.20, 0.75, m::PLASTIC_RED, m::DENIM, m::SKIN_LIGHT, [false, true, false]),
+    appearance(1.73, 1.0, m::CLOTH_WHITE, m::CLOTH_BEIGE, m::SKIN_DARK, [true, true, false]),
+    appearance(1.80, 1.05, m::CLOTH_BLACK, m::CLOTH_GREY, m::SKIN_LIGHT, [false, false, true]),
 ];
 
 /// Height of a build relative to the average: its stride too.
 pub(crate) fn scale(build: usize) -> f64 {
-    f64::from(LOOKS[build % BUILDS].height) / 1.75
+    f64::from(APPEARANCES[build % BUILDS].height) / 1.75
 }
 
 /// Angles of the limbs, radians, positive ahead.
@@ -81,9 +88,9 @@ fn gait(phase: usize) -> Pose {
 
 /// Somebody in a phase of walking.
 pub(crate) fn walker(build: usize, phase: usize) -> Asset {
-    let look = &LOOKS[build % BUILDS];
+    let appearance = &APPEARANCES[build % BUILDS];
     let mut b = Builder::new(Class::Person);
-    body(&mut b, look, gait(phase));
+    body(&mut b, appearance, gait(phase));
     let lowest = b.lowest();
     b.shift(Vec3::Z * -lowest);
     b.finish(format!("person {build}, phase {phase}"))
@@ -91,7 +98,7 @@ pub(crate) fn walker(build: usize, phase: usize) -> Asset {
 
 /// Somebody who rides: hips at the origin.
 pub(crate) fn rider(b: &mut Builder, build: usize, pedals: bool) {
-    let look = &LOOKS[build % BUILDS];
+    let appearance = &APPEARANCES[build % BUILDS];
     let spread = if pedals { 0.35 } else { 0.0 };
     let pose = Pose {
         hips: [1.15 + spread, 1.15 - spread],
@@ -101,22 +108,27 @@ pub(crate) fn rider(b: &mut Builder, build: usize, pedals: bool) {
         lean: 0.35,
     };
     b.class(Class::Rider);
-    let hip = look.height * 0.52;
-    b.within(Affine3A::from_translation(-Vec3::Z * hip), |b| body(b, look, pose));
+    let hip = appearance.height * 0.52;
+    b.within(Affine3A::from_translation(-Vec3::Z * hip), |b| body(b, appearance, pose));
 }
 
-fn body(b: &mut Builder, look: &Look, pose: Pose) {
-    let h = look.height;
+fn body(b: &mut Builder, appearance: &Appearance, pose: Pose) {
+    let h = appearance.height;
     let hip = Vec3::Z * 0.52 * h;
     let (thigh, shin) = (0.25 * h, 0.25 * h);
     for (k, side) in [(0, 1.0), (1, -1.0)] {
-        let socket = hip + Vec3::Y * side * 0.055 * h * look.girth;
+        let socket = hip + Vec3::Y * side * 0.055 * h * appearance.girth;
         let limb = |angle: f32, length: f32| length * Vec3::new(angle.sin(), 0.0, -angle.cos());
         let knee = socket + limb(pose.hips[k], thigh);
         let foot = pose.hips[k] - pose.knees[k];
         let ankle = knee + limb(foot, shin);
-        b.paint(look.trousers).tube(socket, knee, [0.05 * h * look.girth, 0.034 * h], 7);
-        b.paint(if look.skirt { look.skin } else { look.trousers }).tube(knee, ankle, [0.034 * h, 0.024 * h], 7);
+        b.paint(appearance.trousers).tube(socket, knee, [0.05 * h * appearance.girth, 0.034 * h], 7);
+        b.paint(if appearance.skirt { appearance.skin } else { appearance.trousers }).tube(
+            knee,
+            ankle,
+            [0.034 * h, 0.024 * h],
+            7,
+        );
         // a foot stays near the horizontal while it is loaded
         let pitch = (0.6 * foot).min(0.2);
         b.within(Affine3A::from_translation(ankle) * Affine3A::from_rotation_y(-pitch), |b| {
@@ -124,24 +136,24 @@ fn body(b: &mut Builder, look: &Look, pose: Pose) {
             b.paint(m::LEATHER).cuboid(low * h, high * h);
         });
     }
-    b.within(Affine3A::from_translation(hip) * Affine3A::from_rotation_y(pose.lean), |b| torso(b, look, pose));
+    b.within(Affine3A::from_translation(hip) * Affine3A::from_rotation_y(pose.lean), |b| torso(b, appearance, pose));
 }
 
 /// What is above the hips, in their frame.
-fn torso(b: &mut Builder, look: &Look, pose: Pose) {
-    let (h, g) = (look.height, look.girth);
+fn torso(b: &mut Builder, appearance: &Appearance, pose: Pose) {
+    let (h, g) = (appearance.height, appearance.girth);
     let still = |_: Vec3| 1.0;
-    if look.skirt {
-        b.paint(look.trousers).tube(Vec3::Z * -0.2 * h, Vec3::Z * 0.03 * h, [0.125 * h, 0.085 * h], 9);
+    if appearance.skirt {
+        b.paint(appearance.trousers).tube(Vec3::Z * -0.2 * h, Vec3::Z * 0.03 * h, [0.125 * h, 0.085 * h], 9);
     } else {
-        b.paint(look.trousers).ball(Vec3::ZERO, Vec3::new(0.068 * g, 0.1 * g, 0.06) * h, 5, &still);
+        b.paint(appearance.trousers).ball(Vec3::ZERO, Vec3::new(0.068 * g, 0.1 * g, 0.06) * h, 5, &still);
     }
-    b.paint(look.top).ball(Vec3::Z * 0.15 * h, Vec3::new(0.068 * g, 0.108 * g, 0.185) * h, 7, &still);
-    b.paint(look.skin).tube(Vec3::Z * 0.3 * h, Vec3::Z * 0.36 * h, [0.032 * h, 0.03 * h], 6);
+    b.paint(appearance.top).ball(Vec3::Z * 0.15 * h, Vec3::new(0.068 * g, 0.108 * g, 0.185) * h, 7, &still);
+    b.paint(appearance.skin).tube(Vec3::Z * 0.3 * h, Vec3::Z * 0.36 * h, [0.032 * h, 0.03 * h], 6);
     b.ball(Vec3::new(0.01, 0.0, 0.405) * h, Vec3::new(0.054, 0.043, 0.064) * h, 6, &still);
-    b.paint(if look.hat { look.trousers } else { m::HAIR });
+    b.paint(if appearance.hat { appearance.trousers } else { m::HAIR });
     b.ball(Vec3::new(-0.004, 0.0, 0.424) * h, Vec3::new(0.058, 0.048, 0.056) * h, 6, &still);
-    if look.bag {
+    if appearance.bag {
         b.paint(m::LEATHER).cuboid(Vec3::new(-0.14, -0.08, 0.08) * h, Vec3::new(-0.06, 0.08, 0.29) * h);
     }
     for (k, side) in [(0, 1.0), (1, -1.0)] {
@@ -149,8 +161,8 @@ fn torso(b: &mut Builder, look: &Look, pose: Pose) {
         let limb = |angle: f32, length: f32| length * h * Vec3::new(angle.sin(), side * 0.06, -angle.cos());
         let elbow = shoulder + limb(pose.shoulders[k], 0.17);
         let hand = elbow + limb(pose.shoulders[k] + pose.elbows[k], 0.16);
-        b.paint(look.top).tube(shoulder, elbow, [0.032 * h, 0.025 * h], 6);
+        b.paint(appearance.top).tube(shoulder, elbow, [0.032 * h, 0.025 * h], 6);
         b.tube(elbow, hand, [0.025 * h, 0.019 * h], 6);
-        b.paint(look.skin).ball(hand, Vec3::splat(0.024 * h), 4, &still);
+        b.paint(appearance.skin).ball(hand, Vec3::splat(0.024 * h), 4, &still);
     }
 }

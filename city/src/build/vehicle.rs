@@ -7,7 +7,7 @@ use glam::{Affine3A, Vec2, Vec3};
 use super::{Builder, person};
 use crate::materials::{self as m, Surface};
 use crate::random::Random;
-use crate::words::{Asset, Class};
+use crate::types::{Asset, Class};
 
 /// Kinds of vehicles.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -82,7 +82,7 @@ pub(crate) fn vehicle(kind: VehicleKind, paint: usize, mut random: Random) -> As
 }
 
 /// The side view of a car's lower body and of its cabin, as shares of length (from the back) and metres of height.
-struct Side {
+struct SideView {
     /// Front and rear of the cabin at the belt line and at the roof.
     belt: [f32; 2],
     roof: [f32; 2],
@@ -90,7 +90,7 @@ struct Side {
     heights: [f32; 4],
 }
 
-fn side(kind: VehicleKind) -> Side {
+fn side_view(kind: VehicleKind) -> SideView {
     let (belt, roof, heights) = match kind {
         K::Hatchback => ([0.02, 0.74], [0.13, 0.55], [0.22, 0.82, 0.93, 1.46]),
         K::Estate => ([0.02, 0.72], [0.07, 0.55], [0.2, 0.8, 0.92, 1.47]),
@@ -99,11 +99,11 @@ fn side(kind: VehicleKind) -> Side {
         K::Pickup => ([0.38, 0.74], [0.42, 0.6], [0.34, 1.0, 1.08, 1.76]),
         _ => ([0.13, 0.73], [0.27, 0.54], [0.2, 0.8, 0.92, 1.43]),
     };
-    Side { belt, roof, heights }
+    SideView { belt, roof, heights }
 }
 
 fn car(b: &mut Builder, kind: VehicleKind, colour: Surface, random: &mut Random) {
-    let (size, view) = (kind.size(), side(kind));
+    let (size, view) = (kind.size(), side_view(kind));
     let x = |share: f32| (share - 0.5) * size.x;
     let [sill, bonnet, belt, roof] = view.heights;
     let half = 0.5 * size.y;
@@ -139,7 +139,7 @@ fn car(b: &mut Builder, kind: VehicleKind, colour: Surface, random: &mut Random)
     }
     if kind == K::Taxi {
         b.paint(m::CAR_YELLOW).cuboid(Vec3::new(-0.098, -0.31, roof), Vec3::new(0.098, 0.31, roof + 0.19));
-        b.paint(m::order(5));
+        b.paint(m::traffic_sign(5));
         let p = |y: f32, z: f32| Vec3::new(0.1, y, roof + z);
         b.plate([p(-0.3, 0.03), p(0.3, 0.03), p(0.3, 0.18), p(-0.3, 0.18)]);
         let p = |y: f32, z: f32| Vec3::new(-0.1, y, roof + z);
@@ -148,7 +148,7 @@ fn car(b: &mut Builder, kind: VehicleKind, colour: Surface, random: &mut Random)
 }
 
 /// The cabin: a frustum in the body's colour with panes a little outside of it.
-fn cabin(b: &mut Builder, kind: VehicleKind, colour: Surface, view: &Side, size: Vec2, half: f32) {
+fn cabin(b: &mut Builder, kind: VehicleKind, colour: Surface, view: &SideView, size: Vec2, half: f32) {
     let x = |share: f32| (share - 0.5) * size.x;
     let [.., belt, roof] = view.heights;
     let narrow = half - if kind == K::Van { 0.1 } else { 0.2 };

@@ -7,7 +7,7 @@ use glam::{DQuat, DVec3};
 use scene::{Camera, Rigid};
 use serde::{Deserialize, Serialize};
 
-use super::{SenseError, Shot, count, survey::smooth, within};
+use super::{SenseError, Shot, check_count, check_range, survey::catmull_rom};
 use crate::{
     Waypoint,
     random::{Random, bits},
@@ -95,9 +95,9 @@ impl Inertial {
     /// # Errors
     /// [`SenseError`] for settings that cannot be.
     pub fn check(&self) -> Result<(), SenseError> {
-        within("rate", self.rate, 0.1, 1e4)?;
-        within("fix_every", f64::from(self.fix_every), 1.0, 1e9)?;
-        within("wander_seconds", self.wander_seconds, 1e-3, 1e9)?;
+        check_range("rate", self.rate, 0.1, 1e4)?;
+        check_range("fix_every", f64::from(self.fix_every), 1.0, 1e9)?;
+        check_range("wander_seconds", self.wander_seconds, 1e-3, 1e9)?;
         let spreads = [
             ("wander_metres", self.wander_metres),
             ("fix_noise_metres", self.fix_noise_metres),
@@ -108,7 +108,7 @@ impl Inertial {
             ("accelerometer_bias", self.accelerometer_bias),
             ("bias_walk", self.bias_walk),
         ];
-        spreads.iter().try_for_each(|(name, spread)| within(name, *spread, 0.0, 1e4).map(|_| ()))
+        spreads.iter().try_for_each(|(name, spread)| check_range(name, *spread, 0.0, 1e4).map(|_| ()))
     }
 
     /// Readings along a path that is passed smoothly.
@@ -122,7 +122,7 @@ impl Inertial {
             return Err(SenseError::Setting("the path"));
         }
         let (Some(first), Some(last)) = (path.first(), path.last()) else { return Ok(Vec::new()) };
-        let readings = count((last.seconds - first.seconds) * self.rate + 1.0)?;
+        let readings = check_count((last.seconds - first.seconds) * self.rate + 1.0)?;
         let wander = self.wander(first.seconds, last.seconds)?;
         let mut random = Random::new(self.seed).fork(23);
         let (mut gyro_bias, mut accelerometer_bias) =
@@ -178,7 +178,7 @@ impl Inertial {
 
     /// The slow part of the GPS error: a knot each second.
     fn wander(&self, from: f64, to: f64) -> Result<Wander, SenseError> {
-        let knots = count(to - from + 2.0)?;
+        let knots = check_count(to - from + 2.0)?;
         let mut random = Random::new(self.seed).fork(31);
         let keep = (-1.0 / self.wander_seconds).exp();
         let spread = upright(self.wander_metres);
@@ -216,7 +216,8 @@ fn normal(random: &mut Random) -> DVec3 {
 
 /// Truth at a moment, from differences over `step` seconds to both sides.
 fn state(path: &[Waypoint], seconds: f64, step: f64) -> Option<Reading> {
-    let (before, here, after) = (smooth(path, seconds - step)?, smooth(path, seconds)?, smooth(path, seconds + step)?);
+    let (before, here, after) =
+        (catmull_rom(path, seconds - step)?, catmull_rom(path, seconds)?, catmull_rom(path, seconds + step)?);
     let velocity = (after.translation - before.translation) / (2.0 * step);
     let acceleration = (after.translation - 2.0 * here.translation + before.translation) / (step * step);
     let turn = (before.rotation.inverse() * after.rotation).normalize();
@@ -238,7 +239,7 @@ fn state(path: &[Waypoint], seconds: f64, step: f64) -> Option<Reading> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{sense::rig, stage};
+    use crate::{sense::rig, test_scene};
 
     /// A circle of 20 m at 10 m/s.
     fn circle() -> Vec<Waypoint> {
@@ -272,7 +273,7 @@ mod tests {
 
     #[test]
     fn cameras_of_one_moment_are_off_by_the_same() {
-        let shots = rig::drive(&stage::city(), &rig::Rig::default()).unwrap();
+        let shots = rig::drive(&test_scene::city(), &rig::Rig::default()).unwrap();
         let reported = Inertial::default().report(shots.clone()).unwrap();
         let off = |i: usize| reported[i].reported.centre() - reported[i].camera.centre();
         assert!((off(0) - off(5)).length() < 1e-9 && off(0).length() > 1e-3 && (off(0) - off(60)).length() > 1e-4);

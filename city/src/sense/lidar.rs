@@ -12,18 +12,18 @@ use rayon::prelude::*;
 use scene::Rigid;
 use serde::{Deserialize, Serialize};
 
-use super::{Motion, SenseError, count, rig, rig::Mount, within};
+use super::{Motion, SenseError, check_count, check_range, rig, rig::Mount};
 use crate::{
     Waypoint,
     faults::{self, Fault},
     random::{Random, bits},
-    trace::{Hit, Light, Meets, Moment, Ray, World},
+    trace::{Hit, Light, Moment, Ray, RayMask, World, degrade::degrade_light},
 };
 
 /// Times for which what moves is placed anew in a turn.
-const TICKS: usize = 8;
+const TIME_STEPS: usize = 8;
 /// Reflectivity of the wall that is half missed at the greatest range.
-const FAINT: f64 = 0.1;
+const THRESHOLD_REFLECTIVITY: f64 = 0.1;
 
 /// A lidar's make.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -117,16 +117,16 @@ impl Lidar {
     /// # Errors
     /// [`SenseError`] for a make that cannot be, or with more firings in a turn than a list may hold.
     pub fn check(&self) -> Result<(), SenseError> {
-        within("channels", f64::from(self.channels), 1.0, 1024.0)?;
-        within("lowest_degrees", self.lowest_degrees, -90.0, self.highest_degrees)?;
-        within("highest_degrees", self.highest_degrees, -90.0, 90.0)?;
-        within("range_metres", self.range_metres, 0.1, 1e4)?;
-        within("turns_per_second", self.turns_per_second, 0.1, 1e3)?;
-        within("firings_per_second", self.firings_per_second, 1.0, 1e8)?;
-        within("noise_metres", self.noise_metres, 0.0, 10.0)?;
-        within("intensity_noise", self.intensity_noise, 0.0, 10.0)?;
-        within("extinction", self.extinction, 0.0, 10.0)?;
-        count(f64::from(self.channels) * f64::from(self.columns()))?;
+        check_range("channels", f64::from(self.channels), 1.0, 1024.0)?;
+        check_range("lowest_degrees", self.lowest_degrees, -90.0, self.highest_degrees)?;
+        check_range("highest_degrees", self.highest_degrees, -90.0, 90.0)?;
+        check_range("range_metres", self.range_metres, 0.1, 1e4)?;
+        check_range("turns_per_second", self.turns_per_second, 0.1, 1e3)?;
+        check_range("firings_per_second", self.firings_per_second, 1.0, 1e8)?;
+        check_range("noise_metres", self.noise_metres, 0.0, 10.0)?;
+        check_range("intensity_noise", self.intensity_noise, 0.0, 10.0)?;
+        check_range("extinction", self.extinction, 0.0, 10.0)?;
+        check_count(f64::from(self.channels) * f64::from(self.columns()))?;
         Ok(())
     }
 
@@ -134,10 +134,10 @@ impl Lidar {
     ///
     /// # Errors
     /// [`SenseError`] for a make that cannot be, or more turns than a list may hold.
-    pub fn turns(&self, leg: &[Waypoint]) -> Result<usize, SenseError> {
+    pub fn sweep_count(&self, leg: &[Waypoint]) -> Result<usize, SenseError> {
         self.check()?;
         let (Some(first), Some(last)) = (leg.first(), leg.last()) else { return Ok(0) };
-        count((last.seconds - first.seconds) * self.turns_per_second)
+        check_count((last.seconds - first.seconds) * self.turns_per_second)
     }
 
     fn columns(&self) -> u32 {
@@ -148,7 +148,7 @@ impl Lidar {
     ///
     /// # Errors
     /// [`SenseError`] for a make that cannot be.
-    pub fn turn(
+    pub fn sweep_on_leg(
         &self,
         world: &World,
         leg: &[Waypoint],
@@ -158,8 +158,8 @@ impl Lidar {
         self.check()?;
         let Some(first) = leg.first() else { return Ok(None) };
         let seconds = first.seconds + (number as f64 + 0.5) / self.turns_per_second;
-        let Some((pose, motion)) = rig::carried(leg, &self.mount, seconds) else { return Ok(None) };
-        if faults::is_silent(faults, &self.mount.name, seconds) {
+        let Some((pose, motion)) = rig::sensor_pose_at(leg, &self.mount, seconds) else { return Ok(None) };
+        if faults::is_dropped_out(faults, &self.mount.name, seconds) {
             return Ok(None);
         }
         self.sweep(world, &pose, &motion, seconds, faults).map(Some)
@@ -184,15 +184,17 @@ impl Lidar {
         let columns = self.columns();
         let turn = 1.0 / self.turns_per_second;
         let after = |share: f64| (share - 0.5) * turn;
-        let moments: Vec<Moment> =
-            (0..TICKS).into_par_iter().map(|i| world.at(seconds + after((i as f64 + 0.5) / TICKS as f64))).collect();
-        let fog = f64::from(faults::spoil_light(&Light::default(), faults).fog);
+        let moments: Vec<Moment> = (0..TIME_STEPS)
+            .into_par_iter()
+            .map(|i| world.at(seconds + after((i as f64 + 0.5) / TIME_STEPS as f64)))
+            .collect();
+        let fog = f64::from(degrade_light(&Light::default(), faults).fog);
         let column = |i: u32| {
             let share = (f64::from(i) + 0.5) / f64::from(columns);
             let firing = Firing {
                 lidar: self,
-                moment: &moments[((share * TICKS as f64) as usize).min(TICKS - 1)],
-                pose: motion.carry(pose, after(share)),
+                moment: &moments[((share * TIME_STEPS as f64) as usize).min(TIME_STEPS - 1)],
+                pose: motion.extrapolate(pose, after(share)),
                 // clockwise from behind, so that the middle of the turn looks ahead
                 azimuth: std::f64::consts::PI - std::f64::consts::TAU * share,
                 seconds: seconds + after(share),
@@ -225,13 +227,13 @@ impl Firing<'_> {
         let (sine, cosine) = self.azimuth.sin_cos();
         let direction = DVec3::new(cosine * elevation.cos(), sine * elevation.cos(), elevation.sin());
         let towards = (self.pose.rotation * direction).as_vec3().normalize_or(Vec3::X);
-        let ray = Ray { to: lidar.range_metres as f32, ..Ray::new(self.pose.translation.as_vec3(), towards) };
-        let (hit, intensity, through_glass) = self.strongest(&ray)?;
+        let ray = Ray { t_max: lidar.range_metres as f32, ..Ray::new(self.pose.translation.as_vec3(), towards) };
+        let (hit, intensity, through_glass) = self.strongest_return(&ray)?;
         let true_range = f64::from(hit.distance);
         let mut random = Random::new(bits(self.key, u64::from(channel)));
         // the noise under which a return is lost is that of the faint wall at the end of the range
         let end = lidar.range_metres;
-        let threshold = FAINT * (-2.0 * lidar.extinction * end).exp() / (end * end);
+        let threshold = THRESHOLD_REFLECTIVITY * (-2.0 * lidar.extinction * end).exp() / (end * end);
         let power = intensity / (true_range * true_range).max(0.25);
         let lost = f64::from(random.unit()) > 1.0 / (1.0 + (threshold / power.max(1e-30)).powi(3));
         let range = true_range + f64::from(random.normal()) * lidar.noise_metres;
@@ -254,16 +256,16 @@ impl Firing<'_> {
     }
 
     /// The stronger of what glass sends back and what comes through it.
-    fn strongest(&self, ray: &Ray) -> Option<(Hit, f64, bool)> {
-        let hit = self.moment.cast(ray, Meets::Everything)?;
+    fn strongest_return(&self, ray: &Ray) -> Option<(Hit, f64, bool)> {
+        let hit = self.moment.cast(ray, RayMask::All)?;
         let own = self.intensity(ray, &hit);
         let clear = f64::from(self.moment.material(&hit).1.transparency.clamp(0.0, 1.0));
         if clear == 0.0 {
             return Some((hit, own, false));
         }
-        let beyond = Ray { from: hit.distance + 1e-3, ..*ray };
+        let beyond = Ray { t_min: hit.distance + 1e-3, ..*ray };
         let behind =
-            self.moment.cast(&beyond, Meets::Opaque).map(|far| (far, clear * clear * self.intensity(ray, &far)));
+            self.moment.cast(&beyond, RayMask::Opaque).map(|far| (far, clear * clear * self.intensity(ray, &far)));
         let (own_power, square) = (own / f64::from(hit.distance).powi(2), |far: &Hit| f64::from(far.distance).powi(2));
         match behind {
             Some((far, weak)) if weak / square(&far) > own_power => Some((far, weak, true)),
@@ -285,12 +287,12 @@ impl Firing<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::stage;
+    use crate::test_scene;
 
     fn sweep(at: DVec3, faults: &[Fault]) -> Sweep {
-        let city = stage::city();
+        let city = test_scene::city();
         let world = World::new(&city).unwrap();
-        Lidar::default().sweep(&world, &stage::place(at), &Motion::STILL, 0.0, faults).unwrap()
+        Lidar::default().sweep(&world, &test_scene::pose_at_point(at), &Motion::STILL, 0.0, faults).unwrap()
     }
 
     #[test]
@@ -300,12 +302,12 @@ mod tests {
         let (mut walls, mut off, mut kept) = (0, 0.0, 0.0);
         for r in &seen.returns {
             let distance = match r.material {
-                stage::ASPHALT => r.point.z.abs(),
-                stage::PLASTER => {
+                test_scene::ASPHALT => r.point.z.abs(),
+                test_scene::PLASTER => {
                     walls += 1;
                     (r.point.y - 12.0).abs()
                 }
-                stage::BRICK => (r.point.x - 14.0).abs().min((r.point.y - 6.0).abs()),
+                test_scene::BRICK => (r.point.x - 14.0).abs().min((r.point.y - 6.0).abs()),
                 _ => 0.0,
             };
             assert!(distance < 1e-3, "{r:?}");
@@ -325,9 +327,9 @@ mod tests {
         // beams at the height of the pane go through to the wall 2 m behind it
         let seen = sweep(DVec3::new(0.0, 0.0, 1.73), &[]);
         let through: Vec<&Return> = seen.returns.iter().filter(|r| r.through_glass).collect();
-        assert!(through.len() > 20 && through.iter().all(|r| r.material == stage::PLASTER));
+        assert!(through.len() > 20 && through.iter().all(|r| r.material == test_scene::PLASTER));
         assert!(through.iter().all(|r| r.true_intensity < 0.5 * 0.85 * 0.85 + 1e-3));
-        assert!(seen.returns.iter().any(|r| r.material == stage::GLASS), "the squarest beams flash");
+        assert!(seen.returns.iter().any(|r| r.material == test_scene::GLASS), "the squarest beams flash");
     }
 
     #[test]
@@ -343,20 +345,20 @@ mod tests {
             lost(&clear, true),
             lost(&clear, false)
         );
-        let fog = Fault { kind: crate::faults::Kind::Fog, strength: 1.0, seed: 0 };
+        let fog = Fault { kind: crate::faults::FaultKind::Fog, strength: 1.0, seed: 0 };
         assert!(lost(&sweep(DVec3::new(-50.0, 0.0, 1.73), &[fog]), false) > lost(&clear, false) + 0.05);
     }
 
     #[test]
     fn a_turn_of_a_leg_is_the_same_for_any_number_of_threads() {
-        let city = stage::city();
+        let city = test_scene::city();
         let world = World::new(&city).unwrap();
         let legs = rig::legs(&city, &rig::Rig::default()).unwrap();
         let lidar = Lidar::default();
-        assert_eq!(lidar.turns(&legs[0]), Ok(240));
+        assert_eq!(lidar.sweep_count(&legs[0]), Ok(240));
         let with = |threads| {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-            pool.install(|| lidar.turn(&world, &legs[0], 50, &[]).unwrap().unwrap())
+            pool.install(|| lidar.sweep_on_leg(&world, &legs[0], 50, &[]).unwrap().unwrap())
         };
         let (one, two) = (with(1), with(2));
         assert_eq!(one, two);

@@ -19,7 +19,7 @@ use scene::{Camera, Pinhole, Rigid};
 use serde::{Deserialize, Serialize};
 
 /// The most shots or sweeps that one list may hold.
-pub const MOST: usize = 4_000_000;
+pub const MAX_READINGS: usize = 4_000_000;
 
 /// Settings that ask for what cannot be.
 #[derive(Debug, thiserror::Error, Clone, PartialEq, Eq)]
@@ -27,8 +27,8 @@ pub enum SenseError {
     /// A number that is not finite or out of its range.
     #[error("{0} is out of range")]
     Setting(&'static str),
-    /// More readings than [`MOST`].
-    #[error("{0} would be more readings than {MOST}")]
+    /// More readings than [`MAX_READINGS`].
+    #[error("{0} would be more readings than {MAX_READINGS}")]
     TooMany(u64),
 }
 
@@ -56,7 +56,7 @@ impl Motion {
     }
 
     /// A pose, `world_from_body`, this much later.
-    pub fn carry(&self, pose: &Rigid, seconds: f64) -> Rigid {
+    pub fn extrapolate(&self, pose: &Rigid, seconds: f64) -> Rigid {
         Rigid {
             rotation: (DQuat::from_scaled_axis(self.spin * seconds) * pose.rotation).normalize(),
             translation: pose.translation + self.velocity * seconds,
@@ -121,7 +121,7 @@ pub fn pinhole(width: u32, height: u32, field_degrees: f64) -> Result<Pinhole, S
 
 /// A camera at a point that looks along a direction, its picture upright (y down) where the direction is not vertical;
 /// straight down, the top of the picture is `up`.
-pub fn looking(pinhole: Pinhole, centre: DVec3, forward: DVec3, up: DVec3) -> Camera {
+pub fn camera_towards(pinhole: Pinhole, centre: DVec3, forward: DVec3, up: DVec3) -> Camera {
     let forward = forward.try_normalize().unwrap_or(DVec3::X);
     let level = DVec3::Z.cross(forward);
     let right = if level.length() > 1e-6 { -level } else { forward.cross(up) };
@@ -132,13 +132,13 @@ pub fn looking(pinhole: Pinhole, centre: DVec3, forward: DVec3, up: DVec3) -> Ca
 }
 
 /// Checks that a number lies in a range (and is one).
-pub(crate) fn within(name: &'static str, value: f64, low: f64, high: f64) -> Result<f64, SenseError> {
+pub(crate) fn check_range(name: &'static str, value: f64, low: f64, high: f64) -> Result<f64, SenseError> {
     if value >= low && value <= high { Ok(value) } else { Err(SenseError::Setting(name)) }
 }
 
 /// Checks a number of readings before there are any.
-pub(crate) fn count(readings: f64) -> Result<usize, SenseError> {
-    if readings.is_finite() && readings <= MOST as f64 {
+pub(crate) fn check_count(readings: f64) -> Result<usize, SenseError> {
+    if readings.is_finite() && readings <= MAX_READINGS as f64 {
         Ok(readings.max(0.0) as usize)
     } else {
         Err(SenseError::TooMany(readings as u64))
@@ -151,7 +151,7 @@ mod tests {
 
     #[test]
     fn a_level_camera_sees_up_as_up_and_left_as_left() {
-        let camera = looking(pinhole(100, 100, 90.0).unwrap(), DVec3::new(1.0, 2.0, 3.0), DVec3::X, DVec3::X);
+        let camera = camera_towards(pinhole(100, 100, 90.0).unwrap(), DVec3::new(1.0, 2.0, 3.0), DVec3::X, DVec3::X);
         let (ahead, depth) = camera.project(DVec3::new(11.0, 2.0, 3.0));
         assert!((ahead.x - 50.0).abs() < 1e-6 && (ahead.y - 50.0).abs() < 1e-6 && (depth - 10.0).abs() < 1e-9);
         let (left_above, _) = camera.project(DVec3::new(11.0, 4.0, 4.0));
@@ -162,7 +162,7 @@ mod tests {
     fn a_motion_carries_one_pose_to_the_other() {
         let a = Rigid { rotation: DQuat::from_rotation_z(0.3), translation: DVec3::new(1.0, 2.0, 3.0) };
         let b = Rigid { rotation: DQuat::from_rotation_z(0.7), translation: DVec3::new(2.0, 2.0, 3.0) };
-        let there = Motion::between(&a, &b, 0.5).carry(&a, 0.5);
+        let there = Motion::between(&a, &b, 0.5).extrapolate(&a, 0.5);
         assert!((there.translation - b.translation).length() < 1e-12);
         assert!(there.rotation.angle_between(b.rotation) < 1e-9);
     }

@@ -17,12 +17,12 @@ use rayon::prelude::*;
 use scene::Rigid;
 use serde::{Deserialize, Serialize};
 
-use super::{Motion, SenseError, rig::Mount, within};
+use super::{Motion, SenseError, check_range, rig::Mount};
 use crate::{
     Class,
     faults::{self, Fault},
     random::{Random, bits},
-    trace::{Hit, Meets, Moment, Ray, motion},
+    trace::{Hit, Moment, Ray, RayMask, motion},
 };
 
 /// Rays of a column of the fan.
@@ -47,7 +47,8 @@ pub struct Radar {
     /// Size of a cell in velocity, metres per second.
     pub velocity_cell: f64,
     /// The most detections of a sweep, without ghosts.
-    pub most: u32,
+    #[serde(rename = "most")]
+    pub max_detections: u32,
     /// Noise of a range, metres (1σ).
     pub range_noise_metres: f64,
     /// Noise of an azimuth, degrees (1σ).
@@ -70,7 +71,7 @@ impl Default for Radar {
             range_cell_metres: 0.4,
             azimuth_cell_degrees: 1.5,
             velocity_cell: 0.2,
-            most: 250,
+            max_detections: 250,
             range_noise_metres: 0.1,
             azimuth_noise_degrees: 0.4,
             velocity_noise: 0.08,
@@ -113,17 +114,17 @@ impl Radar {
     /// # Errors
     /// [`SenseError`] for a make that cannot be.
     pub fn check(&self) -> Result<(), SenseError> {
-        within("field_degrees", self.field_degrees, 1.0, 360.0)?;
-        within("elevation_degrees", self.elevation_degrees, 0.0, 120.0)?;
-        within("range_metres", self.range_metres, 1.0, 1e4)?;
-        within("range_cell_metres", self.range_cell_metres, 1e-3, 1e3)?;
-        within("azimuth_cell_degrees", self.azimuth_cell_degrees, 0.05, 90.0)?;
-        within("velocity_cell", self.velocity_cell, 1e-3, 1e3)?;
-        within("most", f64::from(self.most), 0.0, 1e6)?;
-        within("range_noise_metres", self.range_noise_metres, 0.0, 1e3)?;
-        within("azimuth_noise_degrees", self.azimuth_noise_degrees, 0.0, 90.0)?;
-        within("velocity_noise", self.velocity_noise, 0.0, 1e3)?;
-        within("ghosts", self.ghosts, 0.0, 10.0)?;
+        check_range("field_degrees", self.field_degrees, 1.0, 360.0)?;
+        check_range("elevation_degrees", self.elevation_degrees, 0.0, 120.0)?;
+        check_range("range_metres", self.range_metres, 1.0, 1e4)?;
+        check_range("range_cell_metres", self.range_cell_metres, 1e-3, 1e3)?;
+        check_range("azimuth_cell_degrees", self.azimuth_cell_degrees, 0.05, 90.0)?;
+        check_range("velocity_cell", self.velocity_cell, 1e-3, 1e3)?;
+        check_range("max_detections", f64::from(self.max_detections), 0.0, 1e6)?;
+        check_range("range_noise_metres", self.range_noise_metres, 0.0, 1e3)?;
+        check_range("azimuth_noise_degrees", self.azimuth_noise_degrees, 0.0, 90.0)?;
+        check_range("velocity_noise", self.velocity_noise, 0.0, 1e3)?;
+        check_range("ghosts", self.ghosts, 0.0, 10.0)?;
         Ok(())
     }
 
@@ -135,26 +136,26 @@ impl Radar {
         &self,
         moment: &Moment,
         pose: &Rigid,
-        own: &Motion,
+        sensor_motion: &Motion,
         faults: &[Fault],
     ) -> Result<Vec<Detection>, SenseError> {
         self.check()?;
-        if !pose.is_sane() || !own.velocity.is_finite() {
+        if !pose.is_sane() || !sensor_motion.velocity.is_finite() {
             return Err(SenseError::Setting("the pose"));
         }
-        if faults::is_silent(faults, &self.mount.name, moment.seconds) {
+        if faults::is_dropped_out(faults, &self.mount.name, moment.seconds) {
             return Ok(Vec::new());
         }
         let mut random = Random::new(bits(self.seed, moment.seconds.to_bits()));
-        let kept = self.strongest(self.returns(moment, pose, own));
-        let mut detections: Vec<Detection> = kept.iter().map(|found| self.read(found, &mut random)).collect();
-        let ghosts: Vec<Detection> = kept.iter().filter_map(|found| self.haunt(found, &mut random)).collect();
+        let kept = self.strongest_per_cell(self.returns(moment, pose, sensor_motion));
+        let mut detections: Vec<Detection> = kept.iter().map(|found| self.add_noise(found, &mut random)).collect();
+        let ghosts: Vec<Detection> = kept.iter().filter_map(|found| self.ghost_of(found, &mut random)).collect();
         detections.extend(ghosts);
         Ok(detections)
     }
 
     /// Everything the fan meets, without noise.
-    fn returns(&self, moment: &Moment, pose: &Rigid, own: &Motion) -> Vec<Detection> {
+    fn returns(&self, moment: &Moment, pose: &Rigid, sensor_motion: &Motion) -> Vec<Detection> {
         // four columns to a cell, so that a pole is not missed for long
         let columns = (4.0 * self.field_degrees / self.azimuth_cell_degrees).ceil() as u32;
         let column = |i: u32| {
@@ -164,9 +165,9 @@ impl Radar {
                 let (e, (s, c)) = (elevation.to_radians(), azimuth.sin_cos());
                 let local = DVec3::new(c * e.cos(), s * e.cos(), e.sin());
                 let towards = (pose.rotation * local).as_vec3().normalize_or(Vec3::X);
-                Ray { to: self.range_metres as f32, ..Ray::new(pose.translation.as_vec3(), towards) }
+                Ray { t_max: self.range_metres as f32, ..Ray::new(pose.translation.as_vec3(), towards) }
             };
-            let met = |row: u32| self.echo(moment, pose, own, &ray(row), azimuth);
+            let met = |row: u32| self.return_along(moment, pose, sensor_motion, &ray(row), azimuth);
             (0..ROWS).filter_map(met).collect::<Vec<_>>()
         };
         let columns: Vec<Vec<Detection>> = (0..columns).into_par_iter().map(column).collect();
@@ -174,12 +175,20 @@ impl Radar {
     }
 
     /// What comes back along a ray; the thin glass of windows is not there for it.
-    fn echo(&self, moment: &Moment, pose: &Rigid, own: &Motion, ray: &Ray, azimuth: f64) -> Option<Detection> {
-        let hit = moment.cast(ray, Meets::Opaque)?;
+    fn return_along(
+        &self,
+        moment: &Moment,
+        pose: &Rigid,
+        sensor_motion: &Motion,
+        ray: &Ray,
+        azimuth: f64,
+    ) -> Option<Detection> {
+        let hit = moment.cast(ray, RayMask::Opaque)?;
         let range = f64::from(hit.distance).max(0.05);
         let towards = ray.direction.as_dvec3();
         let point = pose.translation + towards * range;
-        let velocity = (motion::velocity_at(moment.actor(&hit), moment.seconds, point) - own.velocity).dot(towards);
+        let velocity =
+            (motion::velocity_at(moment.actor(&hit), moment.seconds, point) - sensor_motion.velocity).dot(towards);
         // a square metre of metal, met squarely at the end of the range, is 10 dB over the noise
         let scattered = scattering(moment, &hit, ray).max(1e-9);
         let power = 10.0 + 10.0 * scattered.log10() + 40.0 * (self.range_metres / range).log10();
@@ -200,7 +209,7 @@ impl Radar {
     }
 
     /// The strongest return of each cell, and of those the strongest.
-    fn strongest(&self, returns: Vec<Detection>) -> Vec<Detection> {
+    fn strongest_per_cell(&self, returns: Vec<Detection>) -> Vec<Detection> {
         let mut cells: BTreeMap<[i64; 3], Detection> = BTreeMap::new();
         for found in returns.into_iter().filter(|found| found.power > 0.0) {
             let cell = [
@@ -215,13 +224,13 @@ impl Radar {
         }
         let mut kept: Vec<Detection> = cells.into_values().collect();
         // gain is turned down for what is near, or nothing else would be seen
-        let even = |found: &Detection| f64::from(found.power) + 40.0 * found.true_range.log10();
-        kept.sort_by(|a, b| even(b).total_cmp(&even(a)));
-        kept.truncate(self.most as usize);
+        let range_independent_power = |found: &Detection| f64::from(found.power) + 40.0 * found.true_range.log10();
+        kept.sort_by(|a, b| range_independent_power(b).total_cmp(&range_independent_power(a)));
+        kept.truncate(self.max_detections as usize);
         kept
     }
 
-    fn read(&self, found: &Detection, random: &mut Random) -> Detection {
+    fn add_noise(&self, found: &Detection, random: &mut Random) -> Detection {
         let mut noisy = |value: f32, noise: f64| value + random.normal() * noise as f32;
         Detection {
             range: noisy(found.range, self.range_noise_metres).max(0.0),
@@ -233,7 +242,7 @@ impl Radar {
     }
 
     /// Sometimes, the ghost of a return.
-    fn haunt(&self, found: &Detection, random: &mut Random) -> Option<Detection> {
+    fn ghost_of(&self, found: &Detection, random: &mut Random) -> Option<Detection> {
         let appears = random.chance(self.ghosts as f32);
         let twice = random.chance(0.5);
         let farther = random.range(1.1, 1.6);
@@ -242,7 +251,7 @@ impl Radar {
             false => Detection { range: farther * found.range, azimuth: -found.azimuth, ..*found },
         };
         let shadow = Detection { ghost: true, power: found.power - 12.0, ..shadow };
-        (appears && f64::from(shadow.range) < self.range_metres).then(|| self.read(&shadow, random))
+        (appears && f64::from(shadow.range) < self.range_metres).then(|| self.add_noise(&shadow, random))
     }
 }
 
@@ -267,17 +276,17 @@ fn scattering(moment: &Moment, hit: &Hit, ray: &Ray) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{stage, trace::World};
+    use crate::{test_scene, trace::World};
 
     #[test]
     fn a_van_that_drives_away_is_seen_to_do_so() {
-        let city = stage::city();
+        let city = test_scene::city();
         let world = World::new(&city).unwrap();
         // the van is 20 m ahead of a sensor that follows it at 4 m/s
         let moment = world.at(2.25 + 0.0);
-        let pose = stage::place(DVec3::new(-30.0, -2.0, 0.6));
-        let own = Motion { velocity: DVec3::X * 4.0, ..Motion::STILL };
-        let found = Radar::default().sweep(&moment, &pose, &own, &[]).unwrap();
+        let pose = test_scene::pose_at_point(DVec3::new(-30.0, -2.0, 0.6));
+        let sensor_motion = Motion { velocity: DVec3::X * 4.0, ..Motion::STILL };
+        let found = Radar::default().sweep(&moment, &pose, &sensor_motion, &[]).unwrap();
         let van: Vec<&Detection> = found.iter().filter(|d| d.instance == 7 && !d.ghost).collect();
         assert!(!van.is_empty());
         for d in &van {
@@ -295,11 +304,12 @@ mod tests {
 
     #[test]
     fn a_box_straight_ahead_moves_at_ten_metres_a_second() {
-        let city = stage::city();
+        let city = test_scene::city();
         let world = World::new(&city).unwrap();
         let radar = Radar { velocity_noise: 0.0, ghosts: 1.0, ..Radar::default() };
-        let found =
-            radar.sweep(&world.at(3.0), &stage::place(DVec3::new(-40.0, -2.0, 0.9)), &Motion::STILL, &[]).unwrap();
+        let found = radar
+            .sweep(&world.at(3.0), &test_scene::pose_at_point(DVec3::new(-40.0, -2.0, 0.9)), &Motion::STILL, &[])
+            .unwrap();
         let nearest = found
             .iter()
             .filter(|d| d.instance == 7 && !d.ghost)
@@ -309,7 +319,9 @@ mod tests {
         assert!(ghosts > 3 && found.len() - ghosts > 20 && found.len() - ghosts <= 250, "{ghosts} of {}", found.len());
         assert_eq!(
             found,
-            radar.sweep(&world.at(3.0), &stage::place(DVec3::new(-40.0, -2.0, 0.9)), &Motion::STILL, &[]).unwrap()
+            radar
+                .sweep(&world.at(3.0), &test_scene::pose_at_point(DVec3::new(-40.0, -2.0, 0.9)), &Motion::STILL, &[])
+                .unwrap()
         );
     }
 
@@ -317,10 +329,10 @@ mod tests {
     fn makes_that_cannot_be_are_refused_and_a_dropped_sensor_is_silent() {
         assert!(Radar { azimuth_cell_degrees: 0.0, ..Radar::default() }.check().is_err());
         assert!(Radar { ghosts: f64::NAN, ..Radar::default() }.check().is_err());
-        let city = stage::city();
+        let city = test_scene::city();
         let world = World::new(&city).unwrap();
-        let out = [Fault { kind: crate::faults::Kind::SensorDropout, strength: 1.0, seed: 5 }];
-        let pose = stage::place(DVec3::new(-30.0, 0.0, 0.6));
+        let out = [Fault { kind: crate::faults::FaultKind::SensorDropout, strength: 1.0, seed: 5 }];
+        let pose = test_scene::pose_at_point(DVec3::new(-30.0, 0.0, 0.6));
         let silent = (0..40)
             .filter(|i| {
                 Radar::default().sweep(&world.at(f64::from(*i) * 2.0), &pose, &Motion::STILL, &out).unwrap().is_empty()

@@ -14,7 +14,7 @@ use glam::{DMat3, DQuat, DVec3};
 use scene::Rigid;
 use serde::{Deserialize, Serialize};
 
-use super::{Motion, SenseError, Shot, count, looking, pinhole, within};
+use super::{Motion, SenseError, Shot, camera_towards, check_count, check_range, pinhole};
 use crate::{City, Waypoint, trace::motion};
 
 /// A sensor on a car: metres from the point of the road under its centre.
@@ -90,14 +90,14 @@ impl Default for Rig {
 /// [`SenseError`] for settings out of range, or more pictures than a list may hold.
 pub fn drive(city: &City, rig: &Rig) -> Result<Vec<Shot>, SenseError> {
     let lens = pinhole(rig.width, rig.height, rig.field_degrees)?;
-    within("rolling_shutter_seconds", rig.rolling_shutter_seconds, 0.0, 1.0)?;
-    within("shutter_seconds", rig.shutter_seconds, 0.0, 1.0)?;
+    check_range("rolling_shutter_seconds", rig.rolling_shutter_seconds, 0.0, 1.0)?;
+    check_range("shutter_seconds", rig.shutter_seconds, 0.0, 1.0)?;
     let offsets = rig.cameras.iter().all(|m| m.offset.abs().max_element() < 100.0 && m.yaw_degrees.abs() <= 360.0);
     if !offsets {
         return Err(SenseError::Setting("a camera's mount"));
     }
     let legs = legs(city, rig)?;
-    count(legs.iter().map(|leg| leg.len() as f64).sum::<f64>() * rig.cameras.len() as f64)?;
+    check_count(legs.iter().map(|leg| leg.len() as f64).sum::<f64>() * rig.cameras.len() as f64)?;
     let mut shots = Vec::new();
     for (street, leg) in legs.iter().enumerate() {
         for (i, here) in leg.iter().enumerate() {
@@ -107,7 +107,7 @@ pub fn drive(city: &City, rig: &Rig) -> Result<Vec<Shot>, SenseError> {
                 let pose = &here.world_from_asset;
                 let arm = pose.rotation * mount.offset;
                 let forward = pose.rotation * (DQuat::from_rotation_z(mount.yaw_degrees.to_radians()) * DVec3::X);
-                let camera = looking(lens, pose.translation + arm, forward, DVec3::Z);
+                let camera = camera_towards(lens, pose.translation + arm, forward, DVec3::Z);
                 let name = format!("{}-{street:04}-{i:05}", mount.name);
                 let mut shot = Shot::new(name, &mount.name, here.seconds, camera);
                 // a camera on an arm moves with the car and is swung around its centre
@@ -126,12 +126,12 @@ pub fn drive(city: &City, rig: &Rig) -> Result<Vec<Shot>, SenseError> {
 /// # Errors
 /// [`SenseError`] for settings out of range, or more waypoints than a list may hold.
 pub fn legs(city: &City, rig: &Rig) -> Result<Vec<Vec<Waypoint>>, SenseError> {
-    let spacing = within("spacing_metres", rig.spacing_metres, 0.01, 1e4)?;
-    let speed = within("speed", rig.speed, 0.01, 100.0)?;
-    let lane = within("lane_metres", rig.lane_metres, -50.0, 50.0)?;
-    let mut seconds = within("start_seconds", rig.start_seconds, -1e9, 1e9)?;
-    let streets: Vec<Line> = city.streets.iter().filter_map(|street| Line::new(street)).collect();
-    count(streets.iter().map(|line| line.length() / spacing + 1.0).sum())?;
+    let spacing = check_range("spacing_metres", rig.spacing_metres, 0.01, 1e4)?;
+    let speed = check_range("speed", rig.speed, 0.01, 100.0)?;
+    let lane = check_range("lane_metres", rig.lane_metres, -50.0, 50.0)?;
+    let mut seconds = check_range("start_seconds", rig.start_seconds, -1e9, 1e9)?;
+    let streets: Vec<Polyline> = city.streets.iter().filter_map(|street| Polyline::new(street)).collect();
+    check_count(streets.iter().map(|line| line.length() / spacing + 1.0).sum())?;
     let mut legs = Vec::new();
     for line in &streets {
         let rounds = (line.length() / spacing) as usize + 1;
@@ -147,7 +147,7 @@ pub fn legs(city: &City, rig: &Rig) -> Result<Vec<Vec<Waypoint>>, SenseError> {
 }
 
 /// The pose of a car's sensor at a moment of a leg, `world_from_sensor` with x ahead, y left and z up, and its motion.
-pub fn carried(leg: &[Waypoint], mount: &Mount, seconds: f64) -> Option<(Rigid, Motion)> {
+pub fn sensor_pose_at(leg: &[Waypoint], mount: &Mount, seconds: f64) -> Option<(Rigid, Motion)> {
     const STEP: f64 = 0.01;
     let at = |seconds| {
         let car = motion::between(leg, seconds)?;
@@ -161,13 +161,13 @@ pub fn carried(leg: &[Waypoint], mount: &Mount, seconds: f64) -> Option<(Rigid, 
 }
 
 /// A polyline by its length.
-pub(crate) struct Line<'a> {
+pub(crate) struct Polyline<'a> {
     points: &'a [DVec3],
     /// Metres to each point.
     ways: Vec<f64>,
 }
 
-impl<'a> Line<'a> {
+impl<'a> Polyline<'a> {
     /// None for lines without a length or with points that are none.
     pub(crate) fn new(points: &'a [DVec3]) -> Option<Self> {
         let mut ways = vec![0.0];
@@ -204,11 +204,11 @@ impl<'a> Line<'a> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::stage;
+    use crate::test_scene;
 
     #[test]
     fn six_cameras_look_around_from_a_car() {
-        let city = stage::city();
+        let city = test_scene::city();
         let shots = drive(&city, &Rig::default()).unwrap();
         assert_eq!(shots.len(), 6 * 61);
         let round = &shots[60..66];
@@ -226,7 +226,7 @@ mod tests {
 
     #[test]
     fn settings_that_cannot_be_are_refused() {
-        let city = stage::city();
+        let city = test_scene::city();
         for rig in [
             Rig { spacing_metres: 0.0, ..Rig::default() },
             Rig { spacing_metres: f64::NAN, ..Rig::default() },

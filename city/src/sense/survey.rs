@@ -5,7 +5,7 @@ use glam::{DVec2, DVec3};
 use scene::{Camera, Pinhole};
 use serde::{Deserialize, Serialize};
 
-use super::{Motion, SenseError, Shot, count, looking, pinhole, rig::Line, within};
+use super::{Motion, SenseError, Shot, camera_towards, check_count, check_range, pinhole, rig::Polyline};
 use crate::{
     City, Waypoint,
     random::Random,
@@ -65,10 +65,10 @@ impl Survey {
     /// [`SenseError`] for settings out of range, or more stops than a list may hold.
     pub fn stops(&self, city: &City) -> Result<[u32; 2], SenseError> {
         let lens = pinhole(self.width, self.height, self.field_degrees)?;
-        let height = within("height_metres", self.height_metres, 5.0, 2e4)?;
-        let forward = within("forward_overlap", self.forward_overlap, 0.0, 0.95)?;
-        let side = within("side_overlap", self.side_overlap, 0.0, 0.95)?;
-        within("tilt_degrees", self.tilt_degrees, 0.0, 80.0)?;
+        let height = check_range("height_metres", self.height_metres, 5.0, 2e4)?;
+        let forward = check_range("forward_overlap", self.forward_overlap, 0.0, 0.95)?;
+        let side = check_range("side_overlap", self.side_overlap, 0.0, 0.95)?;
+        check_range("tilt_degrees", self.tilt_degrees, 0.0, 80.0)?;
         let [low, high] = self.corners(city);
         let size = high - low;
         if !(size.min_element() >= 0.0 && size.max_element() < 1e6 && low.abs().max_element() < 1e6) {
@@ -78,7 +78,7 @@ impl Survey {
         let covered = DVec2::new(f64::from(lens.width), f64::from(lens.height)) * height / lens.fx;
         let step = covered * (DVec2::ONE - DVec2::new(side, forward));
         let stops = (size / step).ceil() + 1.0;
-        count(stops.x * stops.y)?;
+        check_count(stops.x * stops.y)?;
         Ok([stops.x as u32, stops.y as u32])
     }
 
@@ -96,11 +96,11 @@ pub fn survey(city: &City, settings: &Survey) -> Result<Vec<Shot>, SenseError> {
     let lens = pinhole(settings.width, settings.height, settings.field_degrees)?;
     let [lines, stops] = settings.stops(city)?;
     let headings = if settings.tilt_degrees > 0.0 { 5.0 } else { 1.0 };
-    count(f64::from(lines) * f64::from(stops) * headings)?;
+    check_count(f64::from(lines) * f64::from(stops) * headings)?;
     let (height, tilt) = (settings.height_metres, settings.tilt_degrees);
-    let speed = within("speed", settings.speed, 0.1, 300.0)?;
-    let start = within("start_seconds", settings.start_seconds, -1e9, 1e9)?;
-    let shutter = within("shutter_seconds", settings.shutter_seconds, 0.0, 1.0)?;
+    let speed = check_range("speed", settings.speed, 0.1, 300.0)?;
+    let start = check_range("start_seconds", settings.start_seconds, -1e9, 1e9)?;
+    let shutter = check_range("shutter_seconds", settings.shutter_seconds, 0.0, 1.0)?;
     let [low, high] = settings.corners(city);
     let size = high - low;
     let even = |i: u32, n: u32| if n > 1 { f64::from(i) / f64::from(n - 1) } else { 0.5 };
@@ -114,7 +114,7 @@ pub fn survey(city: &City, settings: &Survey) -> Result<Vec<Shot>, SenseError> {
             way += last.map_or(0.0, |p| p.distance(place));
             last = Some(place);
             for (name, heading) in headings_of(ahead, tilt) {
-                let camera = looking(lens, place, heading, ahead);
+                let camera = camera_towards(lens, place, heading, ahead);
                 let mut shot = Shot::new(format!("{name}-{line:04}-{stop:04}"), name, start + way / speed, camera);
                 shot.motion.velocity = ahead * speed;
                 shot.shutter_seconds = shutter;
@@ -196,13 +196,13 @@ impl Default for Fixed {
 /// [`SenseError`] for settings out of range, or more pictures than a list may hold.
 pub fn fixed(moment: &Moment, settings: &Fixed) -> Result<Vec<Shot>, SenseError> {
     let lens = pinhole(settings.width, settings.height, settings.field_degrees)?;
-    let height = within("height_metres", settings.height_metres, 0.1, 200.0)?;
-    let side = within("side_metres", settings.side_metres, -50.0, 50.0)?;
-    let tilt = within("tilt_degrees", settings.tilt_degrees, -89.0, 89.0)?.to_radians();
-    let every = within("every_seconds", settings.every_seconds, 0.0, 1e6)?;
-    let start = within("start_seconds", settings.start_seconds, -1e9, 1e9)?;
-    count(f64::from(settings.cameras) * f64::from(settings.pictures))?;
-    let streets: Vec<Line> = moment.city().streets.iter().filter_map(|street| Line::new(street)).collect();
+    let height = check_range("height_metres", settings.height_metres, 0.1, 200.0)?;
+    let side = check_range("side_metres", settings.side_metres, -50.0, 50.0)?;
+    let tilt = check_range("tilt_degrees", settings.tilt_degrees, -89.0, 89.0)?.to_radians();
+    let every = check_range("every_seconds", settings.every_seconds, 0.0, 1e6)?;
+    let start = check_range("start_seconds", settings.start_seconds, -1e9, 1e9)?;
+    check_count(f64::from(settings.cameras) * f64::from(settings.pictures))?;
+    let streets: Vec<Polyline> = moment.city().streets.iter().filter_map(|street| Polyline::new(street)).collect();
     let mut random = Random::new(settings.seed).fork(17);
     let mut shots = Vec::new();
     let mut found = 0;
@@ -212,7 +212,7 @@ pub fn fixed(moment: &Moment, settings: &Fixed) -> Result<Vec<Shot>, SenseError>
         }
         let line = random.one_of(&streets);
         let (way, right) = (f64::from(random.unit()) * line.length(), if random.chance(0.5) { side } else { -side });
-        let Some(camera) = post(moment, line, way, right, height, tilt, lens) else { continue };
+        let Some(camera) = post_camera(moment, line, way, right, height, tilt, lens) else { continue };
         let sensor = format!("fixed-{found:03}");
         shots.extend(
             (0..settings.pictures)
@@ -224,7 +224,15 @@ pub fn fixed(moment: &Moment, settings: &Fixed) -> Result<Vec<Shot>, SenseError>
 }
 
 /// A camera beside a street, or none where something stands between it and the street.
-fn post(moment: &Moment, line: &Line, way: f64, right: f64, height: f64, tilt: f64, lens: Pinhole) -> Option<Camera> {
+fn post_camera(
+    moment: &Moment,
+    line: &Polyline,
+    way: f64,
+    right: f64,
+    height: f64,
+    tilt: f64,
+    lens: Pinhole,
+) -> Option<Camera> {
     let road = line.pose(way, 0.0);
     let place = line.pose(way, right).translation + DVec3::Z * height;
     // back to the middle of what it is to see
@@ -233,11 +241,11 @@ fn post(moment: &Moment, line: &Line, way: f64, right: f64, height: f64, tilt: f
     let over = road.translation + DVec3::Z * height;
     let is_free = |a: DVec3, b: DVec3| {
         let direction = (b - a).as_vec3().normalize_or_zero();
-        !moment.is_blocked(&Ray { to: a.distance(b) as f32, ..Ray::new(a.as_vec3(), direction) })
+        !moment.is_occluded(&Ray { t_max: a.distance(b) as f32, ..Ray::new(a.as_vec3(), direction) })
     };
     let towards =
         (ahead * tilt.cos() - DVec3::Z * tilt.sin() - 0.25 * right.signum() * -(road.rotation * DVec3::Y)).normalize();
-    (is_free(over, place) && is_free(place, seen)).then(|| looking(lens, place, towards, ahead))
+    (is_free(over, place) && is_free(place, seen)).then(|| camera_towards(lens, place, towards, ahead))
 }
 
 /// Pictures along a path of camera poses (`world_from_camera`, OpenCV axes), which it passes smoothly: Catmull and Rom's
@@ -246,24 +254,24 @@ fn post(moment: &Moment, line: &Line, way: f64, right: f64, height: f64, tilt: f
 /// # Errors
 /// [`SenseError`] for settings out of range, or more pictures than a list may hold.
 pub fn free(sensor: &str, path: &[Waypoint], lens: Pinhole, every_seconds: f64) -> Result<Vec<Shot>, SenseError> {
-    let every = within("every_seconds", every_seconds, 1e-4, 1e6)?;
+    let every = check_range("every_seconds", every_seconds, 1e-4, 1e6)?;
     let sane = path.iter().all(|w| w.seconds.is_finite() && w.world_from_asset.is_sane());
     if !sane || path.windows(2).any(|pair| pair[0].seconds >= pair[1].seconds) {
         return Err(SenseError::Setting("the path"));
     }
     let (Some(first), Some(last)) = (path.first(), path.last()) else { return Ok(Vec::new()) };
-    let pictures = count((last.seconds - first.seconds) / every + 1.0)?;
+    let pictures = check_count((last.seconds - first.seconds) / every + 1.0)?;
     let mut shots = Vec::with_capacity(pictures);
     for i in 0..pictures {
         let seconds = first.seconds + i as f64 * every;
-        let Some(pose) = smooth(path, seconds) else { continue };
+        let Some(pose) = catmull_rom(path, seconds) else { continue };
         let mut shot = Shot::new(
             format!("{sensor}-{i:06}"),
             sensor,
             seconds,
             Camera { pinhole: lens, camera_from_world: pose.inverse() },
         );
-        if let (Some(before), Some(after)) = (smooth(path, seconds - 5e-3), smooth(path, seconds + 5e-3)) {
+        if let (Some(before), Some(after)) = (catmull_rom(path, seconds - 5e-3), catmull_rom(path, seconds + 5e-3)) {
             shot.motion = Motion::between(&before, &after, 1e-2);
         }
         shots.push(shot);
@@ -272,7 +280,7 @@ pub fn free(sensor: &str, path: &[Waypoint], lens: Pinhole, every_seconds: f64) 
 }
 
 /// A pose on the smooth curve through waypoints.
-pub fn smooth(path: &[Waypoint], seconds: f64) -> Option<scene::Rigid> {
+pub fn catmull_rom(path: &[Waypoint], seconds: f64) -> Option<scene::Rigid> {
     let straight = motion::between(path, seconds)?;
     let next = path.partition_point(|w| w.seconds <= seconds);
     if next == 0 || next == path.len() {
@@ -294,11 +302,11 @@ pub fn smooth(path: &[Waypoint], seconds: f64) -> Option<scene::Rigid> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{stage, trace::World};
+    use crate::{test_scene, trace::World};
 
     #[test]
     fn neighbours_overlap_as_asked() {
-        let city = stage::city();
+        let city = test_scene::city();
         let settings = Survey { height_metres: 50.0, forward_overlap: 0.8, side_overlap: 0.5, ..Survey::default() };
         let shots = survey(&city, &settings).unwrap();
         let covered = 50.0 / shots[0].camera.pinhole.fx * 1200.0;
@@ -323,7 +331,7 @@ mod tests {
 
     #[test]
     fn surveillance_cameras_stay_and_see_their_street() {
-        let city = stage::city();
+        let city = test_scene::city();
         let world = World::new(&city).unwrap();
         let shots = fixed(&world.at(0.0), &Fixed { cameras: 3, pictures: 4, ..Fixed::default() }).unwrap();
         assert_eq!(shots.len(), 12);
@@ -333,8 +341,10 @@ mod tests {
 
     #[test]
     fn a_free_path_passes_its_waypoints() {
-        let at =
-            |seconds: f64, x: f64, y: f64| Waypoint { seconds, world_from_asset: stage::place(DVec3::new(x, y, 2.0)) };
+        let at = |seconds: f64, x: f64, y: f64| Waypoint {
+            seconds,
+            world_from_asset: test_scene::pose_at_point(DVec3::new(x, y, 2.0)),
+        };
         let path = [at(0.0, 0.0, 0.0), at(1.0, 1.0, 0.5), at(2.0, 2.0, 0.0), at(3.0, 3.0, 0.5)];
         let shots = free("free", &path, pinhole(64, 64, 90.0).unwrap(), 0.5).unwrap();
         assert_eq!(shots.len(), 7);

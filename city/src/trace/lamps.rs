@@ -1,5 +1,5 @@
-//! What shines at night. Materials say so by their names, in want of a word of their own: "lamp" for lamps, "lit" for
-//! rooms with a light on. Lamps on posts light what is around them; all others are only seen.
+//! Light sources at night. A material emits if its name has the word "lamp" (lamps) or "lit" (lit rooms). Only lamps on
+//! posts illuminate other surfaces.
 
 use std::collections::BTreeMap;
 
@@ -7,41 +7,41 @@ use glam::{IVec2, Quat, Vec3, vec3};
 
 use crate::{Asset, City, Class, Material};
 
-/// Metres beyond which a street lamp counts for nothing.
-const REACH: f32 = 24.0;
-/// Light of a street lamp straight below, at a metre.
-const STREET: Vec3 = vec3(26.0, 20.0, 13.0);
+/// Range of a street lamp, metres.
+const REACH_METRES: f32 = 24.0;
+/// Irradiance one metre straight below a street lamp.
+const LAMP_INTENSITY: Vec3 = vec3(26.0, 20.0, 13.0);
 
-/// What shines in a city.
+/// The light sources of a city.
 pub(crate) struct Lamps {
-    /// How bright each material is, next to its base colour.
-    glow: Vec<f32>,
-    /// Street lamps by square of [`REACH`], world metres.
+    /// Emission of each material, as a factor on its base colour.
+    emission: Vec<f32>,
+    /// Street lamps by grid cell of [`REACH_METRES`], world metres.
     cells: BTreeMap<[i32; 2], Vec<Vec3>>,
 }
 
 impl Lamps {
     pub(crate) fn new(city: &City) -> Self {
-        let glow: Vec<f32> = city.materials.iter().map(glow).collect();
-        let bulbs: Vec<Option<Vec3>> = city.assets.iter().map(|asset| bulb(asset, &glow)).collect();
+        let emission: Vec<f32> = city.materials.iter().map(emission_of).collect();
+        let positions: Vec<Option<Vec3>> = city.assets.iter().map(|asset| lamp_position(asset, &emission)).collect();
         let mut cells: BTreeMap<[i32; 2], Vec<Vec3>> = BTreeMap::new();
         for actor in city.actors.iter().filter(|actor| actor.trajectory.is_none()) {
-            if let Some(bulb) = bulbs[actor.asset as usize] {
+            if let Some(position) = positions[actor.asset as usize] {
                 let pose = &actor.world_from_asset;
-                let at = Quat::from_array(pose.rotation.as_quat().to_array()) * bulb + pose.translation.as_vec3();
+                let at = Quat::from_array(pose.rotation.as_quat().to_array()) * position + pose.translation.as_vec3();
                 cells.entry(cell(at).to_array()).or_default().push(at);
             }
         }
-        Self { glow, cells }
+        Self { emission, cells }
     }
 
-    /// How bright a material is at night, next to its base colour.
-    pub(crate) fn glow(&self, material: u16) -> f32 {
-        self.glow[usize::from(material)]
+    /// Emission of a material, as a factor on its base colour.
+    pub(crate) fn emission(&self, material: u16) -> f32 {
+        self.emission[usize::from(material)]
     }
 
-    /// Light of the street lamps on a surface; `is_free` says whether nothing stands between two points.
-    pub(crate) fn shine(&self, point: Vec3, normal: Vec3, is_free: impl Fn(Vec3, Vec3) -> bool) -> Vec3 {
+    /// Irradiance of the street lamps on a surface; `is_free` tells whether the segment between two points is unobstructed.
+    pub(crate) fn irradiance(&self, point: Vec3, normal: Vec3, is_free: impl Fn(Vec3, Vec3) -> bool) -> Vec3 {
         let here = cell(point);
         let mut sum = Vec3::ZERO;
         for (x, y) in (0..9).map(|i| (i % 3 - 1, i / 3 - 1)) {
@@ -49,12 +49,12 @@ impl Lamps {
                 let way = lamp - point;
                 let square = way.length_squared().max(0.25);
                 let towards = way / square.sqrt();
-                // downwards most, a little to the sides, nothing up; fades out at its reach
+                // strongest downwards, none upwards, fading to zero at the range
                 let lobe = (0.1 + 0.9 * towards.z).max(0.0);
-                let fade = (1.0 - square / (REACH * REACH)).max(0.0);
+                let fade = (1.0 - square / (REACH_METRES * REACH_METRES)).max(0.0);
                 let share = normal.dot(towards).max(0.0) * lobe * fade * fade / square;
                 if share > 1e-4 && is_free(point, lamp - 0.35 * towards) {
-                    sum += share * STREET;
+                    sum += share * LAMP_INTENSITY;
                 }
             }
         }
@@ -63,10 +63,10 @@ impl Lamps {
 }
 
 fn cell(at: Vec3) -> IVec2 {
-    (at.truncate() / REACH).floor().as_ivec2()
+    (at.truncate() / REACH_METRES).floor().as_ivec2()
 }
 
-fn glow(material: &Material) -> f32 {
+fn emission_of(material: &Material) -> f32 {
     let named = |word: &str| material.name.split(|c: char| !c.is_alphabetic()).any(|part| part == word);
     if named("lamp") {
         2.5
@@ -77,12 +77,12 @@ fn glow(material: &Material) -> f32 {
     }
 }
 
-/// The middle of an asset's lamp, where it is one on a post.
-fn bulb(asset: &Asset, glow: &[f32]) -> Option<Vec3> {
+/// The centre of an asset's lamp, if it is a street lamp.
+fn lamp_position(asset: &Asset, emission: &[f32]) -> Option<Vec3> {
     let mesh = &asset.mesh;
     let (mut sum, mut corners) = (Vec3::ZERO, 0.0);
     for (i, triangle) in mesh.triangles.iter().enumerate() {
-        if mesh.classes[i] == Class::Pole && glow[usize::from(mesh.materials[i])] > 0.0 {
+        if mesh.classes[i] == Class::Pole && emission[usize::from(mesh.materials[i])] > 0.0 {
             sum += triangle.iter().map(|&c| mesh.positions[c as usize]).sum::<Vec3>();
             corners += 3.0;
         }

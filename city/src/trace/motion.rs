@@ -1,17 +1,17 @@
-//! Where an actor is at a moment, how fast, and in which part of its gait.
+//! Poses, velocities and gait phases of actors at a time.
 
 use glam::DVec3;
 use scene::Rigid;
 
 use crate::{Actor, Waypoint};
 
-/// The actor's pose at a moment of the city's clock.
+/// The actor's pose at a city time, seconds.
 pub fn pose_at(actor: &Actor, seconds: f64) -> Rigid {
     let path = actor.trajectory.as_ref().map_or(&[][..], |t| &t.waypoints);
     between(path, seconds).unwrap_or(actor.world_from_asset)
 }
 
-/// The asset that the actor wears at a moment: its gait's in turn, else its own.
+/// The actor's asset at a time: the current phase of its gait, or its own asset without one.
 pub fn asset_at(actor: &Actor, seconds: f64) -> u32 {
     match &actor.trajectory {
         Some(t) if !t.gait.is_empty() && t.gait_seconds > 0.0 => {
@@ -22,18 +22,19 @@ pub fn asset_at(actor: &Actor, seconds: f64) -> u32 {
     }
 }
 
-/// The velocity of a point that the actor carries along, world metres per second.
+/// The velocity of a point fixed to the actor, world metres per second.
 pub fn velocity_at(actor: &Actor, seconds: f64, point: DVec3) -> DVec3 {
     const STEP: f64 = 1e-3;
     if actor.trajectory.is_none() {
         return DVec3::ZERO;
     }
-    let carried = pose_at(actor, seconds).inverse().apply(point);
+    let sensor_pose_at = pose_at(actor, seconds).inverse().apply(point);
     let (before, after) = (pose_at(actor, seconds - STEP), pose_at(actor, seconds + STEP));
-    (after.apply(carried) - before.apply(carried)) / (2.0 * STEP)
+    (after.apply(sensor_pose_at) - before.apply(sensor_pose_at)) / (2.0 * STEP)
 }
 
-/// A pose between waypoints: straight and by slerp, held before the first and after the last; none where there are none.
+/// The pose between waypoints: linear interpolation and slerp, constant before the first and after the last waypoint.
+/// `None` without waypoints.
 pub fn between(path: &[Waypoint], seconds: f64) -> Option<Rigid> {
     let next = path.partition_point(|w| w.seconds <= seconds);
     let (Some(a), Some(b)) = (path.get(next.saturating_sub(1)), path.get(next.min(path.len().saturating_sub(1))))
@@ -45,7 +46,7 @@ pub fn between(path: &[Waypoint], seconds: f64) -> Option<Rigid> {
     Some(mix(&a.world_from_asset, &b.world_from_asset, share))
 }
 
-/// A pose between two.
+/// Interpolates two poses; `share` is 0 at `a` and 1 at `b`.
 pub fn mix(a: &Rigid, b: &Rigid, share: f64) -> Rigid {
     Rigid {
         rotation: a.rotation.slerp(b.rotation, share).normalize(),

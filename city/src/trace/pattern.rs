@@ -1,37 +1,38 @@
-//! What surfaces are painted with: the patterns of materials, filtered over the footprint of a pixel, so that distance
-//! blurs them as a lens would and no view shows what another cannot confirm.
+//! Material patterns as procedural textures, filtered over the footprint of a pixel. Without the filter distant patterns
+//! would alias, and views of the same surface would disagree.
 
 use font8x8::legacy::BASIC_LEGACY;
 use glam::{Vec2, Vec3};
 
 use crate::{Material, Pattern};
 
-/// Octaves of noise that are ever added up.
+/// Largest number of noise octaves.
 const OCTAVES: u32 = 10;
-/// Share of a letter's cell that its ink covers, on average over capitals.
+/// Mean ink coverage of a letter's cell, over capital letters.
 const INK: f32 = 0.36;
 
-/// The colour of a material at a place of its surface. `seed` tells surfaces of different materials apart; `size` is how
-/// far the pixel reaches in u and in v; `amount`, 0 to 1, fades the pattern (0: one colour).
+/// The colour of a material at a surface coordinate. `seed` differs by material, `size` is the footprint of the pixel in u
+/// and v, `amount` from 0 (base colour only) to 1 is the strength of the pattern.
 pub(crate) fn colour(material: &Material, seed: u32, texts: &[String], uv: Vec2, size: Vec2, amount: f32) -> Vec3 {
     let base = material.base_colour;
     let painted = match material.pattern {
         Pattern::Plain => return base,
         Pattern::Noise { finest_metres, coarsest_metres, amount } => {
-            base * (1.0 + amount * octaves(uv, finest_metres, coarsest_metres, seed, size)).max(0.0)
+            base * (1.0 + amount * fractal_noise(uv, finest_metres, coarsest_metres, seed, size)).max(0.0)
         }
         Pattern::Bricks { size_metres, joint_metres, joint_shade, bond, amount } => {
             bricks(base, uv, size_metres, joint_metres, joint_shade, bond, amount, seed, size)
         }
         Pattern::Panels { width_metres, joint_metres, amount } => {
-            let one = fade(width_metres, size.x) * (unit(hash(seed, (uv.x / width_metres).floor() as i32, 0)) - 0.5);
-            let joints = stripes(uv.x, width_metres, joint_metres, size.x);
-            let weather = 0.15 * octaves(uv * Vec2::new(1.0, 0.2), 0.1, 3.0, seed ^ 1, size);
+            let one =
+                detail_weight(width_metres, size.x) * (unit(hash(seed, (uv.x / width_metres).floor() as i32, 0)) - 0.5);
+            let joints = stripe_coverage(uv.x, width_metres, joint_metres, size.x);
+            let weather = 0.15 * fractal_noise(uv * Vec2::new(1.0, 0.2), 0.1, 3.0, seed ^ 1, size);
             base * (1.0 + amount * (one + weather)).max(0.0) * (1.0 - 0.55 * joints)
         }
         Pattern::Text { row, ink } => {
             let text = texts.get(row as usize).map_or("", String::as_str);
-            base.lerp(ink, written(text, uv, size))
+            base.lerp(ink, text_coverage(text, uv, size))
         }
     };
     base.lerp(painted, amount)
@@ -49,20 +50,21 @@ fn bricks(
     size: Vec2,
 ) -> Vec3 {
     let course = (uv.y / brick.y).floor();
-    // beyond the width of a course its offset is a mean too
+    // every other course is shifted
     let shift = if bond { 0.5 * brick.x * (course.rem_euclid(2.0)) } else { 0.0 };
     let along = uv.x + shift;
     let one = unit(hash(seed, (along / brick.x).floor() as i32, course as i32)) - 0.5;
-    let seen = fade(brick.x, size.x) * fade(brick.y, size.y);
-    let (level, upright) = (stripes(uv.y, brick.y, joint, size.y), stripes(along, brick.x, joint, size.x));
+    let seen = detail_weight(brick.x, size.x) * detail_weight(brick.y, size.y);
+    let (level, upright) =
+        (stripe_coverage(uv.y, brick.y, joint, size.y), stripe_coverage(along, brick.x, joint, size.x));
     let joints = level + upright - level * upright;
-    let stains = 0.35 * octaves(uv, 0.5 * brick.y, 4.0, seed ^ 1, size);
+    let stains = 0.35 * fractal_noise(uv, 0.5 * brick.y, 4.0, seed ^ 1, size);
     let tone = (1.0 + amount * (1.4 * seen * one + stains)).max(0.0);
     (base * tone).lerp(base * shade, joints)
 }
 
-/// The share of ink where a text fills the unit square, dot by dot.
-fn written(text: &str, uv: Vec2, size: Vec2) -> f32 {
+/// Ink coverage of a text that fills the unit square, in a dot-matrix font.
+fn text_coverage(text: &str, uv: Vec2, size: Vec2) -> f32 {
     let letters = text.chars().count();
     if letters == 0 || uv.min_element() < 0.0 || uv.max_element() > 1.0 {
         return 0.0;
@@ -87,9 +89,9 @@ fn written(text: &str, uv: Vec2, size: Vec2) -> f32 {
     sum / (taps * taps) as f32
 }
 
-/// Noise in about -1..1 whose features reach from `coarsest` down to `finest` metres or the pixel, finer ones weaker.
-fn octaves(uv: Vec2, finest: f32, coarsest: f32, seed: u32, size: Vec2) -> f32 {
-    // between the two extents of a pixel seen at an angle: finer would shimmer, coarser would be a smear
+/// Fractal noise, about -1..1, with wavelengths from `coarsest` metres down to `finest` or the pixel footprint.
+fn fractal_noise(uv: Vec2, finest: f32, coarsest: f32, seed: u32, size: Vec2) -> f32 {
+    // the geometric mean of the footprint's sides: less would alias, more would blur
     let footprint = (size.x * size.y).sqrt();
     let (mut feature, mut weight) = (coarsest.max(1e-3), 1.0);
     let (mut sum, mut power) = (0.0, 0.0);
@@ -97,18 +99,18 @@ fn octaves(uv: Vec2, finest: f32, coarsest: f32, seed: u32, size: Vec2) -> f32 {
         if feature < finest.max(1e-3) * 0.7 {
             break;
         }
-        let seen = fade(feature, footprint);
+        let seen = detail_weight(feature, footprint);
         if seen > 0.0 {
             sum += weight * seen * noise(uv / feature, seed.wrapping_add(octave));
         }
         power += weight * weight;
         (feature, weight) = (0.5 * feature, 0.97 * weight);
     }
-    // a lattice's values spread over 0.37 of their range
+    // the standard deviation of lattice noise is about 0.37 of its range
     if power > 0.0 { sum / (0.8 * power).sqrt() } else { 0.0 }
 }
 
-/// Smooth noise in -1..1 between values on the integer lattice.
+/// Value noise in -1..1 on the integer lattice.
 fn noise(at: Vec2, seed: u32) -> f32 {
     let cell = at.floor();
     let t = at - cell;
@@ -120,8 +122,8 @@ fn noise(at: Vec2, seed: u32) -> f32 {
     2.0 * (low + t.y * (high - low)) - 1.0
 }
 
-/// The share of a pixel that lies on stripes of this width, one at the start of each period.
-fn stripes(x: f32, period: f32, width: f32, size: f32) -> f32 {
+/// Share of a pixel that is covered by stripes of this width, one at the start of each period.
+fn stripe_coverage(x: f32, period: f32, width: f32, size: f32) -> f32 {
     let covered = |x: f32| {
         let n = (x / period).floor();
         n * width + (x - n * period).min(width)
@@ -137,12 +139,12 @@ fn stripes(x: f32, period: f32, width: f32, size: f32) -> f32 {
     ((covered(x + 0.5 * span) - covered(x - 0.5 * span)) / span).clamp(0.0, 1.0)
 }
 
-/// 1 where a pixel is much smaller than a feature, 0 where it is as large.
-fn fade(feature: f32, footprint: f32) -> f32 {
+/// Weight of a detail: 1 where the pixel is much smaller than the feature, 0 where it is as large.
+fn detail_weight(feature: f32, footprint: f32) -> f32 {
     (1.5 - 1.5 * footprint / feature).clamp(0.0, 1.0)
 }
 
-/// Well mixed bits of a place on a lattice (the permuted generator's finaliser, Jarzynski and Olano 2020).
+/// Hash of a lattice point (PCG output function, Jarzynski and Olano 2020).
 pub(crate) fn hash(seed: u32, x: i32, y: i32) -> u32 {
     let mixed =
         seed.wrapping_mul(0x9e37_79b1) ^ (x as u32).wrapping_mul(0x85eb_ca77) ^ (y as u32).wrapping_mul(0xc2b2_ae3d);
@@ -151,9 +153,14 @@ pub(crate) fn hash(seed: u32, x: i32, y: i32) -> u32 {
     (word >> 22) ^ word
 }
 
-/// A number in [0, 1).
+/// Maps random bits to [0, 1).
 pub(crate) fn unit(bits: u32) -> f32 {
     (bits >> 8) as f32 / (1 << 24) as f32
+}
+
+/// A uniform number in [0, 1) for a pixel and channel.
+pub(crate) fn grain(seed: u32, i: usize, channel: i32) -> f32 {
+    unit(hash(seed, i as i32, channel))
 }
 
 #[cfg(test)]
@@ -179,7 +186,7 @@ mod tests {
     }
 
     #[test]
-    fn far_bricks_have_the_mean_colour_of_near_ones() {
+    fn distant_bricks_have_the_mean_colour_of_near_ones() {
         let material = brick();
         let mut mean = 0.0;
         for i in 0..64 {
@@ -193,16 +200,16 @@ mod tests {
     }
 
     #[test]
-    fn a_faded_pattern_is_one_colour() {
+    fn a_pattern_of_amount_zero_is_the_base_colour() {
         let material = brick();
         let of = |x: f32| colour(&material, 3, &[], Vec2::new(x, 0.01), Vec2::splat(0.001), 0.0);
         assert!((0..100).all(|i| of(i as f32 * 0.01) == Vec3::splat(0.5)));
     }
 
     #[test]
-    fn letters_are_written_upright_and_from_the_left() {
+    fn text_is_upright_and_starts_at_the_left() {
         // an L: ink down the left, a foot at the bottom, nothing at the top right
-        let ink = |u: f32, v: f32| written("L", Vec2::new(u, v), Vec2::splat(1e-3));
+        let ink = |u: f32, v: f32| text_coverage("L", Vec2::new(u, v), Vec2::splat(1e-3));
         assert!(ink(0.3, 0.6) > 0.5 && ink(0.7, 0.2) > 0.5 && ink(0.8, 0.8) < 0.5);
     }
 }

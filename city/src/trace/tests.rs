@@ -1,17 +1,17 @@
 use glam::{DVec2, DVec3, Vec3, vec3};
 use scene::Camera;
 
-use super::{frame::NOTHING, *};
+use super::{frame::NO_SURFACE, *};
 use crate::{
     City, CitySettings, Class,
-    faults::{self, Fault, Kind},
+    faults::{self, Fault, FaultKind},
     random::Random,
-    sense::{Shot, looking, pinhole},
-    stage,
+    sense::{Shot, camera_towards, pinhole},
+    test_scene,
 };
 
 fn camera(centre: DVec3, target: DVec3, side: u32) -> Camera {
-    looking(pinhole(side, side, 80.0).unwrap(), centre, target - centre, DVec3::Y)
+    camera_towards(pinhole(side, side, 80.0).unwrap(), centre, target - centre, DVec3::Y)
 }
 
 fn shot(centre: DVec3, target: DVec3, seconds: f64) -> Shot {
@@ -19,19 +19,19 @@ fn shot(centre: DVec3, target: DVec3, seconds: f64) -> Shot {
 }
 
 fn take(shot: &Shot, faults: &[Fault]) -> Frame {
-    let city = stage::city();
+    let city = test_scene::city();
     let world = World::new(&city).unwrap();
-    frame(&world, shot, &Options { faults: faults.to_vec(), ..Options::default() }).unwrap()
+    render_frame(&world, shot, &RenderOptions { faults: faults.to_vec(), ..RenderOptions::default() }).unwrap()
 }
 
 #[test]
 fn rays_meet_boxes_where_arithmetic_says() {
-    let city = stage::city();
+    let city = test_scene::city();
     let world = World::new(&city).unwrap();
     let moment = world.at(0.0);
     let cast = |from: Vec3, to: Vec3| {
         let ray = Ray::new(from, (to - from).normalize());
-        moment.cast(&ray, Meets::Everything).map(|hit| (hit, ray))
+        moment.cast(&ray, RayMask::All).map(|hit| (hit, ray))
     };
     let (wall, ray) = cast(vec3(0.0, 12.0, 6.0), vec3(14.0, 12.0, 6.0)).unwrap();
     assert!((wall.distance - 14.0).abs() < 1e-4 && wall.normal == -Vec3::X && moment.actor(&wall).instance == 1);
@@ -43,14 +43,14 @@ fn rays_meet_boxes_where_arithmetic_says() {
     // along an axis, whatever the sign of zero
     for direction in [-Vec3::Z, vec3(0.0, 0.0, -1.0), vec3(-0.0, 0.0, -1.0)] {
         let ray = Ray::new(vec3(20.5, 12.25, 14.0), direction);
-        let hit = moment.cast(&ray, Meets::Everything);
+        let hit = moment.cast(&ray, RayMask::All);
         assert!(hit.is_some_and(|hit| (hit.distance - 5.0).abs() < 1e-4), "{direction}");
-        assert!(moment.is_blocked(&ray));
+        assert!(moment.is_occluded(&ray));
     }
     // the van at its start, and three seconds later
     let at = |seconds: f64| {
         let ray = Ray::new(vec3(-50.0, -2.0, 1.0), Vec3::X);
-        world.at(seconds).cast(&ray, Meets::Everything).unwrap().distance
+        world.at(seconds).cast(&ray, RayMask::All).unwrap().distance
     };
     assert!((at(0.0) - 17.75).abs() < 1e-4 && (at(3.0) - 47.75).abs() < 1e-4 && (at(100.0) - 77.75).abs() < 1e-4);
 }
@@ -65,11 +65,11 @@ fn every_instruction_set_meets_the_same() {
     for i in 0..20_000 {
         let origin = vec3(random.range(-120.0, 120.0), random.range(-120.0, 120.0), random.range(0.5, 60.0));
         let direction = vec3(random.normal(), random.normal(), random.normal() - 0.5).normalize_or(Vec3::Z);
-        let ray = Ray { to: if i % 3 == 0 { 4.0 } else { f32::INFINITY }, ..Ray::new(origin, direction) };
-        let hit = moment.cast(&ray, Meets::Opaque);
-        assert_eq!(hit, moment.cast_by::<walk::Portable>(&ray, Meets::Opaque), "{ray:?}");
-        let blocked = moment.is_blocked(&ray);
-        assert_eq!(blocked, moment.is_blocked_by::<walk::Portable>(&ray), "{ray:?}");
+        let ray = Ray { t_max: if i % 3 == 0 { 4.0 } else { f32::INFINITY }, ..Ray::new(origin, direction) };
+        let hit = moment.cast(&ray, RayMask::Opaque);
+        assert_eq!(hit, moment.cast_by::<traversal::Portable>(&ray, RayMask::Opaque), "{ray:?}");
+        let blocked = moment.is_occluded(&ray);
+        assert_eq!(blocked, moment.is_occluded_by::<traversal::Portable>(&ray), "{ray:?}");
         assert_eq!(blocked, hit.is_some(), "{ray:?}");
         met += u32::from(blocked);
     }
@@ -78,14 +78,14 @@ fn every_instruction_set_meets_the_same() {
 
 #[test]
 fn no_ray_slips_between_two_triangles() {
-    let city = stage::city();
+    let city = test_scene::city();
     let world = World::new(&city).unwrap();
     let moment = world.at(0.0);
     // along the diagonal that splits the ground, and around an edge of the house
     for i in 0..20_000 {
         let d = i as f32 * 0.0031 - 31.0;
         let ray = Ray::new(vec3(d * 0.5, d * 0.4, 30.0), (vec3(d, d, 0.0) - vec3(d * 0.5, d * 0.4, 30.0)).normalize());
-        assert!(moment.is_blocked(&ray), "{d}");
+        assert!(moment.is_occluded(&ray), "{d}");
     }
 }
 
@@ -94,7 +94,7 @@ fn depth_of_one_view_lands_on_another() {
     let (a, b) = (DVec3::new(-6.0, -9.0, 3.0), DVec3::new(-2.0, -8.0, 4.0));
     let (target, there) = (DVec3::new(6.0, 10.0, 2.0), shot(b, DVec3::new(6.0, 10.0, 2.0), 100.0));
     let first = take(&shot(a, target, 100.0), &[]);
-    let city = stage::city();
+    let city = test_scene::city();
     let world = World::new(&city).unwrap();
     let moment = world.at(100.0);
     let from = camera(a, target, 96);
@@ -111,7 +111,7 @@ fn depth_of_one_view_lands_on_another() {
         // what the other view sees there is either nearer (hidden) or the same point, back in its own pixel
         let towards = (point - b).as_vec3();
         let ray = Ray::new(b.as_vec3(), towards.normalize());
-        let hit = moment.cast(&ray, Meets::Everything).expect("something is there");
+        let hit = moment.cast(&ray, RayMask::All).expect("something is there");
         if (hit.distance - towards.length()).abs() < 0.02 {
             let met = ray.at(hit.distance).as_dvec3();
             errors.push(there.camera.project(met).0.distance(seen) + from.project(met).0.distance(pixel));
@@ -128,27 +128,27 @@ fn glass_has_two_depths() {
     let middle = 48 * 96 + 48;
     assert!((seen.first.depth[middle] - 8.0).abs() < 1e-3 && (seen.behind.depth[middle] - 10.0).abs() < 1e-3);
     assert_eq!((seen.first.instance[middle], seen.behind.instance[middle]), (3, 2));
-    assert_eq!((seen.first.material[middle], seen.behind.material[middle]), (stage::GLASS, stage::PLASTER));
+    assert_eq!((seen.first.material[middle], seen.behind.material[middle]), (test_scene::GLASS, test_scene::PLASTER));
     assert_eq!((seen.first.semantic[middle], seen.behind.semantic[middle]), (Class::Building as u8, Class::Wall as u8));
     // the wall beside the pane has no second layer, the sky no depth
     let sky = 5 * 96 + 48;
     assert_eq!(
         (seen.first.semantic[sky], seen.first.depth[sky], seen.behind.semantic[sky]),
-        (Class::Sky as u8, 0.0, NOTHING)
+        (Class::Sky as u8, 0.0, NO_SURFACE)
     );
     assert_eq!(seen.normals[middle], [0.0, -1.0, 0.0]);
 }
 
 #[test]
 fn shadows_fall_away_from_the_sun() {
-    let city = stage::city();
+    let city = test_scene::city();
     let world = World::new(&city).unwrap();
     let moment = world.at(100.0);
     let light = Light { road_pattern: 0.0, ..Light::default() };
     let brightness = |at: Vec3| {
         let ray = Ray::new(at + Vec3::Z * 20.0, Vec3::NEG_Z);
-        let glow = shade::Shader { moment: &moment, light: &light, spread: 1e-3 }.glow(&ray);
-        (glow.direct + glow.around).element_sum()
+        let radiance = shade::Shader { moment: &moment, light: &light, spread: 1e-3 }.radiance(&ray);
+        (radiance.direct + radiance.ambient).element_sum()
     };
     // the pole's tip at 5 m is over (8, 4); its shadow ends 5 m × cot of the sun's height away from it
     let sun = light.towards_sun;
@@ -164,9 +164,9 @@ fn shadows_fall_away_from_the_sun() {
 #[test]
 fn corners_are_darker_only_where_something_is_near() {
     let shot = shot(DVec3::new(10.0, 0.0, 2.0), DVec3::new(14.0, 12.0, 0.0), 100.0);
-    let city = stage::city();
+    let city = test_scene::city();
     let world = World::new(&city).unwrap();
-    let with = |corners| frame(&world, &shot, &Options { corners, ..Options::default() }).unwrap();
+    let with = |corners| render_frame(&world, &shot, &RenderOptions { corners, ..RenderOptions::default() }).unwrap();
     let (dark, open) = (with(true), with(false));
     let pairs = || dark.rgb.iter().zip(&open.rgb);
     assert!(pairs().all(|(a, b)| a <= b) && pairs().filter(|(a, b)| a < b).count() > 1000);
@@ -195,22 +195,22 @@ fn rolling_shutters_lean_and_blurs_smear() {
 
 #[test]
 fn the_same_shot_gives_the_same_bytes_on_one_thread_and_two() {
-    let city = stage::city();
+    let city = test_scene::city();
     let world = World::new(&city).unwrap();
     let mut shot = shot(DVec3::new(-8.0, -9.0, 2.2), DVec3::new(4.0, 10.0, 1.0), 2.0);
     shot.rolling_shutter_seconds = 0.03;
-    let faults = Kind::ALL.iter().map(|&kind| Fault { kind, strength: 0.4, seed: 9 }).collect();
-    let options = Options { faults, ..Options::default() };
+    let faults = FaultKind::ALL.iter().map(|&kind| Fault { kind, strength: 0.4, seed: 9 }).collect();
+    let options = RenderOptions { faults, ..RenderOptions::default() };
     let with = |threads| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-        pool.install(|| frame(&world, &shot, &options).unwrap())
+        pool.install(|| render_frame(&world, &shot, &options).unwrap())
     };
     assert_eq!(with(1), with(2));
 }
 
 #[test]
 fn every_fault_changes_nothing_at_zero_and_something_at_one() {
-    let city = stage::city();
+    let city = test_scene::city();
     let world = World::new(&city).unwrap();
     let shots: Vec<Shot> = (0..40)
         .map(|i| {
@@ -219,28 +219,28 @@ fn every_fault_changes_nothing_at_zero_and_something_at_one() {
             shot
         })
         .collect();
-    for &kind in Kind::ALL {
+    for &kind in FaultKind::ALL {
         let with = |strength| {
-            let options = Options { faults: vec![Fault { kind, strength, seed: 4 }], ..Options::default() };
-            let spoilt = faults::spoil_shots(shots.clone(), &options.faults);
-            (frame(&world, spoilt.first().unwrap_or(&shots[0]), &options).unwrap(), spoilt)
+            let options = RenderOptions { faults: vec![Fault { kind, strength, seed: 4 }], ..RenderOptions::default() };
+            let spoilt = faults::degrade_shots(shots.clone(), &options.faults);
+            (render_frame(&world, spoilt.first().unwrap_or(&shots[0]), &options).unwrap(), spoilt)
         };
-        let plain = frame(&world, &shots[0], &Options::default()).unwrap();
+        let plain = render_frame(&world, &shots[0], &RenderOptions::default()).unwrap();
         let (none, unchanged) = with(0.0);
         assert!(none == plain && unchanged == shots, "{kind:?} at 0");
         let (full, spoilt) = with(1.0);
         let differs = |a: &Frame, b: &Frame| a.rgb.iter().zip(&b.rgb).filter(|(a, b)| a != b).count() > 50;
         match kind {
-            Kind::PoseNoise => {
+            FaultKind::PoseNoise => {
                 let off = |s: &Shot| s.reported.centre().distance(s.camera.centre());
                 assert!(spoilt.iter().all(|s| (0.01..3.0).contains(&off(s))) && full.rgb == plain.rgb);
             }
-            Kind::SparseViews => assert!((1..12).contains(&spoilt.len()), "{}", spoilt.len()),
-            Kind::SensorDropout => assert!((8..32).contains(&spoilt.len()), "{}", spoilt.len()),
-            Kind::MovingUnmasked => {
+            FaultKind::SparseViews => assert!((1..12).contains(&spoilt.len()), "{}", spoilt.len()),
+            FaultKind::SensorDropout => assert!((8..32).contains(&spoilt.len()), "{}", spoilt.len()),
+            FaultKind::MovingUnmasked => {
                 assert!(plain.mask.contains(&1) && full.mask.iter().all(|&m| m == 0) && full.moves == plain.moves);
             }
-            Kind::ExposureDrift => {
+            FaultKind::ExposureDrift => {
                 assert!(spoilt.iter().any(|s| (s.exposure - 1.0).abs() > 0.3) && differs(&full, &plain))
             }
             _ => assert!(differs(&full, &plain) && full.first == plain.first, "{kind:?} at 1"),
@@ -251,7 +251,7 @@ fn every_fault_changes_nothing_at_zero_and_something_at_one() {
 #[test]
 fn broken_cities_and_shots_are_refused() {
     let broken = |change: &dyn Fn(&mut City)| {
-        let mut city = stage::city();
+        let mut city = test_scene::city();
         change(&mut city);
         World::new(&city).err()
     };
@@ -262,20 +262,18 @@ fn broken_cities_and_shots_are_refused() {
     assert_eq!(broken(&|c| c.actors[3].world_from_asset.translation.x = f64::INFINITY), Some(WorldError::Actor(3)));
     assert_eq!(broken(&|c| c.assets.clear()), Some(WorldError::Actor(0)));
     assert_eq!(broken(&|c| (c.assets[1].mesh, c.actors[1].trajectory) = (crate::Mesh::default(), None)), None);
-    assert!(
-        World::new(&City::default()).unwrap().at(0.0).cast(&Ray::new(Vec3::ZERO, Vec3::X), Meets::Everything).is_none()
-    );
-    let city = stage::city();
+    assert!(World::new(&City::default()).unwrap().at(0.0).cast(&Ray::new(Vec3::ZERO, Vec3::X), RayMask::All).is_none());
+    let city = test_scene::city();
     let world = World::new(&city).unwrap();
-    let refused = |change: &dyn Fn(&mut Shot, &mut Options)| {
-        let (mut shot, mut options) = (shot(DVec3::ZERO, DVec3::Y, 0.0), Options::default());
+    let refused = |change: &dyn Fn(&mut Shot, &mut RenderOptions)| {
+        let (mut shot, mut options) = (shot(DVec3::ZERO, DVec3::Y, 0.0), RenderOptions::default());
         change(&mut shot, &mut options);
-        frame(&world, &shot, &options).is_err()
+        render_frame(&world, &shot, &options).is_err()
     };
     assert!(refused(&|s, _| s.camera.pinhole.width = u32::MAX));
     assert!(refused(&|s, _| s.camera.pinhole.fx = 0.0));
     assert!(refused(&|s, _| s.exposure = f32::NAN));
     assert!(refused(&|s, _| s.rolling_shutter_seconds = f64::INFINITY));
     assert!(refused(&|_, o| o.samples = 0));
-    assert!(refused(&|_, o| o.faults.push(Fault { kind: Kind::Fog, strength: 2.0, seed: 0 })));
+    assert!(refused(&|_, o| o.faults.push(Fault { kind: FaultKind::Fog, strength: 2.0, seed: 0 })));
 }

@@ -19,7 +19,7 @@ pub(crate) struct SynthArgs {
     /// Only draw a picture of what there is to choose from, of this city and size: layouts, labels, faults
     #[arg(long, value_name = "FILE", conflicts_with = "out")]
     pub(crate) gallery: Option<PathBuf>,
-    /// Area of the square city, km²: 0.05 to 25
+    /// Area of the square city, km²: 0.005 to 25
     #[arg(long, value_name = "A", default_value_t = 0.2)]
     pub(crate) area_km2: f64,
     /// Photos, spread over the city as evenly as their number allows

@@ -3,11 +3,11 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use city::faults::{self, Fault, Kind};
+use city::faults::{self, Fault, FaultKind};
 use city::random::bits;
 use city::sense::rig::{Rig, drive};
-use city::sense::{Shot, looking, pinhole};
-use city::trace::{Frame, Options, World, frame};
+use city::sense::{Shot, camera_towards, pinhole};
+use city::trace::{Frame, RenderOptions, World, render_frame};
 use city::{City, CitySettings, Layout};
 use font8x8::legacy::BASIC_LEGACY;
 use glam::{DVec3, Vec3};
@@ -15,7 +15,7 @@ use image::{Rgb, RgbImage};
 use rayon::prelude::*;
 
 use super::views::views;
-use super::{Progress, SynthError, Settings, impossible};
+use super::{Progress, Settings, SynthError, impossible};
 
 /// Tiles in a row.
 const COLUMNS: u32 = 6;
@@ -30,7 +30,7 @@ const CAPTION: u32 = 12;
 /// Settings out of range.
 pub fn gallery(settings: &Settings, progress: Progress) -> Result<RgbImage, SynthError> {
     settings.check()?;
-    let (mut tiles, total) = (Vec::new(), 2 * Layout::ALL.len() + 8 + Kind::ALL.len());
+    let (mut tiles, total) = (Vec::new(), 2 * Layout::ALL.len() + 8 + FaultKind::ALL.len());
     let add = |tiles: &mut Vec<(String, RgbImage)>, name: String, tile| {
         tiles.push((name, tile));
         progress("gallery", tiles.len(), total);
@@ -49,13 +49,13 @@ pub fn gallery(settings: &Settings, progress: Progress) -> Result<RgbImage, Synt
     for (name, tile) in labels(&taken) {
         add(&mut tiles, name.to_owned(), tile);
     }
-    for &kind in Kind::ALL {
+    for &kind in FaultKind::ALL {
         let faults = [Fault { kind, strength: 1.0, seed: settings.city.seed }];
         let (caption, tile) = match kind {
-            Kind::ExposureDrift => ("most, least", drift(&world, &shot, &faults)?),
-            Kind::PoseNoise => ("reported over true", ghost(&world, &shot, &faults)?),
-            Kind::SparseViews | Kind::SensorDropout => ("red is lost", map(&world, settings, &faults)?),
-            Kind::MovingUnmasked => ("red is forgotten", {
+            FaultKind::ExposureDrift => ("most, least", drift(&world, &shot, &faults)?),
+            FaultKind::PoseNoise => ("reported over true", ghost(&world, &shot, &faults)?),
+            FaultKind::SparseViews | FaultKind::SensorDropout => ("red is lost", map(&world, settings, &faults)?),
+            FaultKind::MovingUnmasked => ("red is forgotten", {
                 over(&take(&world, &shot, &faults)?, |frame, i| frame.moves[i] != 0 && frame.mask[i] == 0)
             }),
             _ => ("", photo(&take(&world, &spoilt(&shot, &faults), &faults)?)),
@@ -67,15 +67,15 @@ pub fn gallery(settings: &Settings, progress: Progress) -> Result<RgbImage, Synt
 }
 
 fn take(world: &World, shot: &Shot, faults: &[Fault]) -> Result<Frame, SynthError> {
-    let options = Options { samples: 3, faults: faults.to_vec(), ..Options::default() };
-    Ok(frame(world, shot, &options).map_err(|e| impossible(&e))?)
+    let options = RenderOptions { samples: 3, faults: faults.to_vec(), ..RenderOptions::default() };
+    Ok(render_frame(world, shot, &options).map_err(|e| impossible(&e))?)
 }
 
 /// The city from a corner, all of it.
 fn above(city: &City, settings: &Settings) -> Result<Shot, SynthError> {
     let lens = pinhole(settings.width, settings.height, 60.0).map_err(|e| impossible(&e))?;
     let from = city.extent_metres * DVec3::new(-0.62, -0.62, 0.6);
-    Ok(Shot::new("above".into(), "above", 5.0, looking(lens, from, -from.with_z(from.z * 1.08), DVec3::Z)))
+    Ok(Shot::new("above".into(), "above", 5.0, camera_towards(lens, from, -from.with_z(from.z * 1.08), DVec3::Z)))
 }
 
 /// Ahead from a car, where of some places along all streets the most goes on.
@@ -90,11 +90,11 @@ fn street(world: &World, settings: &Settings) -> Result<Shot, SynthError> {
     let inside: Vec<&Shot> = shots.iter().filter(within).collect();
     let tried: Vec<&Shot> = inside.iter().copied().step_by(inside.len().div_ceil(PLACES).max(1)).collect();
     let lens = pinhole(96, 54, 80.0).map_err(|e| impossible(&e))?;
-    let sketch = Options { samples: 1, corners: false, ..Options::default() };
+    let sketch = RenderOptions { samples: 1, corners: false, ..RenderOptions::default() };
     let life = |shot: &&Shot| -> Result<f64, SynthError> {
         let mut small = (*shot).clone();
         small.camera.pinhole = lens;
-        Ok(liveliness(&frame(world, &small, &sketch).map_err(|e| impossible(&e))?))
+        Ok(liveliness(&render_frame(world, &small, &sketch).map_err(|e| impossible(&e))?))
     };
     let lives: Vec<f64> = tried.par_iter().map(life).collect::<Result<_, _>>()?;
     let best = tried.iter().zip(&lives).rev().max_by(|a, b| a.1.total_cmp(b.1));
@@ -122,13 +122,13 @@ fn liveliness(frame: &Frame) -> f64 {
 }
 
 fn spoilt(shot: &Shot, faults: &[Fault]) -> Shot {
-    faults::spoil_shots(vec![shot.clone()], faults).pop().unwrap_or_else(|| shot.clone())
+    faults::degrade_shots(vec![shot.clone()], faults).pop().unwrap_or_else(|| shot.clone())
 }
 
 /// The shot with the highest gain of two minutes at the left, with the lowest at the right.
 fn drift(world: &World, shot: &Shot, faults: &[Fault]) -> Result<RgbImage, SynthError> {
     let later = (0..120).map(|i| Shot { seconds: shot.seconds + f64::from(i), ..shot.clone() }).collect();
-    let gains: Vec<f32> = faults::spoil_shots(later, faults).iter().map(|shot| shot.exposure).collect();
+    let gains: Vec<f32> = faults::degrade_shots(later, faults).iter().map(|shot| shot.exposure).collect();
     let with = |exposure: Option<f32>| {
         take(world, &Shot { exposure: exposure.unwrap_or(shot.exposure), ..shot.clone() }, &[])
             .map(|frame| photo(&frame))
@@ -194,11 +194,11 @@ fn labels(frame: &Frame) -> [(&'static str, RgbImage); 8] {
 fn map(world: &World, settings: &Settings, faults: &[Fault]) -> Result<RgbImage, SynthError> {
     let lens = pinhole(settings.width, settings.height, 60.0).map_err(|e| impossible(&e))?;
     let height = 0.6 * world.city().extent_metres * lens.fx / f64::from(lens.height.min(lens.width));
-    let nadir = looking(lens, DVec3::Z * height * 1.2, DVec3::NEG_Z, DVec3::Y);
+    let nadir = camera_towards(lens, DVec3::Z * height * 1.2, DVec3::NEG_Z, DVec3::Y);
     let mut map = photo(&take(world, &Shot::new("map".into(), "map", 5.0, nadir), &[])?);
     let planned = views(world, settings)?.shots;
     let kept: BTreeSet<String> =
-        faults::spoil_shots(planned.clone(), faults).into_iter().map(|shot| shot.name).collect();
+        faults::degrade_shots(planned.clone(), faults).into_iter().map(|shot| shot.name).collect();
     for shot in &planned {
         let colour = if kept.contains(&shot.name) { [255; 3] } else { [255, 0, 0] };
         let (pixel, _) = nadir.project(shot.camera.centre().with_z(0.0));

@@ -6,14 +6,14 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 
 use city::random::{Random, bits};
 use city::sense::Shot;
-use city::trace::{Frame, Options, World, frame};
+use city::trace::{Frame, RenderOptions, World, render_frame};
 use glam::{DVec3, Vec3};
 use image::{ColorType, ImageFormat};
 use rayon::prelude::*;
 use store::file::{SaveError, save};
 
 use super::scene_files::Instances;
-use super::{Progress, SynthError, Settings, city_moves, impossible, make, truth};
+use super::{Progress, Settings, SynthError, city_moves, impossible, make, truth};
 
 /// Pixels of photos that are in the making at once.
 const PIXELS_AT_ONCE: usize = 1 << 23;
@@ -60,7 +60,7 @@ pub(super) fn take(
     if settings.truth {
         truth::prepare(out)?;
     }
-    let options = Options { faults: settings.faults.clone(), ..Options::default() };
+    let options = RenderOptions { faults: settings.faults.clone(), ..RenderOptions::default() };
     let done = AtomicUsize::new(0);
     let pixels = settings.width as usize * settings.height as usize;
     // Rows are shared out as well: a chunk bounds the photos that threads hold while they help with others' rows.
@@ -69,7 +69,7 @@ pub(super) fn take(
     let mut all = Taken { seeds: Vec::with_capacity(shots.len()), boxes: Vec::with_capacity(shots.len()) };
     for (start, chunk) in shots.chunks(chunk).enumerate().map(|(i, shots)| (i * chunk, shots)) {
         let one = |(i, shot): (usize, &Shot)| -> Result<(Vec<Seed>, String), SynthError> {
-            let taken = frame(world, shot, &options).map_err(|e| impossible(&e))?;
+            let taken = render_frame(world, shot, &options).map_err(|e| impossible(&e))?;
             let name = format!("{}.png", shot.name);
             png(&out.join("images").join(&name), &taken.rgb, &taken, ColorType::Rgb8)?;
             if masks {

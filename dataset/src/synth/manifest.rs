@@ -9,7 +9,7 @@ use scene::BadInput;
 use serde_json::{Value, json};
 use store::file::{SaveError, save};
 
-use super::{SynthError, Settings, Summary, make};
+use super::{Settings, Summary, SynthError, make};
 
 const NAME: &str = "manifest.json";
 /// Everything else that a rehearsal writes.

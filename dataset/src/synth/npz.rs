@@ -5,7 +5,7 @@ use std::path::Path;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use city::City;
-use city::occupancy::{Grid, GridError, Voxels, voxels};
+use city::occupancy::{Grid, GridError, Voxels, voxelize};
 use glam::{DMat4, DQuat, DVec3};
 use rayon::prelude::*;
 use scene::{BadInput, Rigid, npy};
@@ -63,8 +63,8 @@ pub(super) fn blocks(out: &Path, city: &City, voxel: f64, progress: Progress) ->
     let done = AtomicUsize::new(0);
     let one = |&(x, y): &(usize, usize)| -> Result<(), SynthError> {
         let from = DVec3::new(corner(x), corner(y), low);
-        let grid = Grid::of_block(from, DVec3::new(corner(x + 1), corner(y + 1), high), voxel);
-        let filled = grid.and_then(|grid| voxels(city, 0.0, &grid)).map_err(|e: GridError| impossible(&e))?;
+        let grid = Grid::world_aligned(from, DVec3::new(corner(x + 1), corner(y + 1), high), voxel);
+        let filled = grid.and_then(|grid| voxelize(city, 0.0, &grid)).map_err(|e: GridError| impossible(&e))?;
         let path = folder.join(format!("{x:03}_{y:03}.npz"));
         put(&path, &filled)?;
         progress("voxels", done.fetch_add(1, Ordering::Relaxed) + 1, side * side);
@@ -86,7 +86,7 @@ pub(super) fn around(out: &Path, city: &City, voxel: f64, places: &[Around]) -> 
     let folder = out.join("occupancy");
     make(&folder)?;
     for (i, place) in places.iter().enumerate() {
-        let filled = voxels(city, place.seconds, &place.grid(voxel)?).map_err(|e| impossible(&e))?;
+        let filled = voxelize(city, place.seconds, &place.grid(voxel)?).map_err(|e| impossible(&e))?;
         put(&folder.join(format!("around_{i:03}.npz")), &filled)?;
     }
     Ok(())

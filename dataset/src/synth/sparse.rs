@@ -91,7 +91,7 @@ fn sees(moment: &Moment, shot: &Shot, centre: DVec3, reach: f64, seed: &Seed) ->
     }
     // off the surface, so that it does not hide itself
     let start = seed.position.as_vec3() + 0.02 * seed.normal;
-    !moment.is_blocked(&Ray { to: distance as f32 - 0.02, ..Ray::new(start, towards) })
+    !moment.is_occluded(&Ray { t_max: distance as f32 - 0.02, ..Ray::new(start, towards) })
 }
 
 /// Turns what each view sees into tracks, and moves points by what triangulation errs.

@@ -9,7 +9,7 @@ use city::Waypoint;
 use city::faults;
 use city::sense::lidar::{Lidar, Return};
 use city::sense::radar::{Detection, Radar};
-use city::sense::rig::{Mount, carried};
+use city::sense::rig::{Mount, sensor_pose_at};
 use city::sense::{Motion, SenseError};
 use city::trace::World;
 use rayon::prelude::*;
@@ -18,7 +18,7 @@ use serde_json::json;
 use store::file::{SaveError, save};
 
 use super::views::Station;
-use super::{Progress, SynthError, Settings, impossible, make};
+use super::{Progress, Settings, SynthError, impossible, make};
 
 /// Writes `lidar/` and `radar/`, as far as they are asked for.
 pub(super) fn write(
@@ -73,8 +73,8 @@ fn sense(
     let done = AtomicUsize::new(0);
     let one = |station: &Station| -> Result<Option<String>, SynthError> {
         progress(what, done.fetch_add(1, Ordering::Relaxed) + 1, stations.len());
-        let place = legs.get(station.leg).and_then(|leg| carried(leg, mount, station.seconds));
-        let Some((pose, motion)) = place.filter(|_| !faults::is_silent(&settings.faults, what, station.seconds)) else {
+        let place = legs.get(station.leg).and_then(|leg| sensor_pose_at(leg, mount, station.seconds));
+        let Some((pose, motion)) = place.filter(|_| !faults::is_dropped_out(&settings.faults, what, station.seconds)) else {
             return Ok(None);
         };
         let readings = measure(station, &pose, &motion, &folder)?;

@@ -1,7 +1,7 @@
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
-use city::faults::Kind;
+use city::faults::FaultKind;
 use city::{Layout, Traffic};
 use glam::{DVec2, DVec3};
 
@@ -103,7 +103,7 @@ fn a_rehearsal_opens_as_a_capture_and_its_points_are_where_views_see_them() {
             let towards = (point - centre).normalize().as_vec3();
             let hit = world
                 .at(shot.seconds)
-                .cast(&city::trace::Ray::new(centre.as_vec3(), towards), city::trace::Meets::Opaque);
+                .cast(&city::trace::Ray::new(centre.as_vec3(), towards), city::trace::RayMask::Opaque);
             // the surface along the ray, put where the point's own depth is: how far is it from there, in pixels?
             let Some(hit) = hit else { continue };
             let footprint = shot.camera.project(point).1 / shot.camera.pinhole.fx;
@@ -144,14 +144,14 @@ fn faults_reach_the_capture_and_the_truth_stays() {
     let fault = |kind| Fault { kind, strength: 1.0, seed: 3 };
     let clean = Settings { views: 12, width: 48, height: 32, ..small() };
     let spoilt = |kind| Settings { faults: vec![fault(kind)], ..clean.clone() };
-    let (a, noisy) = (written(&clean, 2), written(&spoilt(Kind::PoseNoise), 2));
+    let (a, noisy) = (written(&clean, 2), written(&spoilt(FaultKind::PoseNoise), 2));
     let (a, noisy) = (files(a.0.path()), files(noisy.0.path()));
     let [model, told] = ["sparse/0/images.bin", "truth/transforms.json"].map(Path::new);
     assert!(a[model] != noisy[model] && a[told] == noisy[told]);
-    let sparse = Settings { views: 60, ..spoilt(Kind::SparseViews) };
+    let sparse = Settings { views: 60, ..spoilt(FaultKind::SparseViews) };
     let views = written(&sparse, 2).1.views;
     assert!((1..20).contains(&views), "{views}");
-    let open_masks = files(written(&spoilt(Kind::MovingUnmasked), 2).0.path());
+    let open_masks = files(written(&spoilt(FaultKind::MovingUnmasked), 2).0.path());
     let dark = |files: &BTreeMap<PathBuf, Vec<u8>>| {
         let masks = files.iter().filter(|(name, _)| name.starts_with("masks"));
         let count =
@@ -173,7 +173,7 @@ fn settings_out_of_range_are_refused_before_anything_is_made() {
         Settings { aerial: f64::NAN, ..small() },
         Settings { aerial: 0.6, fixed: 0.5, ..small() },
         Settings { fixed: -0.1, ..small() },
-        Settings { faults: vec![Fault { kind: Kind::Fog, strength: 2.0, seed: 0 }], ..small() },
+        Settings { faults: vec![Fault { kind: FaultKind::Fog, strength: 2.0, seed: 0 }], ..small() },
         Settings { city: CitySettings { area_km2: 26.0, ..small().city }, ..small() },
     ] {
         let refusal = write(&out, &wrong, &|_, _, _| ()).unwrap_err();
@@ -246,7 +246,7 @@ fn voxels_around_a_pose_are_the_citys_turned_and_at_its_moment() {
         let moment = world.at(place.seconds);
         let from = place.place + DVec3::Z * 2.99;
         let ray = city::trace::Ray::new(from.as_vec3(), -glam::Vec3::Z);
-        let hit = moment.cast(&ray, city::trace::Meets::Everything).unwrap();
+        let hit = moment.cast(&ray, city::trace::RayMask::All).unwrap();
         let met = from - DVec3::Z * f64::from(hit.distance);
         assert!(taken.iter().any(|(p, _)| p.distance(met) < 0.22), "{met}");
         assert!(taken.iter().all(|(p, _)| (*p - place.place).abs().max_element() < 3.0 * 1.5));
@@ -382,7 +382,7 @@ fn the_gallery_shows_every_layout_label_and_fault() {
     let settings = Settings { width: 96, height: 54, ..small() };
     let told = std::sync::Mutex::new((0, 0));
     let sheet = gallery(&settings, &|_, done, total| *told.lock().unwrap() = (done, total)).unwrap();
-    let tiles = 2 * Layout::ALL.len() + 8 + Kind::ALL.len();
+    let tiles = 2 * Layout::ALL.len() + 8 + FaultKind::ALL.len();
     assert_eq!(*told.lock().unwrap(), (tiles, tiles));
     assert_eq!(sheet.dimensions(), (6 * 98, tiles.div_ceil(6) as u32 * 66));
     let tile = |i: usize| {
@@ -395,7 +395,7 @@ fn the_gallery_shows_every_layout_label_and_fault() {
     };
     let all: Vec<_> = (0..tiles).map(tile).collect();
     let clean = &all[2 * Layout::ALL.len()];
-    for (i, kind) in (2 * Layout::ALL.len() + 8..).zip(Kind::ALL) {
+    for (i, kind) in (2 * Layout::ALL.len() + 8..).zip(FaultKind::ALL) {
         let share = differs(clean, &all[i]);
         assert!(share > 0.005, "{kind} shows in {share} of its pane");
     }

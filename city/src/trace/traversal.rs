@@ -1,24 +1,24 @@
-//! How a ray walks a tree: in `obvhs`' order, with the eight boxes of a node tested at once where the machine can.
+//! BVH traversal in the order of `obvhs`, with the eight child boxes of a node tested at once where the CPU has AVX2.
 //!
-//! Half of what a photo of a generated city costs is this walk. Compiled for any x86-64 it counts bits in software and widens
-//! the boxes' bytes one by one; with AVX2 the same arithmetic, in the same order and so with the same results, is a fifth of
-//! the instructions. Everything between [`Moment::cast`](super::Moment::cast) and here is inlined into one function for each
-//! instruction set.
+//! About half of the time of a rendered image is spent here. A build for any x86-64 counts bits in software and converts
+//! the boxes' bytes one by one. With AVX2 the same arithmetic in the same order, so with identical results, takes a fifth
+//! of the instructions. All code between [`Moment::cast`](super::Moment::cast) and this module is inlined into one
+//! function per instruction set.
 
 use obvhs::{cwbvh::node::CwBvhNode, ray::Ray};
 
-/// Which of a node's eight children a ray meets.
-pub(super) trait Boxes {
-    /// Their bits, in the order in which `obvhs` visits them.
-    fn met(node: &CwBvhNode, ray: &Ray, octant: u32) -> u32;
+/// Tests a ray against the child boxes of a node.
+pub(super) trait NodeTest {
+    /// The bits of the children whose box the ray enters, in the visiting order of `obvhs`.
+    fn intersect_children(node: &CwBvhNode, ray: &Ray, octant: u32) -> u32;
 }
 
-/// Whatever the machine.
+/// For any CPU.
 pub(super) struct Portable;
 
-impl Boxes for Portable {
+impl NodeTest for Portable {
     #[inline(always)]
-    fn met(node: &CwBvhNode, ray: &Ray, octant: u32) -> u32 {
+    fn intersect_children(node: &CwBvhNode, ray: &Ray, octant: u32) -> u32 {
         node.intersect_ray(ray, octant)
     }
 }
@@ -28,11 +28,11 @@ impl Boxes for Portable {
 pub(super) struct Avx2;
 
 #[cfg(target_arch = "x86_64")]
-impl Boxes for Avx2 {
+impl NodeTest for Avx2 {
     #[inline(always)]
-    fn met(node: &CwBvhNode, ray: &Ray, octant: u32) -> u32 {
+    fn intersect_children(node: &CwBvhNode, ray: &Ray, octant: u32) -> u32 {
         use std::arch::x86_64::*;
-        /// Nothing nearer is met, as in `obvhs`.
+        /// Smallest distance of a box, as in `obvhs`.
         const NEAREST: f32 = 1e-4;
         let step = node.compute_extent() * ray.inv_direction;
         let (origin, inverse) = (ray.origin, ray.inv_direction);
@@ -45,8 +45,8 @@ impl Boxes for Avx2 {
             (&node.child_min_y, &node.child_max_y),
             (&node.child_min_z, &node.child_max_z),
         ];
-        // SAFETY: functions that this is inlined into run only where AVX2 was detected (see the module), and the eight bytes
-        // that are read are those of an array of eight.
+        // SAFETY: the functions that this is inlined into run only where AVX2 was detected (see the module docs), and the
+        // eight bytes that are read are those of an array of eight.
         let mut met = unsafe {
             let mut near = _mm256_set1_ps(NEAREST);
             let mut far = _mm256_set1_ps(ray.tmax);
@@ -72,20 +72,20 @@ impl Boxes for Avx2 {
     }
 }
 
-/// Walks a tree along a ray, the near children of a node first. `walk!(boxes, bvh, ray, i => body)`: the body is run for each
-/// primitive `i`, in the order of the tree, whose box the ray meets before `ray.tmax`, which the body may lower; it may
-/// `break` out of the loop around it by a label.
-macro_rules! walk {
-    ($boxes:ty, $bvh:expr, $ray:ident, $i:ident => $body:block) => {{
+/// Traverses a BVH along a ray, near children first. `traverse_bvh!(node_test, bvh, ray, i => body)` runs the body for each
+/// primitive `i` whose box the ray enters before `ray.tmax`. The body may lower `ray.tmax`, and may leave the traversal by
+/// breaking to a label outside.
+macro_rules! traverse_bvh {
+    ($node_test:ty, $bvh:expr, $ray:ident, $i:ident => $body:block) => {{
         #[allow(unused_imports)]
         use glam_of_obvhs::UVec2;
         let bvh = &$bvh;
         let mut state = bvh.new_traversal($ray.direction);
         let mut node;
-        obvhs::traverse!(bvh, node, state, <$boxes>::met(node, &$ray, state.oct_inv4), {
+        obvhs::traverse!(bvh, node, state, <$node_test>::intersect_children(node, &$ray, state.oct_inv4), {
             let $i = state.primitive_id as usize;
             $body
         });
     }};
 }
-pub(super) use walk;
+pub(super) use traverse_bvh;

@@ -3,10 +3,10 @@
 use glam::{DVec2, DVec3};
 
 use crate::build::furniture::Piece;
-use crate::build::ground::Line;
+use crate::build::ground::Polyline;
 use crate::build::tree;
 use crate::build::vehicle::{PAINTS, VehicleKind};
-use crate::parcels::{Footprint, Parcel, Use, contains, on_slope, upright};
+use crate::parcels::{Footprint, LandUse, Parcel, contains, on_slope, upright};
 use crate::props::Prop;
 use crate::random::Random;
 use crate::roads::{Profile, RoadKind};
@@ -27,38 +27,38 @@ const CARS: [VehicleKind; 10] = [
 ];
 
 /// Some car in some colour.
-pub(crate) fn some_car(random: &mut Random) -> Prop {
+pub(crate) fn random_car(random: &mut Random) -> Prop {
     Prop::Vehicle(*random.one_of(&CARS), random.below(PAINTS) as u8)
 }
 
 impl Parcel<'_> {
     /// Everything but houses.
     pub(crate) fn furnish(&mut self) {
-        self.curbside();
-        self.parked();
-        match self.used {
-            Use::Houses => self.yards(),
-            Use::Park => self.park(),
-            Use::Square => self.square(),
-            Use::CarPark => self.car_park(),
+        self.place_curbside();
+        self.park_vehicles();
+        match self.land_use {
+            LandUse::Houses => self.fill_yard(),
+            LandUse::Park => self.fill_park(),
+            LandUse::Square => self.fill_square(),
+            LandUse::CarPark => self.fill_car_park(),
         }
     }
 
     /// A place on the pavement, this far behind the curb.
-    fn on_pavement(&mut self, line: &Line, s: f64, profile: &Profile, prop: Prop) {
+    fn on_pavement(&mut self, line: &Polyline, s: f64, profile: &Profile, prop: Prop) {
         let (p, along) = line.at(s);
         let at = self.terrain.at(p) + DVec3::Z * profile.curb;
-        self.put(prop, upright(at, along));
+        self.place(prop, upright(at, along));
     }
 
     /// Lamps, signs, trees and the like behind the curb.
-    fn curbside(&mut self) {
+    fn place_curbside(&mut self) {
         let behind = |p: &Profile| p.half + if p.pavement > 2.5 { 0.7 } else { 0.32 };
         for (line, profile) in self.sides(&behind) {
             match profile.kind {
                 RoadKind::Alley => {}
                 RoadKind::Lane => self.on_pavement(&line, 0.4, &profile, Prop::Furniture(Piece::Bollard)),
-                _ => self.street_side(&line, &profile),
+                _ => self.place_along_street(&line, &profile),
             }
         }
         if self.layout == Layout::Alley {
@@ -66,12 +66,12 @@ impl Parcel<'_> {
             let (ring, turns) = self.roads.ring(&self.walk, &|p| p.front() + 0.2);
             for &turn in turns.iter().step_by(2) {
                 let at = self.ground(ring[turn].at);
-                self.put(Prop::Furniture(Piece::OldLamp), upright(at, DVec2::X));
+                self.place(Prop::Furniture(Piece::OldLamp), upright(at, DVec2::X));
             }
         }
     }
 
-    fn street_side(&mut self, line: &Line, profile: &Profile) {
+    fn place_along_street(&mut self, line: &Polyline, profile: &Profile) {
         let length = line.length;
         let wide = profile.pavement > 2.5;
         let name = self.random.below(12) as u8;
@@ -122,7 +122,7 @@ impl Parcel<'_> {
     }
 
     /// Vehicles along the curb, heading as the lane beside them.
-    fn parked(&mut self) {
+    fn park_vehicles(&mut self) {
         for (line, profile) in self.sides(&|p| p.half - 1.07) {
             if !profile.parking {
                 continue;
@@ -137,7 +137,7 @@ impl Parcel<'_> {
                     let kind = *self.random.one_of(&[VehicleKind::Bus, VehicleKind::Truck, VehicleKind::Truck]);
                     Prop::Vehicle(kind, self.random.below(PAINTS) as u8)
                 } else {
-                    some_car(&mut self.random)
+                    random_car(&mut self.random)
                 };
                 let Prop::Vehicle(kind, _) = prop else { continue };
                 let length = f64::from(kind.size().x);
@@ -147,20 +147,20 @@ impl Parcel<'_> {
                     break;
                 }
                 let (p, along) = line.at(s + 0.5 * length);
-                self.put(prop, on_slope(self.terrain, p - aside * along.perp(), -along));
+                self.place(prop, on_slope(self.terrain, p - aside * along.perp(), -along));
                 s += length;
             }
         }
     }
 
     /// Puts something behind the fronts if it is clear of houses, of other such things, and of the pavement.
-    fn put_free(&mut self, prop: Prop, p: DVec2, along: DVec2, clear: f64, outline: &[DVec2]) -> bool {
+    fn place_if_free(&mut self, prop: Prop, p: DVec2, along: DVec2, clear: f64, outline: &[DVec2]) -> bool {
         let free = contains(outline, p)
             && outline.iter().all(|q| q.distance(p) > clear)
             && self.footprints.iter().all(|f| f.distance(p) > clear);
         if free {
             let at = self.ground(p);
-            self.put(prop, upright(at, along));
+            self.place(prop, upright(at, along));
             self.footprints.push(Footprint { centre: p, along, half: DVec2::splat(0.4) });
         }
         free
@@ -171,51 +171,51 @@ impl Parcel<'_> {
     }
 
     /// Trees at random, so many to a hectare.
-    fn scatter(&mut self, per_hectare: f64, kinds: &[u8], outline: &[DVec2], clear: f64) {
+    fn scatter_trees(&mut self, per_hectare: f64, kinds: &[u8], outline: &[DVec2], clear: f64) {
         let (low, high) = outline.iter().fold((DVec2::MAX, DVec2::MIN), |(a, b), &p| (a.min(p), b.max(p)));
         let tries = ((high - low).element_product() * per_hectare / 1e4) as usize;
         for _ in 0..tries {
             let p = self.random.between(low.as_vec2(), high.as_vec2()).as_dvec2();
             let kind = *self.random.one_of(kinds);
             let heading = DVec2::from_angle(f64::from(self.random.range(0.0, std::f32::consts::TAU)));
-            self.put_free(Prop::Tree(kind), p, heading, clear, outline);
+            self.place_if_free(Prop::Tree(kind), p, heading, clear, outline);
         }
     }
 
-    fn yards(&mut self) {
+    fn fill_yard(&mut self) {
         let outline = self.outline();
         match self.layout {
             Layout::Winding => {
-                self.driveways(&outline);
-                self.garden_fronts();
-                self.scatter(90.0, &[0, 1, 3, 4, 5, 6, 7, 8], &outline, 2.8);
+                self.park_in_driveways(&outline);
+                self.place_garden_fronts();
+                self.scatter_trees(90.0, &[0, 1, 3, 4, 5, 6, 7, 8], &outline, 2.8);
             }
-            Layout::Alley => self.scatter(60.0, &[7, 8], &outline, 1.6),
-            _ => self.scatter(110.0, &[0, 1, 2, 4, 8], &outline, 3.2),
+            Layout::Alley => self.scatter_trees(60.0, &[7, 8], &outline, 1.6),
+            _ => self.scatter_trees(110.0, &[0, 1, 2, 4, 8], &outline, 3.2),
         }
     }
 
     /// Cars beside villas.
-    fn driveways(&mut self, outline: &[DVec2]) {
+    fn park_in_driveways(&mut self, outline: &[DVec2]) {
         for house in self.footprints.clone() {
             let beside = house.centre + (house.half.x + 1.7) * house.along - 0.3 * house.half.y * house.along.perp();
-            let car = some_car(&mut self.random);
+            let car = random_car(&mut self.random);
             let Prop::Vehicle(kind, _) = car else { continue };
             let half = 0.5 * kind.size().as_dvec2();
             let footprint = Footprint { centre: beside, along: house.along.perp(), half };
             let inside = footprint.corners().iter().all(|&c| contains(outline, c));
-            let free = self.footprints.iter().all(|other| !footprint.meets(other, 0.3));
+            let free = self.footprints.iter().all(|other| !footprint.overlaps(other, 0.3));
             if inside && free && self.random.chance(0.7) {
                 let mut pose = on_slope(self.terrain, beside, house.along.perp());
                 pose.translation = self.ground(beside);
                 self.footprints.push(footprint);
-                self.put(car, pose);
+                self.place(car, pose);
             }
         }
     }
 
     /// A hedge, a fence or a low wall behind the pavement, open where cars come out.
-    fn garden_fronts(&mut self) {
+    fn place_garden_fronts(&mut self) {
         for (line, _) in self.sides(&|p| p.front() + 0.45) {
             let prop = match self.random.below(4) {
                 0 => Prop::Hedge,
@@ -228,29 +228,29 @@ impl Parcel<'_> {
                 let (p, along) = line.at(s);
                 let piece = Footprint { centre: p, along, half: DVec2::new(1.0, 4.0) };
                 let free =
-                    self.footprints.iter().all(|f| f.half.x > 2.9 && f.half.x > f.half.y || !piece.meets(f, 0.5));
+                    self.footprints.iter().all(|f| f.half.x > 2.9 && f.half.x > f.half.y || !piece.overlaps(f, 0.5));
                 let walled = self.footprints.iter().all(|f| f.distance(p) > 1.3);
                 if free && walled && !self.random.chance(0.06) {
                     let at = self.ground(p);
-                    self.put(prop, upright(at, along));
+                    self.place(prop, upright(at, along));
                 }
                 s += 2.0;
             }
         }
     }
 
-    fn park(&mut self) {
+    fn fill_park(&mut self) {
         let outline = self.outline();
         for (line, _) in self.sides(&|p| p.front() + 6.0) {
             for k in 1..4 {
                 let (p, along) = line.at(line.length * f64::from(k) / 4.0);
-                self.put_free(Prop::Furniture(Piece::Bench), p, along, 1.5, &outline);
+                self.place_if_free(Prop::Furniture(Piece::Bench), p, along, 1.5, &outline);
             }
         }
-        self.scatter(260.0, &[0, 1, 2, 3, 4, 5, 6, 7], &outline, 3.0);
+        self.scatter_trees(260.0, &[0, 1, 2, 3, 4, 5, 6, 7], &outline, 3.0);
     }
 
-    fn square(&mut self) {
+    fn fill_square(&mut self) {
         let outline = self.outline();
         let middle = outline.iter().sum::<DVec2>() / outline.len() as f64;
         let along = (outline[outline.len() / 8] - outline[0]).normalize_or(DVec2::X);
@@ -258,7 +258,7 @@ impl Parcel<'_> {
         if room && matches!(self.layout, Layout::Deck | Layout::Grid) {
             let at = self.ground(middle);
             let footprint = Footprint { centre: middle + 8.0 * along.perp(), along, half: DVec2::new(10.5, 11.0) };
-            self.put(Prop::Furniture(Piece::Platform), upright(at, along));
+            self.place(Prop::Furniture(Piece::Platform), upright(at, along));
             self.footprints.push(footprint);
         }
         for (line, _) in self.sides(&|p| p.front() + 4.0) {
@@ -270,14 +270,14 @@ impl Parcel<'_> {
                     1 => Prop::Furniture(Piece::Bench),
                     _ => Prop::Tree(1),
                 };
-                self.put_free(prop, p, along, 2.0, &outline);
+                self.place_if_free(prop, p, along, 2.0, &outline);
             }
         }
-        self.put_free(Prop::Furniture(Piece::Column), middle, along, 2.0, &outline);
+        self.place_if_free(Prop::Furniture(Piece::Column), middle, along, 2.0, &outline);
     }
 
     /// Rows of cars.
-    fn car_park(&mut self) {
+    fn fill_car_park(&mut self) {
         let outline = self.outline();
         let Some((line, _)) = self.sides(&|p| p.front() + 5.0).into_iter().next() else { return };
         let (corner, along) = line.at(0.0);
@@ -287,7 +287,7 @@ impl Parcel<'_> {
             let y = 5.9 * f64::from(row) + 6.0 * f64::from((row + 1) / 2);
             for k in 0..(line.length / 2.7) as usize {
                 let p = corner + along * (2.7 * k as f64 + 2.0) + across * y;
-                let car = some_car(&mut self.random);
+                let car = random_car(&mut self.random);
                 let Prop::Vehicle(kind, _) = car else { continue };
                 let footprint = Footprint { centre: p, along: across, half: 0.5 * kind.size().as_dvec2() + 1.0 };
                 let inside = footprint.corners().iter().all(|&c| contains(&outline, c));
@@ -295,12 +295,12 @@ impl Parcel<'_> {
                     let heading = if self.random.chance(0.5) { across } else { -across };
                     let mut pose = on_slope(self.terrain, p, heading);
                     pose.translation = self.ground(p);
-                    self.put(car, pose);
+                    self.place(car, pose);
                 }
             }
         }
         for p in [line.at(0.3 * line.length).0, line.at(0.7 * line.length).0] {
-            self.put_free(Prop::Furniture(Piece::OldLamp), p - 3.0 * across, along, 1.0, &outline);
+            self.place_if_free(Prop::Furniture(Piece::OldLamp), p - 3.0 * across, along, 1.0, &outline);
         }
     }
 }

@@ -1,5 +1,5 @@
-//! A small place built by hand, where everything is known: a ground, a house, a pane of glass before a wall, a pole, a
-//! text on a board, a bush, and a van that drives by at 10 m/s. For trials of whatever looks at a city.
+//! A small hand-built scene with known geometry, for tests of sensors: ground, house, a pane of glass before a wall, pole,
+//! a board with text, bush, and a van that passes at 10 m/s.
 //!
 //! ```text
 //! y ▲            wall ▀▀▀▀▀▀▀ y = 12.0           house: x 14…24, y 6…18, 9 m high
@@ -19,7 +19,7 @@ pub const ASPHALT: u16 = 0;
 pub const BRICK: u16 = 1;
 /// Row of the pane.
 pub const GLASS: u16 = 2;
-/// Row of what is behind the pane.
+/// Row of the wall behind the pane.
 pub const PLASTER: u16 = 3;
 /// Row of the van's paint.
 pub const PAINT: u16 = 4;
@@ -30,33 +30,36 @@ pub const BOARD: u16 = 6;
 /// Row of the bush.
 pub const LEAF: u16 = 7;
 
-/// The place.
+/// The scene.
 pub fn city() -> City {
     let mut city = City { extent_metres: 200.0, materials: materials(), texts: vec!["plat".into()], ..City::default() };
     let ground = rectangle(vec3(-100.0, -100.0, 0.0), Vec3::X * 200.0, Vec3::Y * 200.0, ASPHALT, Class::Road);
-    put(&mut city, "ground", ground, Class::Road, 0, DVec3::ZERO);
+    add_actor(&mut city, "ground", ground, Class::Road, 0, DVec3::ZERO);
     let house = cuboid(vec3(-5.0, -6.0, 0.0), vec3(5.0, 6.0, 9.0), BRICK, Class::Building);
-    put(&mut city, "house", house, Class::Building, 1, DVec3::new(19.0, 12.0, 0.0));
+    add_actor(&mut city, "house", house, Class::Building, 1, DVec3::new(19.0, 12.0, 0.0));
     let wall = cuboid(vec3(-4.0, 0.0, 0.0), vec3(4.0, 0.3, 4.0), PLASTER, Class::Wall);
-    put(&mut city, "wall", wall, Class::Wall, 2, DVec3::new(0.0, 12.0, 0.0));
+    add_actor(&mut city, "wall", wall, Class::Wall, 2, DVec3::new(0.0, 12.0, 0.0));
     let pane = rectangle(vec3(-3.0, 0.0, 0.5), Vec3::X * 6.0, Vec3::Z * 2.5, GLASS, Class::Building);
-    put(&mut city, "pane", pane, Class::Building, 3, DVec3::new(0.0, 10.0, 0.0));
+    add_actor(&mut city, "pane", pane, Class::Building, 3, DVec3::new(0.0, 10.0, 0.0));
     let pole = cuboid(vec3(-0.06, -0.06, 0.0), vec3(0.06, 0.06, 5.0), STEEL, Class::Pole);
-    put(&mut city, "pole", pole, Class::Pole, 4, DVec3::new(8.0, 4.0, 0.0));
+    add_actor(&mut city, "pole", pole, Class::Pole, 4, DVec3::new(8.0, 4.0, 0.0));
     let mut board = rectangle(Vec3::ZERO, Vec3::X * 3.0, Vec3::Z * 0.8, BOARD, Class::TrafficSign);
     board.uvs = vec![Vec2::ZERO, Vec2::X, Vec2::ONE, Vec2::Y];
-    put(&mut city, "board", board, Class::TrafficSign, 5, DVec3::new(-9.0, 8.0, 2.0));
-    put(&mut city, "bush", bush(), Class::Vegetation, 6, DVec3::new(-12.0, 6.0, 0.0));
+    add_actor(&mut city, "board", board, Class::TrafficSign, 5, DVec3::new(-9.0, 8.0, 2.0));
+    add_actor(&mut city, "bush", bush(), Class::Vegetation, 6, DVec3::new(-12.0, 6.0, 0.0));
     let van = cuboid(vec3(-2.25, -0.9, 0.0), vec3(2.25, 0.9, 2.0), PAINT, Class::Truck);
-    put(&mut city, "van", van, Class::Truck, 7, DVec3::new(-30.0, -2.0, 0.0));
-    let at = |seconds: f64| Waypoint { seconds, world_from_asset: place(DVec3::new(10.0 * seconds - 30.0, -2.0, 0.0)) };
+    add_actor(&mut city, "van", van, Class::Truck, 7, DVec3::new(-30.0, -2.0, 0.0));
+    let at = |seconds: f64| Waypoint {
+        seconds,
+        world_from_asset: pose_at_point(DVec3::new(10.0 * seconds - 30.0, -2.0, 0.0)),
+    };
     let drive = Trajectory { waypoints: vec![at(0.0), at(6.0)], gait: Vec::new(), gait_seconds: 0.0 };
-    city.actors.last_mut().expect("the van was put").trajectory = Some(drive);
+    city.actors.last_mut().expect("the van was added").trajectory = Some(drive);
     city.streets.push(vec![DVec3::new(-60.0, 0.0, 0.0), DVec3::new(60.0, 0.0, 0.0)]);
     city
 }
 
-/// A rectangle from a corner along two edges, seen from where they turn counter-clockwise; uv are metres.
+/// A rectangle from a corner along two edges, counter-clockwise seen from outside; uv in metres.
 pub fn rectangle(corner: Vec3, along: Vec3, up: Vec3, material: u16, class: Class) -> Mesh {
     let (width, height) = (along.length(), up.length());
     Mesh {
@@ -75,13 +78,13 @@ pub fn cuboid(low: Vec3, high: Vec3, material: u16, class: Class) -> Mesh {
     let sides =
         [(low, x, z), (low + x, y, z), (low + x + y, -x, z), (low + y, -y, z), (low + z, x, y), (low + y, x, -y)];
     for (corner, along, up) in sides {
-        join(&mut mesh, &rectangle(corner, along, up, material, class));
+        append(&mut mesh, &rectangle(corner, along, up, material, class));
     }
     mesh
 }
 
-/// Adds a mesh to another.
-pub fn join(mesh: &mut Mesh, other: &Mesh) {
+/// Appends a mesh to another.
+pub fn append(mesh: &mut Mesh, other: &Mesh) {
     let first = mesh.positions.len() as u32;
     mesh.positions.extend(&other.positions);
     mesh.uvs.extend(&other.uvs);
@@ -90,15 +93,15 @@ pub fn join(mesh: &mut Mesh, other: &Mesh) {
     mesh.classes.extend(&other.classes);
 }
 
-/// Puts an asset and an actor that wears it into a city.
-pub fn put(city: &mut City, name: &str, mesh: Mesh, class: Class, instance: u32, at: DVec3) {
+/// Adds an asset and an actor that uses it.
+pub fn add_actor(city: &mut City, name: &str, mesh: Mesh, class: Class, instance: u32, at: DVec3) {
     let asset = city.assets.len() as u32;
     city.assets.push(Asset { name: name.into(), mesh });
-    city.actors.push(Actor { asset, class, instance, world_from_asset: place(at), trajectory: None });
+    city.actors.push(Actor { asset, class, instance, world_from_asset: pose_at_point(at), trajectory: None });
 }
 
 /// A pose without rotation.
-pub fn place(at: DVec3) -> Rigid {
+pub fn pose_at_point(at: DVec3) -> Rigid {
     Rigid { rotation: DQuat::IDENTITY, translation: at }
 }
 
@@ -111,7 +114,7 @@ fn bush() -> Mesh {
         let out = vec3(angle.cos(), angle.sin(), 0.0) * (1.0 - height * height).sqrt() + Vec3::Z * height;
         let side = out.any_orthonormal_vector() * 0.22;
         let leaf = rectangle(out * 1.1 + Vec3::Z * 1.2, side, out.cross(side) + 0.1 * out, LEAF, Class::Vegetation);
-        join(&mut mesh, &leaf);
+        append(&mut mesh, &leaf);
     }
     mesh
 }

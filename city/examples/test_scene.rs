@@ -4,10 +4,10 @@
 use std::path::Path;
 
 use city::{
-    faults::{self, Fault, Kind},
-    sense::{Shot, looking, pinhole},
-    stage,
-    trace::{Frame, Layer, Options, World, frame},
+    faults::{self, Fault, FaultKind},
+    sense::{Shot, camera_towards, pinhole},
+    test_scene,
+    trace::{Frame, Layer, RenderOptions, World, render_frame},
 };
 use glam::DVec3;
 use image::{RgbImage, imageops};
@@ -18,12 +18,13 @@ fn main() -> Result<()> {
     let folder = std::env::args().nth(1).ok_or("name a folder for the pictures")?;
     let folder = Path::new(&folder);
     std::fs::create_dir_all(folder)?;
-    let city = stage::city();
+    let city = test_scene::city();
     let world = World::new(&city)?;
-    let camera = looking(pinhole(960, 540, 90.0)?, DVec3::new(-8.0, -9.0, 2.2), DVec3::new(0.55, 1.0, -0.02), DVec3::Y);
+    let camera =
+        camera_towards(pinhole(960, 540, 90.0)?, DVec3::new(-8.0, -9.0, 2.2), DVec3::new(0.55, 1.0, -0.02), DVec3::Y);
     let mut shot = Shot::new("stage".into(), "front", 2.9, camera);
     shot.motion.velocity = DVec3::new(8.0, 0.0, 0.0);
-    let plain = frame(&world, &shot, &Options::default())?;
+    let plain = render_frame(&world, &shot, &RenderOptions::default())?;
     picture(&plain, &plain.rgb)?.save(folder.join("plain.png"))?;
     sheet(&truths(&plain)?, 3).save(folder.join("truths.png"))?;
     sheet(&faulty(&world, &shot)?, 3).save(folder.join("faults.png"))?;
@@ -32,16 +33,16 @@ fn main() -> Result<()> {
 
 /// Every fault that a picture shows, at half and full strength, and a rolling shutter.
 fn faulty(world: &World, shot: &Shot) -> Result<Vec<RgbImage>> {
-    let unseen = [Kind::PoseNoise, Kind::SparseViews, Kind::SensorDropout, Kind::MovingUnmasked];
+    let unseen = [FaultKind::PoseNoise, FaultKind::SparseViews, FaultKind::SensorDropout, FaultKind::MovingUnmasked];
     let mut rolling = shot.clone();
     (rolling.rolling_shutter_seconds, rolling.motion.spin) = (0.08, DVec3::new(0.0, 0.0, 3.0));
-    let rolled = frame(world, &rolling, &Options::default())?;
+    let rolled = render_frame(world, &rolling, &RenderOptions::default())?;
     let mut images = vec![picture(&rolled, &rolled.rgb)?];
-    for kind in Kind::ALL.iter().copied().filter(|kind| !unseen.contains(kind)) {
+    for kind in FaultKind::ALL.iter().copied().filter(|kind| !unseen.contains(kind)) {
         for strength in [0.5, 1.0] {
-            let options = Options { faults: vec![Fault { kind, strength, seed: 3 }], ..Options::default() };
-            let shot = faults::spoil_shots(vec![shot.clone()], &options.faults).remove(0);
-            let taken = frame(world, &shot, &options)?;
+            let options = RenderOptions { faults: vec![Fault { kind, strength, seed: 3 }], ..RenderOptions::default() };
+            let shot = faults::degrade_shots(vec![shot.clone()], &options.faults).remove(0);
+            let taken = render_frame(world, &shot, &options)?;
             images.push(picture(&taken, &taken.rgb)?);
         }
     }
