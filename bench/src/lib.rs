@@ -24,7 +24,7 @@ pub use chart::chart;
 pub use parts::{PartLine, append_part};
 pub use seeds::{Averaged, averaged};
 pub use sheet::{SheetRow, contact_sheet, write_png};
-pub use table::{replace_table, table};
+pub use table::{replace_table, short_table, table};
 
 /// One run, as one line of JSON. What was not measured is null.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]

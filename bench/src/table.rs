@@ -1,4 +1,4 @@
-//! The README's table: markdown from result lines, between two markers.
+//! Result lines as Markdown tables between two markers: all runs for the documents, a selection for the README.
 
 use std::fmt::Write;
 
@@ -6,6 +6,8 @@ use crate::{Averaged, ResultLine, averaged, scenes};
 
 const BEGIN: &str = "<!-- bench:begin -->";
 const END: &str = "<!-- bench:end -->";
+/// Maximum number of rows of [`short_table`].
+const SHORT_ROWS: usize = 8;
 
 /// The latest runs of each scene and label, references (lines with a source) first; of several seeds the mean, with the
 /// largest PSNR less the smallest. The column of times says how long a run took to the reference's best PSNR, and how
@@ -23,12 +25,11 @@ pub fn table(lines: &[ResultLine]) -> String {
         let reference = of_scene(true).next().map(|run| &run.line);
         for run in of_scene(true).chain(of_scene(false)) {
             let line = &run.line;
-            let size = if line.downscale > 1 { format!(" 1/{}", line.downscale) } else { String::new() };
             // writing to a String cannot fail
             let _ = writeln!(
                 text,
-                "| {}{size} | {} | {} | {} | {} | {} | {} | {} | {} | {} |",
-                cell(scene),
+                "| {} | {} | {} | {} | {} | {} | {} | {} | {} | {} |",
+                scene_cell(line),
                 cell(&name(run)),
                 cell(&line.backend),
                 psnr(run),
@@ -44,12 +45,57 @@ pub fn table(lines: &[ResultLine]) -> String {
     text
 }
 
+/// One row for each scene, [`SHORT_ROWS`] at most: the run with the highest PSNR, and the best of the first reference. Scenes
+/// with a reference come first, then cities (scenes whose names begin with `city`), then others, each in the order of [`table`].
+pub fn short_table(lines: &[ResultLine]) -> String {
+    let runs = averaged(lines);
+    let mut text = String::from(
+        "| scene | best run | PSNR, dB | CPU s | splats | peak MB | reference, dB | its CPU s | run to its PSNR, CPU s |\n\
+         |---|---|---:|---:|---:|---:|---:|---:|---:|\n",
+    );
+    let of_scene = |scene: &str, referred: bool| {
+        let scene = scene.to_owned();
+        runs.iter().filter(move |run| run.line.scene == scene && run.line.source.is_some() == referred)
+    };
+    let mut scenes = scenes(runs.iter().map(|run| &run.line));
+    scenes.retain(|scene| of_scene(scene, false).next().is_some());
+    scenes.sort_by_key(|scene| (of_scene(scene, true).next().is_none(), !scene.starts_with("city")));
+    for scene in scenes.into_iter().take(SHORT_ROWS) {
+        let best = of_scene(scene, false).reduce(|a, b| if b.line.psnr > a.line.psnr { b } else { a });
+        let Some(best) = best else { continue };
+        let line = &best.line;
+        let reference = of_scene(scene, true).next().map(|run| (run.line.best_psnr(), &run.line));
+        let against = reference.map(|(psnr, reference)| {
+            let reached = |line: &ResultLine| line.cpu_seconds_to(psnr).map_or("not reached".into(), seconds);
+            format!("{psnr:.2} | {} | {}", reached(reference), reached(line))
+        });
+        let _ = writeln!(
+            text,
+            "| {} | {} | {:.2} | {} | {} | {} | {} |",
+            scene_cell(line),
+            cell(&name(best)),
+            line.psnr,
+            seconds(line.cpu_seconds),
+            line.splats.map_or("–".into(), thousands),
+            number(line.peak_memory_bytes.map(|bytes| bytes as f64 / 1e6), 0),
+            against.as_deref().unwrap_or("– | – | –"),
+        );
+    }
+    text
+}
+
 /// The document with the text between its markers `<!-- bench:begin -->` and `<!-- bench:end -->` replaced; `None`
 /// where a marker is missing.
 pub fn replace_table(document: &str, table: &str) -> Option<String> {
     let from = document.find(BEGIN)? + BEGIN.len();
     let to = from + document[from..].find(END)?;
     Some(format!("{}\n{}\n{}", &document[..from], table.trim_end(), &document[to..]))
+}
+
+/// The scene, with the size of its photos where it is not their own.
+fn scene_cell(line: &ResultLine) -> String {
+    let size = if line.downscale > 1 { format!(" 1/{}", line.downscale) } else { String::new() };
+    cell(&line.scene) + &size
 }
 
 fn name(run: &Averaged) -> String {
@@ -116,6 +162,23 @@ mod tests {
         assert!(rows[0].contains("OpenSplat") && rows[0].contains("| 1000 | 1000 |"), "{}", rows[0]);
         assert!(rows[1].contains("| 20.0 (50.0×) | 12,010 |"), "{}", rows[1]);
         assert!(rows[2].contains("plat \\| flat") && rows[2].contains("not reached"), "{}", rows[2]);
+    }
+
+    #[test]
+    fn the_short_table_has_the_best_run_of_each_scene() {
+        let mut reference = line("OpenSplat", "fox", &[(100.0, 20.0), (1000.0, 28.0)]);
+        reference.source = Some("measured".into());
+        let good = line("plat tree", "fox", &[(10.0, 26.0), (30.0, 30.0)]);
+        let worse = line("plat flat", "fox", &[(10.0, 26.0)]);
+        let others = (0..9).map(|n| line("plat tree", &format!("scene {n}"), &[(10.0, 26.0)]));
+        let city = line("plat tree", "city, 0.3 km²", &[(10.0, 26.0)]);
+        let lines: Vec<ResultLine> = others.chain([city, worse, good, reference]).collect();
+        let text = short_table(&lines);
+        let rows: Vec<&str> = text.lines().skip(2).collect();
+        assert_eq!(rows.len(), SHORT_ROWS);
+        assert!(rows[0].starts_with("| fox | plat tree | 30.00 |"), "{}", rows[0]);
+        assert!(rows[0].ends_with("| 28.00 | 1000 | 20.0 |"), "{}", rows[0]);
+        assert!(rows[1].starts_with("| city, 0.3 km² |") && rows[1].ends_with("| – | – | – |"), "{}", rows[1]);
     }
 
     #[test]

@@ -42,15 +42,20 @@ fn a_sweep_has_a_line_for_each_combination_and_goes_on_where_it_was_stopped() {
     sweep(&["a=city", "--steps", "5", "--label", "other"]);
     assert_eq!(lines(at, "plat.jsonl").len(), 7);
 
-    std::fs::write(at.join("README.md"), "<!-- bench:begin -->\n<!-- bench:end -->\n").unwrap();
+    std::fs::create_dir_all(at.join("docs/src")).unwrap();
+    for document in ["README.md", "docs/src/performance.md"] {
+        std::fs::write(at.join(document), "<!-- bench:begin -->\n<!-- bench:end -->\n").unwrap();
+    }
     std::fs::create_dir(at.join("references")).unwrap();
     let other = r#"{"trainer": "Other", "version": "1", "machine": "m", "backend": "cuda", "source": "a paper", "runs": [
         {"scene": "a", "downscale": 1, "command": "other a", "cpu_seconds": 900, "psnr": 31.5, "lpips": 0.2}]}"#;
     std::fs::write(at.join("references/other.json"), other).unwrap();
     let drawn = done(at, &["bench", "chart", "--results", "results", "--reference", "references"]);
     assert_eq!((&drawn["lines"], &drawn["references"]), (&7.into(), &1.into()));
-    let readme = std::fs::read_to_string(at.join("README.md")).unwrap();
-    assert!(readme.contains("| plat, 10 steps |") && readme.contains("| Other | cuda | 31.50 |"), "{readme}");
+    let [readme, all] =
+        ["README.md", "docs/src/performance.md"].map(|name| std::fs::read_to_string(at.join(name)).unwrap());
+    assert!(all.contains("| plat, 10 steps |") && all.contains("| Other | cuda | 31.50 |"), "{all}");
+    assert!(readme.contains("| 31.50 | 900 | not reached |") && !readme.contains("| Other |"), "{readme}");
     let chart = std::fs::read_to_string(at.join("results/chart.svg")).unwrap();
     assert!(chart.contains("plat, 10 steps: ") && chart.contains("Other: 31.50 after 900.0 CPU s"), "{chart}");
     refused(at, &["bench", "chart", "--results", "results", "--reference", "nowhere"], "nowhere");

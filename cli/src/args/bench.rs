@@ -13,7 +13,7 @@ use crate::variants::{self, VARIANTS, Variant};
 pub(crate) enum BenchCommand {
     /// Train every combination of some captures and settings, measure the results, and append a line for each
     Pareto(Box<ParetoArgs>),
-    /// Redraw the chart and the README's table from all results
+    /// Redraw the chart and the tables of README and docs/src/performance.md from all results
     Chart(ChartArgs),
     /// Time the renderer's forward and backward passes
     Kernels(KernelsArgs),
@@ -193,7 +193,8 @@ pub(crate) struct ChartArgs {
     /// Folder of what other trainers reached; by default bench/reference where it is
     #[arg(long, value_name = "DIR")]
     pub(crate) reference: Option<PathBuf>,
-    /// File whose table between the markers is replaced
+    /// File whose table between the markers is replaced by the best run of each scene; the table of all runs goes to
+    /// docs/src/performance.md beside it, where that exists
     #[arg(long, value_name = "FILE", default_value = "README.md")]
     pub(crate) readme: PathBuf,
 }

@@ -22,7 +22,8 @@ fn reference(command: &Command, text: &mut String) {
     let usage = usage.trim_start_matches("Usage:").trim();
     let _ = write!(text, "\n```text\n{usage}\n```\n");
     let is_listed = |arg: &&Arg| !(arg.is_hide_set() || matches!(arg.get_id().as_str(), "help" | "version"));
-    let is_own = |arg: &&Arg| !arg.is_global_set() || command.get_bin_name() == Some("plat");
+    // Global options are listed once, at the root.
+    let is_own = |arg: &&Arg| !arg.is_global_set() || command.get_name() == "plat";
     let mut items = command.get_arguments().filter(is_listed).filter(is_own).map(item).peekable();
     if items.peek().is_some() {
         text.push('\n');

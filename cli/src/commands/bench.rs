@@ -5,7 +5,7 @@ use std::path::Path;
 
 use ::bench::parts::{Ingest, Tree, TreeFaces, TreeLevel};
 use ::bench::reference::read_references;
-use ::bench::{CurvePoint, PartLine, append_part, read_folder, replace_table, table};
+use ::bench::{CurvePoint, PartLine, append_part, read_folder, replace_table, short_table, table};
 use city::CitySettings;
 use dataset::synth::Settings;
 use serde::Serialize;
@@ -192,7 +192,22 @@ struct Drawn<'a> {
     readme: &'a Path,
 }
 
-/// Redraws what is a function of the results and the references.
+/// The document beside the README that has the full table.
+const CHAPTER: &str = "docs/src/performance.md";
+
+/// A document with its table replaced.
+fn with_table(path: &Path, table: &str) -> Result<String, scene::BadInput> {
+    let name = path.display().to_string();
+    let document = fs::read_to_string(path).map_err(|error| {
+        scene::BadInput::new(name.clone(), format!("cannot be read ({error})"), "name it with --readme")
+    })?;
+    replace_table(&document, table).ok_or_else(|| {
+        let advice = "put <!-- bench:begin --> and <!-- bench:end --> where the table goes";
+        scene::BadInput::new(name, "has no place for the table", advice)
+    })
+}
+
+/// Redraws the chart and the tables from the results and the references.
 pub(crate) fn chart(args: &ChartArgs, output: &Output) -> Result<(), Failure> {
     let runs = read_folder(&args.results)?;
     let usual = Path::new("bench/reference");
@@ -201,18 +216,14 @@ pub(crate) fn chart(args: &ChartArgs, output: &Output) -> Result<(), Failure> {
         None if usual.is_dir() => read_references(usual)?,
         None => Vec::new(),
     };
-    let readme = args.readme.display().to_string();
-    let document = fs::read_to_string(&args.readme).map_err(|error| {
-        scene::BadInput::new(readme.clone(), format!("cannot be read ({error})"), "name it with --readme")
-    })?;
     let lines = [&references[..], &runs[..]].concat();
-    let document = replace_table(&document, &table(&lines)).ok_or_else(|| {
-        let advice = "put <!-- bench:begin --> and <!-- bench:end --> where the table goes";
-        scene::BadInput::new(readme, "has no place for the table", advice)
-    })?;
+    let readme = with_table(&args.readme, &short_table(&lines))?;
+    let chapter = args.readme.with_file_name(CHAPTER);
+    let full = chapter.exists().then(|| with_table(&chapter, &table(&lines))).transpose()?;
     let path = args.results.join("chart.svg");
     save(&path, ::bench::chart(&runs, &references).as_bytes())?;
-    save(&args.readme, document.as_bytes())?;
+    save(&args.readme, readme.as_bytes())?;
+    full.map_or(Ok(()), |document| save(&chapter, document.as_bytes()))?;
     let (count, others) = (runs.len(), references.len());
     let drawn = Drawn { command: "bench chart", lines: count, references: others, chart: &path, readme: &args.readme };
     let text = format!("{count} lines, {others} of other trainers\n{}\n{}", path.display(), args.readme.display());
