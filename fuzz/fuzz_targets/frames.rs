@@ -1,4 +1,4 @@
-//! Frames of plat: splat columns, plans, captures. As they are, and with lengths and checksum that fit the bytes.
+//! Frames of plat: splat columns, exposures, plans, captures. Raw, and with valid lengths and checksum.
 #![no_main]
 
 use blocks::{Plan, plan::PLAN};
@@ -7,12 +7,12 @@ use scene::exposures::EXPOSURES;
 use scene::{Capture, Exposures};
 use scene::frame::{self, Kind, SPLATS};
 
-/// As `dataset::ingest::CAPTURE`.
+/// The same as `dataset::ingest::CAPTURE`.
 const CAPTURE: Kind = Kind(*b"capt", 1);
 
 fuzz_target!(|bytes: &[u8]| {
     let _ = frame::decode::<frame::SplatsHeader>(SPLATS, bytes);
-    // The header of splats takes three bytes or a few more, with the name of exposures 66 more, with a residual eight.
+    // A header of splats takes at least three bytes, 66 more with the id of exposures and eight more with a residual.
     for header in 0..bytes.len().min(96) {
         let _ = frame::decode_splats(&sealed(SPLATS, bytes, header));
     }
@@ -36,7 +36,7 @@ fuzz_target!(|bytes: &[u8]| {
     }
 });
 
-/// A frame whose header is the first bytes of these, its bulk the others.
+/// A frame whose header is the first `header` bytes of `body` and whose bulk is the rest.
 fn sealed(kind: Kind, body: &[u8], header: usize) -> Vec<u8> {
     let mut bytes = b"plat".to_vec();
     bytes.extend(kind.0);

@@ -1,4 +1,4 @@
-//! Cameras: an ideal pinhole in the world, windows and mips of it, and the lens models that captures come with.
+//! Cameras: posed ideal pinholes, their mips and windows, and the lens models of captures.
 
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use serde::{Deserialize, Serialize};
@@ -21,13 +21,13 @@ impl Rigid {
         self.rotation * point + self.translation
     }
 
-    /// The transform back.
+    /// The inverse transform.
     pub fn inverse(&self) -> Self {
         let rotation = self.rotation.inverse();
         Self { rotation, translation: -(rotation * self.translation) }
     }
 
-    /// Every number finite and the rotation of unit length (within 1e-3).
+    /// True if every number is finite and the quaternion has unit length within 1e-3.
     pub fn is_sane(&self) -> bool {
         self.translation.is_finite() && self.rotation.is_finite() && (self.rotation.length() - 1.0).abs() < 1e-3
     }
@@ -70,7 +70,7 @@ pub struct Pinhole {
     pub cy: f64,
 }
 
-/// A pinhole somewhere in the world.
+/// A posed pinhole.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Camera {
     /// Intrinsics.
@@ -90,15 +90,15 @@ impl Camera {
         self.camera_from_world.rotation.inverse() * DVec3::Z
     }
 
-    /// A world point in pixels and its depth in metres; pixels are meaningless where the depth is not positive.
+    /// Projects a world point: pixel and depth in metres. The pixel is meaningless where the depth is not positive.
     pub fn project(&self, point: DVec3) -> (DVec2, f64) {
         let p = self.camera_from_world.apply(point);
         let k = &self.pinhole;
         (DVec2::new(k.fx * p.x / p.z + k.cx, k.fy * p.y / p.z + k.cy), p.z)
     }
 
-    /// The camera of mip `m` of the image: a pixel covers `2^m × 2^m` pixels of mip 0, a remainder at the right and
-    /// bottom is dropped, and neither side gets shorter than one pixel.
+    /// The camera of mip `m`. A pixel covers `2^m × 2^m` pixels of mip 0, a remainder at the right and bottom is dropped, and
+    /// each side is at least one pixel.
     pub fn mip(&self, m: u8) -> Self {
         let k = &self.pinhole;
         let scale = 1.0 / f64::from(1u32 << m);
@@ -113,7 +113,7 @@ impl Camera {
         Self { pinhole, ..*self }
     }
 
-    /// The camera that sees only this rectangle of the image.
+    /// The camera of this rectangle of the image.
     pub fn window(&self, rect: Rect) -> Self {
         let k = &self.pinhole;
         let pinhole = Pinhole {
@@ -126,12 +126,12 @@ impl Camera {
         Self { pinhole, ..*self }
     }
 
-    /// The whole image.
+    /// The rectangle of the whole image.
     pub fn full(&self) -> Rect {
         Rect { x: 0, y: 0, width: self.pinhole.width, height: self.pinhole.height }
     }
 
-    /// Rotation matrix rows of `camera_from_world`.
+    /// Rotation matrix of `camera_from_world`.
     pub fn rotation(&self) -> DMat3 {
         DMat3::from_quat(self.camera_from_world.rotation)
     }
@@ -170,8 +170,8 @@ impl CameraModel {
         }
     }
 
-    /// k1, k2, p1, p2, k3, k4, k5, k6 of the OpenCV rational model, which contains all the other perspective ones; of a
-    /// fisheye its k1, k2, k3, k4 and zeros.
+    /// k1, k2, p1, p2, k3, k4, k5, k6 of the OpenCV rational model, which contains the other perspective models. For a fisheye
+    /// k1, k2, k3, k4 and zeros.
     pub fn distortion(&self) -> [f64; 8] {
         match *self {
             Self::SimplePinhole(_) | Self::Pinhole(_) => [0.0; 8],
@@ -183,12 +183,12 @@ impl CameraModel {
         }
     }
 
-    /// True where the model bends rays.
+    /// True if the model distorts points.
     pub fn is_distorted(&self) -> bool {
         self.is_fisheye() || self.distortion().iter().any(|&k| k != 0.0)
     }
 
-    /// True where pixels go with the angle to the axis instead of its tangent.
+    /// True for fisheyes, whose image radius is a function of the angle to the axis instead of its tangent.
     pub fn is_fisheye(&self) -> bool {
         matches!(self, Self::OpenCvFisheye(_))
     }
@@ -200,8 +200,8 @@ impl CameraModel {
             let radius = ideal.length();
             let angle = radius.atan();
             let a2 = angle * angle;
-            let bent = angle * (1.0 + a2 * (k1 + a2 * (k2 + a2 * (k3 + a2 * k4))));
-            return if radius > 1e-12 { ideal * (bent / radius) } else { ideal };
+            let distorted = angle * (1.0 + a2 * (k1 + a2 * (k2 + a2 * (k3 + a2 * k4))));
+            return if radius > 1e-12 { ideal * (distorted / radius) } else { ideal };
         }
         let [k1, k2, p1, p2, k3, k4, k5, k6] = self.distortion();
         let (x, y) = (ideal.x, ideal.y);
@@ -226,7 +226,7 @@ mod tests {
     }
 
     #[test]
-    fn mips_and_windows_project_where_the_image_does() {
+    fn mips_and_windows_project_like_the_image() {
         let (camera, point) = (camera(), DVec3::new(0.3, -0.4, 5.0));
         let (pixel, depth) = camera.project(point);
         let (small, _) = camera.mip(2).project(point);

@@ -1,4 +1,4 @@
-//! A capture after it was opened: posed views, sparse points, and where on Earth they lie.
+//! An opened capture: posed views, sparse points and their geographic origin.
 
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
@@ -21,27 +21,27 @@ pub struct GeoOrigin {
 /// One image with its camera.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct View {
-    /// The image's name as the capture has it, with `/` between folders.
+    /// Name of the image in the capture, with `/` between folders.
     pub name: String,
-    /// The ideal pinhole camera of mip 0.
+    /// Ideal pinhole camera of mip 0.
     pub camera: Camera,
-    /// One artefact per mip, finest first; empty until the capture was ingested.
+    /// One artefact per mip, finest first. Empty before ingest.
     pub mips: Vec<ArtefactId>,
-    /// True when pixels carry a mask (mips then have a fourth channel: 255 = use, 0 = leave out).
+    /// True if the view has a mask. Its mips then have a fourth channel: 255 = use, 0 = leave out.
     pub masked: bool,
 }
 
-/// Structure-from-motion points, and the views that saw each.
+/// Structure-from-motion points and their tracks.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct SparsePoints {
     /// World positions, metres.
     pub positions: Vec<DVec3>,
     /// sRGB colours, one per position.
     pub colours: Vec<[u8; 3]>,
-    /// `seen_by[track_start[i] .. track_start[i + 1]]` are the views that saw point `i`; one longer than `positions`,
-    /// or empty where the capture has no tracks.
+    /// Offsets into `seen_by`: point `i` was observed in `seen_by[track_start[i] .. track_start[i + 1]]`. One longer than `positions`,
+    /// or empty if the capture has no tracks.
     pub track_start: Vec<u32>,
-    /// Indices into the capture's views.
+    /// Indices of views, for all tracks.
     pub seen_by: Vec<u32>,
 }
 
@@ -56,7 +56,7 @@ impl SparsePoints {
         self.positions.is_empty()
     }
 
-    /// The views that saw point `i`; `None` where the capture has no tracks.
+    /// The views in which point `i` was observed; `None` if the capture has no tracks.
     pub fn track(&self, i: usize) -> Option<&[u32]> {
         let (from, to) = (*self.track_start.get(i)?, *self.track_start.get(i + 1)?);
         self.seen_by.get(from as usize..to as usize)
@@ -70,24 +70,24 @@ pub struct Capture {
     pub views: Vec<View>,
     /// Sparse points.
     pub points: SparsePoints,
-    /// Where the local frame lies on Earth, if the capture says so.
+    /// Geographic origin of the local frame, if known.
     pub geo_origin: Option<GeoOrigin>,
 }
 
 impl Capture {
-    /// Refuses captures whose numbers would make other functions meaningless, whoever wrote them.
+    /// Checks the invariants that other functions rely on. Captures come from files, so every number is untrusted.
     ///
     /// # Errors
-    /// What is out of range.
+    /// The first number that is out of range.
     pub fn check(&self) -> Result<(), CodecError> {
         for view in &self.views {
             let (k, bad) = (&view.camera.pinhole, |what| Err(CodecError::new(format!("view {:?} {what}", view.name))));
             let finite = [k.fx, k.fy, k.cx, k.cy].iter().all(|v| v.is_finite());
             if !finite || k.fx <= 0.0 || k.fy <= 0.0 || k.width == 0 || k.height == 0 {
-                return bad("has a camera of no pixels, or without positive focal lengths");
+                return bad("has a camera without pixels or without positive focal lengths");
             }
             if !view.camera.camera_from_world.is_sane() {
-                return bad("has a pose that is not finite or no rotation");
+                return bad("has a pose that is not finite or not a rotation");
             }
             if view.mips.len() > 32 {
                 return bad("has more mips than an image can have");
@@ -95,7 +95,7 @@ impl Capture {
         }
         let SparsePoints { positions, colours, track_start, seen_by } = &self.points;
         if colours.len() != positions.len() || !positions.iter().all(|p| p.is_finite()) {
-            return Err(CodecError::new("sparse points are not finite, or have not a colour each"));
+            return Err(CodecError::new("sparse points are not finite, or their colours do not match their number"));
         }
         let tracks = match track_start.as_slice() {
             [] => seen_by.is_empty(),
@@ -103,15 +103,15 @@ impl Capture {
             [only] => *only == 0 && seen_by.is_empty(),
         };
         if !tracks || !(track_start.is_empty() || track_start.len() == positions.len() + 1) {
-            return Err(CodecError::new("tracks do not fit the sparse points"));
+            return Err(CodecError::new("tracks do not match the sparse points"));
         }
         if seen_by.iter().any(|&view| view as usize >= self.views.len()) {
-            return Err(CodecError::new("a track names a view that is not there"));
+            return Err(CodecError::new("a track refers to a view that does not exist"));
         }
         Ok(())
     }
 
-    /// True for the views that are held out: every `test_every`-th by name order, starting with the first.
+    /// True for held-out views: every `test_every`-th in name order, starting with the first.
     pub fn is_test(index: usize, test_every: u32) -> bool {
         test_every > 0 && index.is_multiple_of(test_every as usize)
     }
@@ -123,7 +123,7 @@ mod tests {
     use crate::camera::{Pinhole, Rigid};
 
     #[test]
-    fn impossible_captures_are_refused() {
+    fn invalid_captures_are_refused() {
         let pinhole = Pinhole { width: 4, height: 3, fx: 5.0, fy: 5.0, cx: 2.0, cy: 1.5 };
         let camera = Camera { pinhole, camera_from_world: Rigid::IDENTITY };
         let view = View { name: "a.png".into(), camera, mips: Vec::new(), masked: false };

@@ -1,8 +1,8 @@
-//! The one envelope for everything plat writes for itself: plans, indices, checkpoints, splat columns.
+//! The checksummed container format of plat's own files: plans, indices, checkpoints, splat columns.
 //!
 //! Layout, little endian: `"plat"`, four bytes of kind, version u32, header length u32, bulk length u64, the first 16
-//! bytes of the BLAKE3 hash of header and bulk, the header (bincode, fixed by serde), the bulk (plain bytes).
-//! bincode 2.0.1 is no longer developed; this module is the only one that calls it, with a limit.
+//! bytes of the BLAKE3 hash of header and bulk, the header (bincode through serde), the bulk (raw bytes).
+//! bincode 2.0.1 is no longer developed; only this module calls it, with a size limit.
 
 use serde::{Serialize, de::DeserializeOwned};
 
@@ -12,17 +12,17 @@ use crate::splats::Splats;
 
 const MAGIC: &[u8; 4] = b"plat";
 const PREFIX: usize = 40;
-/// The largest header that a reader accepts: a plan of 100,000 tasks needs about a tenth of it.
+/// Largest header that a reader accepts, bytes. A plan of 100,000 tasks needs about a tenth of it.
 pub const HEADER_LIMIT: usize = 1 << 30;
 
-/// Kinds of frames and the version each is at.
+/// A kind of frame and its format version.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Kind(pub [u8; 4], pub u32);
 
 /// Splat columns; the header is [`SplatsHeader`].
 pub const SPLATS: Kind = Kind(*b"spla", 2);
 
-/// Wraps a header and bulk bytes.
+/// Encodes a frame from a header and bulk bytes.
 pub fn encode<T: Serialize>(kind: Kind, header: &T, bulk: &[u8]) -> Vec<u8> {
     let header = bincode::serde::encode_to_vec(header, bincode::config::standard())
         .expect("headers are plain data, which bincode always encodes");
@@ -38,10 +38,10 @@ pub fn encode<T: Serialize>(kind: Kind, header: &T, bulk: &[u8]) -> Vec<u8> {
     bytes
 }
 
-/// Unwraps a frame of this kind: its header and a view of its bulk.
+/// Decodes a frame of this kind: its header and a slice of its bulk.
 ///
 /// # Errors
-/// Wrong magic, kind, version, length or checksum, or a header that does not decode to the last byte.
+/// Wrong magic, kind, version, length or checksum, or a header with trailing bytes.
 pub fn decode<T: DeserializeOwned>(kind: Kind, bytes: &[u8]) -> Result<(T, &[u8]), CodecError> {
     let name = String::from_utf8_lossy(&kind.0).into_owned();
     if bytes.len() < PREFIX || &bytes[..4] != MAGIC || bytes[4..8] != kind.0 {
@@ -63,15 +63,15 @@ pub fn decode<T: DeserializeOwned>(kind: Kind, bytes: &[u8]) -> Result<(T, &[u8]
     }
     let (value, used) = decode_header(header).map_err(|e| CodecError::new(format!("'{name}' frame header: {e}")))?;
     if used != header.len() {
-        return Err(CodecError::new(format!("'{name}' frame header has {} bytes too many", header.len() - used)));
+        return Err(CodecError::new(format!("'{name}' frame header has {} extra bytes", header.len() - used)));
     }
     Ok((value, bulk))
 }
 
-/// The value, and the bytes that it took.
+/// The header's value and the number of bytes it took.
 ///
-/// bincode makes room for as long a text as is announced, up to a limit that is a constant: hence the least of some that
-/// suffices, as no value claims more than eight bytes for each of those that it takes.
+/// bincode allocates the announced length of a string or vector, up to a limit that must be a compile-time constant. This picks the
+/// smallest sufficient one of a few limits: no value claims more than eight bytes for each encoded byte.
 fn decode_header<T: DeserializeOwned>(header: &[u8]) -> Result<(T, usize), bincode::error::DecodeError> {
     fn within<const LIMIT: usize, T: DeserializeOwned>(
         header: &[u8],
@@ -95,38 +95,38 @@ fn checksum(header: &[u8], bulk: &[u8]) -> [u8; 16] {
     hasher.finalize().as_bytes()[..16].try_into().expect("16 of 32 bytes")
 }
 
-/// What precedes splat columns in a frame.
+/// Header of a frame of splat columns.
 #[derive(Debug, Clone, Copy, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct SplatsHeader {
     /// SH degree.
     pub sh_degree: u8,
     /// Number of splats.
     pub count: u64,
-    /// What else there is to know.
-    pub about: About,
+    /// How the splats were trained.
+    pub training: TrainingInfo,
 }
 
-/// What else there is to know of trained splats: what a block hands down with them.
+/// How splats were trained, which the children of a block need.
 #[derive(Debug, Clone, Copy, Default, PartialEq, serde::Serialize, serde::Deserialize)]
-pub struct About {
-    /// The [`Exposures`](crate::Exposures) that they were trained with, where there are any.
+pub struct TrainingInfo {
+    /// The [`Exposures`](crate::Exposures) that the splats were trained with, if any.
     pub exposures: Option<ArtefactId>,
-    /// How far the root of their tree was off in its photos: root mean square, 0 to 1.
+    /// Root mean square error of the tree's root block on its photos, 0 to 1.
     pub residual: Option<f64>,
 }
 
-/// Splats as a frame: all columns one after the other, f32 little endian.
+/// Encodes splats: all columns one after the other, f32 little endian.
 pub fn encode_splats(splats: &Splats) -> Vec<u8> {
-    encode_result(splats, About::default())
+    encode_result(splats, TrainingInfo::default())
 }
 
-/// Splats as a frame that says what else there is to know of them.
-pub fn encode_result(splats: &Splats, about: About) -> Vec<u8> {
+/// Encodes splats with their training information.
+pub fn encode_result(splats: &Splats, training: TrainingInfo) -> Vec<u8> {
     let bulk: Vec<u8> = splats.columns().iter().flat_map(|c| bytemuck::cast_slice::<f32, u8>(c)).copied().collect();
-    encode(SPLATS, &SplatsHeader { sh_degree: splats.sh_degree(), count: splats.len() as u64, about }, &bulk)
+    encode(SPLATS, &SplatsHeader { sh_degree: splats.sh_degree(), count: splats.len() as u64, training }, &bulk)
 }
 
-/// Splats from a frame.
+/// Decodes splats.
 ///
 /// # Errors
 /// As [`decode_result`].
@@ -134,27 +134,27 @@ pub fn decode_splats(bytes: &[u8]) -> Result<Splats, CodecError> {
     decode_result(bytes).map(|(splats, _)| splats)
 }
 
-/// Splats from a frame, and what else there is to know of them.
+/// Decodes splats with their training information.
 ///
 /// # Errors
-/// As [`decode`], or a bulk whose length is not that of the columns.
-pub fn decode_result(bytes: &[u8]) -> Result<(Splats, About), CodecError> {
+/// As [`decode`], or a bulk whose length does not match the header.
+pub fn decode_result(bytes: &[u8]) -> Result<(Splats, TrainingInfo), CodecError> {
     let (header, bulk): (SplatsHeader, _) = decode(SPLATS, bytes)?;
     if header.sh_degree > 3 {
         return Err(CodecError::new(format!("SH degree {} is above 3", header.sh_degree)));
     }
     let columns = Splats::new(header.sh_degree).columns().len();
     if header.count.checked_mul(4 * columns as u64) != Some(bulk.len() as u64) {
-        return Err(CodecError::new("splat columns do not fit their header"));
+        return Err(CodecError::new("splat columns do not match their header"));
     }
     if header.count == 0 {
-        return Ok((Splats::new(header.sh_degree), header.about));
+        return Ok((Splats::new(header.sh_degree), header.training));
     }
     let values =
         |chunk: &[u8]| chunk.chunks_exact(4).map(|b| f32::from_le_bytes(b.try_into().expect("four bytes"))).collect();
     let columns = bulk.chunks_exact(4 * header.count as usize).map(values).collect();
     let splats = Splats::from_columns(columns);
-    Ok((splats.ok_or_else(|| CodecError::new("splat columns of unequal length"))?, header.about))
+    Ok((splats.ok_or_else(|| CodecError::new("splat columns of unequal length"))?, header.training))
 }
 
 #[cfg(test)]
@@ -164,12 +164,12 @@ mod tests {
     use glam::Vec3;
 
     #[test]
-    fn no_header_makes_room_for_a_text_that_is_not_there() {
-        // A text of 900 MB, says its length.
+    fn headers_cannot_allocate_more_than_they_hold() {
+        // A string with an announced length of 900 MB.
         let mut bytes = vec![252];
         bytes.extend(900_000_000u32.to_le_bytes());
         assert!(matches!(decode_header::<String>(&bytes), Err(bincode::error::DecodeError::LimitExceeded)));
-        // And headers just under and over a limit pass, of numbers that claim eight bytes and take one, and of text.
+        // Headers just below and above a limit are decoded: numbers that take one byte and claim eight, and strings.
         for length in [1 << 13, (1 << 13) + 1, 1 << 16, (1 << 16) + 1] {
             let (numbers, text) = (vec![7u64; length], "x".repeat(length));
             let frame = encode(SPLATS, &(&numbers, &text), &[]);
@@ -178,24 +178,24 @@ mod tests {
     }
 
     #[test]
-    fn splats_round_trip_and_damage_is_seen() {
+    fn splats_round_trip_and_damage_is_detected() {
         let mut splats = Splats::new(1);
         for i in 0..5 {
             splats.push(&Splat::round(Vec3::splat(i as f32), -1.0, Vec3::splat(0.4), 0.3));
         }
         let bytes = encode_splats(&splats);
-        assert_eq!(decode_result(&bytes).unwrap(), (splats.clone(), About::default()));
-        let about = About { exposures: Some(ArtefactId::of(b"exposures")), residual: Some(0.1) };
-        let exposed = encode_result(&splats, about);
-        assert_eq!(decode_result(&exposed).unwrap(), (splats, about));
+        assert_eq!(decode_result(&bytes).unwrap(), (splats.clone(), TrainingInfo::default()));
+        let training = TrainingInfo { exposures: Some(ArtefactId::of(b"exposures")), residual: Some(0.1) };
+        let exposed = encode_result(&splats, training);
+        assert_eq!(decode_result(&exposed).unwrap(), (splats, training));
         for at in 0..bytes.len() {
             let mut damaged = bytes.clone();
             damaged[at] ^= 0x40;
-            assert!(decode_splats(&damaged).is_err(), "flip at {at} went unseen");
+            assert!(decode_splats(&damaged).is_err(), "flip at {at} was not detected");
         }
         assert!(decode_splats(&bytes[..bytes.len() - 1]).is_err());
-        let mut endless = bytes;
-        endless[16..24].fill(0xff);
-        assert!(decode_splats(&endless).unwrap_err().0.contains("cut short"));
+        let mut oversized = bytes;
+        oversized[16..24].fill(0xff);
+        assert!(decode_splats(&oversized).unwrap_err().0.contains("cut short"));
     }
 }

@@ -1,4 +1,4 @@
-//! Names of things: blocks of the city and immutable artefacts.
+//! Identifiers of blocks and of immutable artefacts.
 
 use std::fmt;
 use std::str::FromStr;
@@ -19,9 +19,9 @@ pub struct BlockId {
 }
 
 impl BlockId {
-    /// The whole scene.
+    /// The block that covers the whole scene.
     pub const ROOT: Self = Self { level: 0, x: 0, y: 0 };
-    /// Deepest level: 2^20 blocks a side are 1 m blocks of a 1,000 km scene.
+    /// Deepest level: 2^20 blocks per side are blocks of 1 m in a scene of 1,000 km.
     pub const MAX_LEVEL: u8 = 20;
 
     /// The block one level up, `None` at the root.
@@ -35,7 +35,7 @@ impl BlockId {
         [child(0), child(1), child(2), child(3)]
     }
 
-    /// The block of an upper `level` that contains this one (itself if `level >= self.level`).
+    /// The ancestor at `level`; the block itself if `level >= self.level`.
     pub fn ancestor(self, level: u8) -> Self {
         if level >= self.level {
             return self;
@@ -66,7 +66,7 @@ impl FromStr for BlockId {
     }
 }
 
-/// The BLAKE3 hash of an artefact's bytes: its name in the store. Written as 64 lower-case hexadecimal digits.
+/// The BLAKE3 hash of an artefact's bytes, which is its key in the store. Written as 64 lower-case hexadecimal digits.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct ArtefactId(pub [u8; 32]);
 

@@ -1,4 +1,4 @@
-//! Pixels in memory: what a window of a view looks like to the trainer.
+//! Pixels of an image or of a window of a view.
 
 /// An 8-bit sRGB image or window, as planes: all red, all green, all blue, rows from the top.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -9,7 +9,7 @@ pub struct Pixels {
     pub height: u32,
     /// `3 · width · height` bytes.
     pub rgb: Vec<u8>,
-    /// `width · height` bytes where the view has a mask: 255 = use, 0 = leave out.
+    /// `width · height` bytes if the view has a mask: 255 = use, 0 = leave out.
     pub mask: Option<Vec<u8>>,
 }
 

@@ -1,8 +1,8 @@
-//! KITTI-360: calibration, poses and Velodyne scans of the data set's own layout.
+//! Reads KITTI-360 calibration, poses and Velodyne scans.
 //!
-//! The vehicle's pose is world_from_imu; `calib_cam_to_pose.txt` has imu_from_camera for each camera before rectification,
-//! `R_rect` turns that camera to the rectified one, whose pinhole is the left of `P_rect`. Only the rectified perspective
-//! cameras 00 and 01 are known here; 02 and 03 are fisheyes of another model.
+//! The vehicle's pose is world_from_imu. `calib_cam_to_pose.txt` has imu_from_camera for each camera before rectification.
+//! `R_rect` rotates that camera to the rectified one, whose intrinsics are the left 3×3 part of `P_rect`. Only the rectified perspective
+//! cameras 00 and 01 are supported; 02 and 03 are fisheyes of another model.
 //!
 //! Source: the data set's documentation, "Raw data", and its scripts (`loadCalibration.py`).
 
@@ -16,27 +16,27 @@ use crate::error::CodecError;
 /// A rectified perspective camera.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct KittiCamera {
-    /// Pinhole.
+    /// Intrinsics: a pinhole.
     pub model: CameraModel,
-    /// Pixels.
+    /// Width in pixels.
     pub width: u32,
-    /// Pixels.
+    /// Height in pixels.
     pub height: u32,
-    /// From the camera before rectification.
+    /// Rectifying rotation.
     pub rectified_from_camera: Rigid,
 }
 
-/// Reads `perspective.txt`: cameras by their name, `image_00` and `image_01`.
+/// Reads `perspective.txt`: cameras by name, `image_00` and `image_01`.
 ///
 /// # Errors
-/// Lines that are cut short, numbers that no camera has, or no camera at all.
+/// Truncated lines, values out of range, or no camera.
 pub fn read_perspective(bytes: &[u8]) -> Result<BTreeMap<String, KittiCamera>, CodecError> {
     let entries = entries(bytes)?;
     let mut cameras = BTreeMap::new();
     for number in ["00", "01"] {
         let get = |key: &str| entries.get(format!("{key}_{number}").as_str());
         let (Some(p), Some(s)) = (get("P_rect"), get("S_rect")) else { continue };
-        let wrong = |key: &str| CodecError::new(format!("{key}_{number} has not the numbers that it should"));
+        let wrong = |key: &str| CodecError::new(format!("{key}_{number} has missing values or values out of range"));
         let p = <[f64; 12]>::try_from(p.as_slice()).map_err(|_| wrong("P_rect"))?;
         let s = <[f64; 2]>::try_from(s.as_slice()).map_err(|_| wrong("S_rect"))?;
         let rectified_from_camera = match get("R_rect") {
@@ -61,15 +61,15 @@ pub fn read_perspective(bytes: &[u8]) -> Result<BTreeMap<String, KittiCamera>, C
     Ok(cameras)
 }
 
-/// Reads `calib_cam_to_pose.txt`: imu_from_camera by the cameras' names.
+/// Reads `calib_cam_to_pose.txt`: imu_from_camera by camera name.
 ///
 /// # Errors
-/// Lines that are no rigid transforms.
+/// Lines that are not rigid transforms.
 pub fn read_cam_to_pose(bytes: &[u8]) -> Result<BTreeMap<String, Rigid>, CodecError> {
     let pose = |(name, values): (&str, Vec<f64>)| {
         let pose = <[f64; 12]>::try_from(values.as_slice()).ok().and_then(|values| rigid(&values));
         let pose = pose.ok_or_else(|| {
-            CodecError::new(format!("'{}' is no rigid transform", name.escape_debug().take(40).collect::<String>()))
+            CodecError::new(format!("'{}' is not a rigid transform", name.escape_debug().take(40).collect::<String>()))
         })?;
         Ok((name.to_string(), pose))
     };
@@ -79,31 +79,31 @@ pub fn read_cam_to_pose(bytes: &[u8]) -> Result<BTreeMap<String, Rigid>, CodecEr
 /// Reads `calib_cam_to_velo.txt`: velodyne_from_camera of camera 00.
 ///
 /// # Errors
-/// Not the twelve numbers of a rigid transform.
+/// Not twelve numbers of a rigid transform.
 pub fn read_cam_to_velo(bytes: &[u8]) -> Result<Rigid, CodecError> {
     let values = numbers(text(bytes)?)?;
     let values = <[f64; 12]>::try_from(values.as_slice()).ok().and_then(|values| rigid(&values));
-    values.ok_or_else(|| CodecError::new("has not the twelve numbers of a rigid transform"))
+    values.ok_or_else(|| CodecError::new("is not a rigid transform of twelve numbers"))
 }
 
-/// Reads `poses.txt` or `cam0_to_world.txt`: transforms to the world by frame, of 12 or 16 numbers.
+/// Reads `poses.txt` or `cam0_to_world.txt`: transforms to the world by frame number, as 12 or 16 numbers.
 ///
 /// # Errors
-/// A line that is no frame and rigid transform, a frame that is there twice, or none.
+/// A line without a frame number and a rigid transform, a repeated frame, or no poses.
 pub fn read_poses(bytes: &[u8]) -> Result<BTreeMap<u32, Rigid>, CodecError> {
     let mut poses = BTreeMap::new();
     for (i, line) in text(bytes)?.lines().enumerate().filter(|(_, line)| !line.trim().is_empty()) {
         let wrong = |what: &str| CodecError::new(format!("line {} {what}", i + 1));
         let (frame, values) = line.trim().split_once(char::is_whitespace).ok_or_else(|| wrong("is cut short"))?;
-        let frame: u32 = frame.parse().map_err(|_| wrong("does not start with the number of a frame"))?;
-        let values = numbers(values).map_err(|_| wrong("has a word that is no number"))?;
+        let frame: u32 = frame.parse().map_err(|_| wrong("does not start with a frame number"))?;
+        let values = numbers(values).map_err(|_| wrong("has a word that is not a number"))?;
         let pose = match values.as_slice() {
             [rows @ .., 0.0, 0.0, 0.0, 1.0] if rows.len() == 12 => rows.try_into().ok(),
             rows => rows.try_into().ok(),
         };
-        let pose = pose.and_then(rigid).ok_or_else(|| wrong("is not the rigid transform of a frame"))?;
+        let pose = pose.and_then(rigid).ok_or_else(|| wrong("is not a rigid transform"))?;
         if poses.insert(frame, pose).is_some() {
-            return Err(wrong("has a frame that was there before"));
+            return Err(wrong("repeats a frame"));
         }
     }
     if poses.is_empty() {
@@ -112,14 +112,14 @@ pub fn read_poses(bytes: &[u8]) -> Result<BTreeMap<u32, Rigid>, CodecError> {
     Ok(poses)
 }
 
-/// Reads a Velodyne scan: every `step`-th point, x, y, z in metres of the scanner; points that are not finite are left out.
+/// Reads every `step`-th point of a Velodyne scan: x, y, z in the scanner's frame, metres. Points that are not finite are dropped.
 ///
 /// # Errors
-/// A length that is not a multiple of a point's 16 bytes.
+/// A length that is not a multiple of 16 bytes, the size of a point.
 pub fn read_scan(bytes: &[u8], step: usize) -> Result<Vec<DVec3>, CodecError> {
     let (points, rest) = bytes.as_chunks::<16>();
     if !rest.is_empty() {
-        return Err(CodecError::new("is cut short: a point has 16 bytes"));
+        return Err(CodecError::new("is cut short: its length is not a multiple of 16 bytes"));
     }
     let point = |bytes: &[u8; 16]| {
         let [x, y, z] = [0, 4, 8].map(|at| f32::from_le_bytes(bytes[at..at + 4].try_into().expect("four bytes")));
@@ -128,7 +128,7 @@ pub fn read_scan(bytes: &[u8], step: usize) -> Result<Vec<DVec3>, CodecError> {
     Ok(points.iter().step_by(step.max(1)).map(point).filter(|point| point.is_finite()).collect())
 }
 
-/// Lines `name: numbers`; those whose rest is no list of numbers are left out.
+/// Lines `name: numbers`. Lines with other values are skipped.
 fn entries(bytes: &[u8]) -> Result<BTreeMap<&str, Vec<f64>>, CodecError> {
     let lines = text(bytes)?.lines().filter_map(|line| line.split_once(':'));
     Ok(lines.filter_map(|(name, values)| Some((name.trim(), numbers(values).ok()?))).collect())
@@ -141,15 +141,15 @@ fn text(bytes: &[u8]) -> Result<&str, CodecError> {
 fn numbers(text: &str) -> Result<Vec<f64>, CodecError> {
     let number = |word: &str| word.parse::<f64>().ok().filter(|v| v.is_finite());
     let numbers = text.split_ascii_whitespace().map(number).collect::<Option<Vec<_>>>();
-    numbers.ok_or_else(|| CodecError::new("has a word that is no number"))
+    numbers.ok_or_else(|| CodecError::new("has a word that is not a number"))
 }
 
-/// From the rows of a 3×4 matrix, if it is rigid to three digits.
+/// The transform of a row-major 3×4 matrix; `None` unless its rotation is orthonormal within 1e-3.
 fn rigid(rows: &[f64; 12]) -> Option<Rigid> {
     let column = |k: usize| DVec3::new(rows[k], rows[4 + k], rows[8 + k]);
     let matrix = DMat3::from_cols(column(0), column(1), column(2));
-    let off = matrix.transpose() * matrix - DMat3::IDENTITY;
-    if off.to_cols_array().iter().any(|v| v.abs() > 1e-3) || matrix.determinant() < 0.0 {
+    let deviation = matrix.transpose() * matrix - DMat3::IDENTITY;
+    if deviation.to_cols_array().iter().any(|v| v.abs() > 1e-3) || matrix.determinant() < 0.0 {
         return None;
     }
     let rigid = Rigid { rotation: DQuat::from_mat3(&matrix).normalize(), translation: column(3) };
@@ -187,7 +187,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_wrong_is_refused() {
+    fn invalid_files_are_refused() {
         for bad in
             ["", "3 1 0 0", "a 1 0 0 5 0 1 0 6 0 0 1 7", "3 2 0 0 5 0 1 0 6 0 0 1 7", "3 nan 0 0 5 0 1 0 6 0 0 1 7"]
         {

@@ -1,4 +1,4 @@
-//! NumPy's array files (`.npy`), as far as plat needs them: numbers in C order, of which floats are read back.
+//! Writes NumPy array files (`.npy`) in C order, and reads those of floats.
 //!
 //! Source: NumPy, "A simple file format for NumPy arrays" (`numpy.lib.format`).
 
@@ -6,12 +6,12 @@ use crate::error::CodecError;
 
 const MAGIC: &[u8; 6] = b"\x93NUMPY";
 
-/// A number that arrays are made of.
+/// An element type of arrays.
 pub trait Number: Copy {
-    /// NumPy's name of the type.
+    /// NumPy's type descriptor.
     const DESCR: &'static str;
 
-    /// Appends its bytes, little-endian.
+    /// Appends the value, little endian.
     fn put(self, bytes: &mut Vec<u8>);
 }
 
@@ -29,12 +29,12 @@ macro_rules! number {
 
 number!(u8 = "|u1", u32 = "<u4", f32 = "<f4", f64 = "<f8");
 
-/// An array of this shape (slowest axis first) as npy 1.0; the data begin at a multiple of 64 bytes.
+/// Encodes an array of this shape (slowest axis first) as npy 1.0, with data at a multiple of 64 bytes.
 ///
 /// # Panics
-/// When the shape does not hold `data.len()` numbers.
+/// If the shape does not have `data.len()` elements.
 pub fn write<T: Number>(shape: &[usize], data: &[T]) -> Vec<u8> {
-    assert_eq!(shape.iter().product::<usize>(), data.len(), "the shape {shape:?} does not fit the data");
+    assert_eq!(shape.iter().product::<usize>(), data.len(), "the shape {shape:?} does not match the data");
     let axes: String = shape.iter().map(|n| format!("{n}, ")).collect();
     let axes = if shape.len() == 1 { axes.trim_end() } else { axes.trim_end_matches(", ") };
     let mut dict = format!("{{'descr': '{}', 'fortran_order': False, 'shape': ({axes}), }}", T::DESCR);
@@ -58,11 +58,11 @@ pub fn write_f32(shape: &[usize], data: &[f32]) -> Vec<u8> {
     write(shape, data)
 }
 
-/// Shape and numbers of an array of `<f4` (bit for bit) or `<f8` (rounded) in C order. Numbers that are not finite
-/// pass: depth maps use them for "no value".
+/// Decodes the shape and data of an array of `<f4` (bit exact) or `<f8` (rounded to f32) in C order. NaN and infinity are kept, as depth
+/// maps use them for missing values.
 ///
 /// # Errors
-/// No npy, another type or order, or a body whose length is not that of the shape.
+/// Not npy, another element type or order, or a body that does not match the shape.
 pub fn read_f32(bytes: &[u8]) -> Result<(Vec<usize>, Vec<f32>), CodecError> {
     let cut_short = || CodecError::new("the npy header is cut short");
     let rest = bytes.strip_prefix(MAGIC).ok_or_else(|| CodecError::new("not an npy file"))?;
@@ -79,19 +79,19 @@ pub fn read_f32(bytes: &[u8]) -> Result<(Vec<usize>, Vec<f32>), CodecError> {
     let dict = std::str::from_utf8(dict).map_err(|_| CodecError::new("the npy header is not text"))?;
 
     if !value_of(dict, "fortran_order")?.starts_with("False") {
-        return Err(CodecError::new("the npy array is in Fortran order, C order is needed"));
+        return Err(CodecError::new("the npy array is in Fortran order, only C order is supported"));
     }
     let descr = value_of(dict, "descr")?;
     let size = match descr.get(1..4) {
         Some("<f4") => 4,
         Some("<f8") => 8,
-        _ => return Err(CodecError::new("the npy array is neither of '<f4' nor of '<f8'")),
+        _ => return Err(CodecError::new("the npy array is neither '<f4' nor '<f8'")),
     };
     let shape =
         shape(value_of(dict, "shape")?).ok_or_else(|| CodecError::new("the npy header's shape is malformed"))?;
     let needed = shape.iter().try_fold(size, |product: usize, &n| product.checked_mul(n));
     if needed != Some(body.len()) {
-        return Err(CodecError::new(format!("the npy shape {shape:?} does not fit {} bytes of data", body.len())));
+        return Err(CodecError::new(format!("the npy shape {shape:?} does not match {} bytes of data", body.len())));
     }
     let data = if size == 4 {
         body.as_chunks().0.iter().map(|b| f32::from_le_bytes(*b)).collect()
@@ -109,7 +109,7 @@ fn value_of<'a>(dict: &'a str, key: &str) -> Result<&'a str, CodecError> {
         .ok_or_else(|| CodecError::new(format!("the npy header has no '{key}'")))
 }
 
-/// A tuple of at most 64 lengths, which is NumPy's own limit.
+/// A tuple of at most 64 lengths, NumPy's limit.
 fn shape(text: &str) -> Option<Vec<usize>> {
     let (tuple, _) = text.strip_prefix('(')?.split_once(')')?;
     let tuple = tuple.trim();
@@ -157,7 +157,7 @@ mod tests {
     }
 
     #[test]
-    fn doubles_scalars_and_numpys_own_bytes_are_read() {
+    fn doubles_scalars_and_numpy_headers_are_read() {
         let body: Vec<u8> = [1.5f64, -2.0].iter().flat_map(|v| v.to_le_bytes()).collect();
         let bytes = with_dict("{'descr': '<f8', 'fortran_order': False, 'shape': (2,), }\n", &body);
         assert_eq!(read_f32(&bytes), Ok((vec![2], vec![1.5, -2.0])));
@@ -170,7 +170,7 @@ mod tests {
     }
 
     #[test]
-    fn what_does_not_fit_is_refused() {
+    fn invalid_headers_are_refused() {
         for dict in [
             "{'descr': '<f4', 'fortran_order': True, 'shape': (1,), }",
             "{'descr': '>f4', 'fortran_order': False, 'shape': (1,), }",

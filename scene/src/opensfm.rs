@@ -1,8 +1,8 @@
-//! OpenSfM's `reconstruction.json`, which OpenDroneMap writes too: cameras, shots and points.
+//! Reads the `reconstruction.json` of OpenSfM and OpenDroneMap: cameras, shots and points.
 //!
-//! Lengths on the image are in units of its longer side, from its middle. A shot's rotation is an axis times an angle,
-//! and its pose is camera_from_world in OpenCV axes, which are ours; the world is metres east, north and up of the
-//! `reference_lla`. A file may hold several reconstructions, which need not share a world: the one of most shots is read.
+//! Image coordinates are in units of the longer side, from the image's centre. A shot's rotation is an axis-angle vector,
+//! and its pose is camera_from_world in OpenCV axes. The world is metres east, north and up of `reference_lla`.
+//! A file may hold several reconstructions in different worlds; the one with the most shots is read.
 //!
 //! Sources: OpenSfM, "Reconstruction format" and `opensfm/src/geometry/camera_*.h`.
 
@@ -15,38 +15,38 @@ use crate::camera::{CameraModel, Rigid};
 use crate::capture::GeoOrigin;
 use crate::error::CodecError;
 
-/// A lens and the size of its images.
+/// A lens model and its image size.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SfmCamera {
-    /// Lens, in pixels of an image of this size.
+    /// Lens model, in pixels of an image of this size.
     pub model: CameraModel,
-    /// Pixels.
+    /// Width in pixels.
     pub width: u32,
-    /// Pixels.
+    /// Height in pixels.
     pub height: u32,
 }
 
 /// A posed image.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Shot {
-    /// The image's name.
+    /// Name of the image.
     pub name: String,
-    /// Its lens.
+    /// Its camera.
     pub camera: SfmCamera,
-    /// Pose.
+    /// Pose: OpenCV camera axes from world axes.
     pub camera_from_world: Rigid,
 }
 
 /// The largest reconstruction of a file.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Sfm {
-    /// At least one, by name.
+    /// Shots by name; at least one.
     pub shots: Vec<Shot>,
-    /// World positions, by the text of their ids.
+    /// World positions, in the lexical order of their ids.
     pub positions: Vec<DVec3>,
-    /// sRGB.
+    /// sRGB colours.
     pub colours: Vec<[u8; 3]>,
-    /// Where the world's origin lies.
+    /// Geographic position of the world's origin.
     pub origin: Option<GeoOrigin>,
     /// Names of the shots of the other reconstructions.
     pub others: Vec<String>,
@@ -117,10 +117,10 @@ fn perspective() -> String {
     "perspective".into()
 }
 
-/// Reads the reconstruction of most shots.
+/// Reads the reconstruction with the most shots.
 ///
 /// # Errors
-/// Malformed JSON, no shots, a shot without its camera, a projection that plat does not know, numbers out of range.
+/// Malformed JSON, no shots, a shot without its camera, an unsupported projection, numbers out of range.
 pub fn read(bytes: &[u8]) -> Result<Sfm, CodecError> {
     let files: Vec<File> =
         serde_json::from_slice(bytes).map_err(|e| CodecError::new(format!("reconstruction.json: {e}")))?;
@@ -152,7 +152,7 @@ fn reconstruction(file: File) -> Result<(Vec<Shot>, Points, Option<GeoOrigin>), 
     let mut shots = Vec::with_capacity(file.shots.len());
     for (name, shot) in file.shots {
         let camera = *(cameras.get(shot.camera.as_str()))
-            .ok_or_else(|| named("shot", &name, "was taken by a camera that is not there"))?;
+            .ok_or_else(|| named("shot", &name, "refers to a camera that does not exist"))?;
         let rotation = DQuat::from_scaled_axis(DVec3::from_array(shot.rotation)).normalize();
         let camera_from_world = Rigid { rotation, translation: DVec3::from_array(shot.translation) };
         if !camera_from_world.is_sane() {
@@ -174,7 +174,7 @@ fn reconstruction(file: File) -> Result<(Vec<Shot>, Points, Option<GeoOrigin>), 
         longitude_degrees: at.longitude,
         altitude_metres: at.altitude,
     });
-    // Where there was no GPS, OpenSfM writes zeros.
+    // OpenSfM writes zeros where it has no GPS.
     let origin = origin.filter(|at| [at.latitude_degrees, at.longitude_degrees, at.altitude_metres] != [0.0; 3]);
     if origin.is_some_and(|at| {
         !(at.latitude_degrees.abs() <= 90.0 && at.longitude_degrees.abs() <= 360.0 && at.altitude_metres.abs() < 1e6)
@@ -246,12 +246,12 @@ mod tests {
         assert_eq!((sfm.positions[1], sfm.colours[1]), (DVec3::new(1.0, 2.0, 3.0), [255, 0, 12]));
         assert_eq!((sfm.positions[0], sfm.colours[0]), (DVec3::new(4.0, 5.0, 6.0), [128; 3]));
         assert_eq!(sfm.origin.unwrap().latitude_degrees, 47.5);
-        // A pixel, as OpenSfM's own example has it: on the axis the middle of the image.
+        // The optical axis is not distorted.
         assert_eq!(a.camera.model.distort(DVec2::ZERO), DVec2::ZERO);
     }
 
     #[test]
-    fn what_is_wrong_is_named() {
+    fn errors_name_the_entry() {
         for (from, to, word) in [
             ("\"camera\": \"v2 b\"", "\"camera\": \"v2 d\"", "b.jpg"),
             ("fisheye", "spherical", "spherical"),

@@ -1,9 +1,9 @@
-//! PLY: splats as INRIA's 3D Gaussian Splatting writes them, and point clouds.
+//! Reads and writes splats as PLY in the layout of INRIA's 3D Gaussian Splatting, and reads point clouds.
 //!
 //! The INRIA convention: one `vertex` element with `x y z nx ny nz f_dc_0..2 f_rest_* opacity scale_0..2 rot_0..3`;
 //! `f_rest` is channel-major (all of red, then green, then blue), opacity is a logit, scales are logarithms and
-//! `rot` is wxyz. Reading takes any order of properties, any scalar types and all three encodings of PLY (Turk 1994).
-//! Splats pass bit for bit, NaNs too: whether a number is sensible is the caller's question.
+//! `rot` is wxyz. The reader accepts any order of properties, any scalar types and all three encodings of PLY (Turk 1994).
+//! Values are bit exact, including NaN; the caller checks their range.
 //! PlayCanvas' `.compressed.ply` is read too; see [`packed`].
 
 mod header;
@@ -16,14 +16,14 @@ pub(crate) use self::packed::logit_of_byte;
 use crate::error::CodecError;
 use crate::splats::{Splats, column, sh_coefficients};
 
-/// Rows that are transposed at a time: few enough to stay in the cache.
+/// Rows transposed at a time, few enough to stay in cache.
 const ROWS: usize = 128;
 
-/// Splats of SH degree 0 to 3 (0, 9, 24 or 45 `f_rest` properties); other properties and elements are left out. A file
-/// of PlayCanvas' packed splats is unpacked.
+/// Decodes splats of SH degree 0 to 3 (0, 9, 24 or 45 `f_rest` properties). Other properties and elements are ignored. PlayCanvas'
+/// packed splats are unpacked.
 ///
 /// # Errors
-/// A malformed header, a missing property, another number of `f_rest`, or a body that is too short.
+/// A malformed header, a missing property, another number of `f_rest` properties, or a body that is too short.
 pub fn read(bytes: &[u8]) -> Result<Splats, CodecError> {
     let header = Header::parse(bytes)?;
     if packed::is_packed(&header) {
@@ -38,29 +38,29 @@ pub fn read(bytes: &[u8]) -> Result<Splats, CodecError> {
     Splats::from_columns(vertices.columns(&wanted)?).ok_or_else(|| CodecError::new("columns of unequal length"))
 }
 
-/// Splats as a `binary_little_endian` PLY with zero normals; each comment becomes one header line.
+/// Encodes splats as a `binary_little_endian` PLY with zero normals and one header line per comment.
 pub fn write(splats: &Splats, comments: &[&str]) -> Vec<u8> {
     let header = header(splats.len(), splats.sh_degree(), comments);
-    let stride = 4 * places(splats.sh_degree()).len();
+    let stride = 4 * properties(splats.sh_degree()).len();
     let mut bytes = Vec::with_capacity(header.len() + stride * splats.len());
     bytes.extend_from_slice(&header);
     append_rows(&mut bytes, splats);
     bytes
 }
 
-/// The header of [`write`] for so many splats; what follows it is the [`rows`] of so many, in any number of parts.
+/// The header of [`write`] for this number of splats. The [`rows`] of that many splats follow it, in any number of parts.
 pub fn header(splats: usize, sh_degree: u8, comments: &[&str]) -> Vec<u8> {
     let mut header = String::from("ply\nformat binary_little_endian 1.0\n");
     for comment in comments {
         header += &format!("comment {}\n", comment.replace(['\n', '\r'], " "));
     }
     header += &format!("element vertex {splats}\n");
-    places(sh_degree).iter().for_each(|(name, _)| header += &format!("property float {name}\n"));
+    properties(sh_degree).iter().for_each(|(name, _)| header += &format!("property float {name}\n"));
     header += "end_header\n";
     header.into_bytes()
 }
 
-/// Splats as [`write`] has them after its header.
+/// The rows that follow the header in [`write`].
 pub fn rows(splats: &Splats) -> Vec<u8> {
     let mut bytes = Vec::new();
     append_rows(&mut bytes, splats);
@@ -68,38 +68,37 @@ pub fn rows(splats: &Splats) -> Vec<u8> {
 }
 
 fn append_rows(bytes: &mut Vec<u8>, splats: &Splats) {
-    let places = places(splats.sh_degree());
-    let (start, stride) = (bytes.len(), 4 * places.len());
+    let properties = properties(splats.sh_degree());
+    let (start, stride) = (bytes.len(), 4 * properties.len());
     bytes.resize(start + stride * splats.len(), 0);
     for (block, rows) in bytes[start..].chunks_mut(stride * ROWS).enumerate() {
-        for (place, (_, source)) in places.iter().enumerate() {
+        for (slot, (_, source)) in properties.iter().enumerate() {
             let Some(source) = *source else { continue };
             for (row, value) in rows.chunks_exact_mut(stride).zip(&splats.col(source)[block * ROWS..]) {
-                row[4 * place..4 * place + 4].copy_from_slice(&value.to_le_bytes());
+                row[4 * slot..4 * slot + 4].copy_from_slice(&value.to_le_bytes());
             }
         }
     }
 }
 
-/// The properties of a row in INRIA's order, each with the column that it is of; normals have none.
-fn places(sh_degree: u8) -> Vec<(String, Option<usize>)> {
+/// The properties of a row in INRIA's order with their columns; normals have none.
+fn properties(sh_degree: u8) -> Vec<(String, Option<usize>)> {
     let names = column_names(sh_degree);
-    let mut places: Vec<(String, Option<usize>)> = Vec::with_capacity(names.len() + 3);
-    let mut put = |name: &str| places.push((name.into(), names.iter().position(|n| n == name)));
+    let mut properties: Vec<(String, Option<usize>)> = Vec::with_capacity(names.len() + 3);
+    let mut put = |name: &str| properties.push((name.into(), names.iter().position(|n| n == name)));
     ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"].into_iter().for_each(&mut put);
     (0..names.len() - column::SH - 3).for_each(|k| put(&format!("f_rest_{k}")));
     ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"].into_iter().for_each(&mut put);
-    places
+    properties
 }
 
-/// The texts of the header's `comment` lines; none where the bytes are no PLY. plat marks anti-aliased models with
-/// `antialiased`.
+/// The header's `comment` lines; empty if the bytes are not a PLY. plat marks anti-aliased models with `antialiased`.
 pub fn comments(bytes: &[u8]) -> Vec<String> {
     Header::parse(bytes).map(|header| header.comments).unwrap_or_default()
 }
 
-/// The points of a cloud with their colours (sRGB): `x y z` of any scalar type, `red green blue` as `uchar`; points
-/// without such colours are grey (128).
+/// Decodes a point cloud: positions `x y z` of any scalar type and sRGB colours `red green blue` as `uchar`. Without such colours
+/// points are grey (128).
 ///
 /// # Errors
 /// As [`read`], or a coordinate that is not finite.
@@ -122,7 +121,7 @@ pub fn read_points(bytes: &[u8]) -> Result<(Vec<DVec3>, Vec<[u8; 3]>), CodecErro
     Ok((points, colours))
 }
 
-/// The property of each of our columns, in their order.
+/// The property of each column, in the order of [`column`].
 fn column_names(sh_degree: u8) -> Vec<String> {
     let mut names: Vec<String> =
         ["x", "y", "z", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3", "opacity"]

@@ -1,7 +1,7 @@
-//! The hash that all random numbers of plat come from: a value is a pure function of its key, so no order of execution can
-//! change it.
+//! The counter-based hash behind all random numbers of plat: a value is a pure function of key and counter, so the order of execution
+//! does not matter.
 
-/// A well mixed 64-bit hash of a key and a counter (SplitMix64's finaliser, Steele et al. 2014, twice).
+/// A 64-bit hash of a key and a counter (SplitMix64's finaliser, Steele et al. 2014, twice).
 pub fn bits(key: u64, counter: u64) -> u64 {
     let mix = |mut z: u64| {
         z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
@@ -19,8 +19,8 @@ pub fn uniform(key: u64, counter: u64) -> f32 {
 #[cfg(test)]
 mod tests {
     #[test]
-    fn the_hash_is_what_it_was() {
-        // Plans, blocks and cities that were made with it must come out the same.
+    fn hash_values_are_stable() {
+        // Existing plans, blocks and cities depend on these values.
         assert_eq!([super::bits(0, 0), super::bits(7, 1)], [0x4821_8226_ff3c_d4bf, 0xb8b4_c297_7eab_ce45]);
     }
 }

@@ -1,22 +1,22 @@
-//! Splats as columns: one `Vec<f32>` per scalar, so that SIMD, optimiser and codecs walk memory in order.
+//! Splats as structure of arrays: one `Vec<f32>` per scalar, so that SIMD, optimiser and codecs read memory sequentially.
 
 use glam::Vec3;
 
-/// Places of the columns in [`Splats`].
+/// Indices of the columns in [`Splats`].
 pub mod column {
     /// x, y, z of the mean, metres.
     pub const MEAN: usize = 0;
     /// Natural logarithm of the three standard deviations, metres.
     pub const LOG_SCALE: usize = 3;
-    /// w, x, y, z of the rotation; normalised on use.
+    /// w, x, y, z of the rotation quaternion; normalised on use.
     pub const QUAT: usize = 6;
-    /// Logit of the opacity.
+    /// Opacity logit.
     pub const OPACITY: usize = 10;
     /// Spherical harmonics: column `SH + 3 * coefficient + channel`.
     pub const SH: usize = 11;
 }
 
-/// `1 / (2 √π)`: the constant of the zeroth spherical harmonic. A splat of SH degree 0 shows `SH_C0 · f_dc + ½`.
+/// `1 / (2 √π)`, the spherical harmonic of degree 0. The colour of a splat of SH degree 0 is `SH_C0 · f_dc + ½`.
 pub const SH_C0: f32 = 0.282_094_79;
 
 /// The number of coefficients per channel of an SH degree.
@@ -33,14 +33,14 @@ pub struct Splat {
     pub log_scale: Vec3,
     /// Rotation wxyz.
     pub quat: [f32; 4],
-    /// Logit of the opacity.
+    /// Opacity logit.
     pub opacity_logit: f32,
     /// SH coefficients, channel fastest; those above the degree are zero.
     pub sh: [[f32; 3]; 16],
 }
 
 impl Splat {
-    /// A round splat of one colour (sRGB, 0..1), with `opacity` in (0, 1).
+    /// An isotropic splat of one colour (sRGB, 0..1), with `opacity` in (0, 1).
     pub fn round(mean: Vec3, log_scale: f32, colour: Vec3, opacity: f32) -> Self {
         let mut sh = [[0.0; 3]; 16];
         sh[0] = ((colour - 0.5) / SH_C0).to_array();
@@ -57,13 +57,13 @@ pub struct Splats {
 }
 
 impl Splats {
-    /// No splats, of this SH degree (0 to 3).
+    /// No splats, with this SH degree (0 to 3).
     pub fn new(sh_degree: u8) -> Self {
         assert!(sh_degree <= 3, "SH degree {sh_degree} is above 3");
         Self { sh_degree, columns: vec![Vec::new(); column::SH + 3 * sh_coefficients(sh_degree)] }
     }
 
-    /// From columns in the order of [`column`]; `None` unless there are 14, 23, 38 or 59 of one length.
+    /// Splats from columns in the order of [`column`]. `None` unless there are 14, 23, 38 or 59 columns of equal length.
     pub fn from_columns(columns: Vec<Vec<f32>>) -> Option<Self> {
         let sh_degree = (0..=3).find(|&d| columns.len() == column::SH + 3 * sh_coefficients(d))?;
         let n = columns[0].len();
@@ -80,7 +80,7 @@ impl Splats {
         self.len() == 0
     }
 
-    /// 0 to 3.
+    /// SH degree, 0 to 3.
     pub fn sh_degree(&self) -> u8 {
         self.sh_degree
     }
@@ -90,7 +90,7 @@ impl Splats {
         &self.columns
     }
 
-    /// All columns for writing. Whoever changes a length must change them all alike.
+    /// All columns, mutable. The caller must keep their lengths equal.
     pub fn columns_mut(&mut self) -> &mut [Vec<f32>] {
         &mut self.columns
     }
@@ -121,31 +121,31 @@ impl Splats {
         }
     }
 
-    /// Overwrites row `i`; coefficients above the degree are left out.
+    /// Overwrites row `i`, without coefficients above the SH degree.
     pub fn set(&mut self, i: usize, splat: &Splat) {
         for (k, value) in row(splat).take(self.columns.len()).enumerate() {
             self.columns[k][i] = value;
         }
     }
 
-    /// Appends a row; coefficients above the degree are left out.
+    /// Appends a row, without coefficients above the SH degree.
     pub fn push(&mut self, splat: &Splat) {
         for (column, value) in self.columns.iter_mut().zip(row(splat)) {
             column.push(value);
         }
     }
 
-    /// Appends all rows of `other`; its coefficients above this degree are left out, missing ones are zero.
+    /// Appends all rows of `other`. Coefficients above this SH degree are dropped, missing ones are zero.
     pub fn append(&mut self, other: &Self) {
         for (k, column) in self.columns.iter_mut().enumerate() {
             match other.columns.get(k) {
-                Some(theirs) => column.extend_from_slice(theirs),
+                Some(values) => column.extend_from_slice(values),
                 None => column.resize(column.len() + other.len(), 0.0),
             }
         }
     }
 
-    /// Makes room for so many more rows, and no more than that.
+    /// Reserves capacity for exactly this many more rows.
     pub fn reserve(&mut self, rows: usize) {
         self.columns.iter_mut().for_each(|column| column.reserve_exact(rows));
     }

@@ -1,11 +1,11 @@
-//! SPZ, Niantic's compressed splats: versions 2 to 4 are read, 2 and 3 written.
+//! Reads and writes SPZ, Niantic's compressed splat format: reads versions 2 to 4, writes 2 and 3.
 //!
-//! Versions 2 and 3 are one gzip stream: a header of 16 bytes, then by attribute positions (24 bits of fixed point),
-//! opacities, colours, log scales, rotations (version 2: x, y, z of 8 bits; version 3: the three smaller components of
-//! 10 bits) and spherical harmonics. Version 4 has a plain header and one zstd stream for each attribute.
+//! Versions 2 and 3 are one gzip stream: a header of 16 bytes, then one plane per attribute: positions (24-bit fixed point),
+//! opacities, colours, log scales, rotations (version 2: x, y, z with 8 bits; version 3: the three smaller components with
+//! 10 bits) and SH coefficients. Version 4 has an uncompressed header and one zstd stream per attribute.
 //!
-//! SPZ's axes are right, up and back, those of an INRIA PLY right, down and forward: y and z change sign on the way, as
-//! in Niantic's own converter, so that a model shows the same way up in a viewer whichever of the two it is given.
+//! SPZ's axes are right, up, back; those of an INRIA PLY right, down, forward. y and z therefore change sign, as in Niantic's
+//! converter, so that a viewer shows both formats the same way up.
 //!
 //! Source: `load-spz.cc` and `splat-types.h` of the SPZ library.
 
@@ -15,7 +15,7 @@ use std::io::{self, Read, Write};
 
 use flate2::{Compression, bufread::GzDecoder, write::GzEncoder};
 
-use self::quantise::{Rotation, flipped_sh};
+use self::quantise::{Rotation, sh_sign};
 use crate::error::CodecError;
 use crate::splats::{Splats, column, sh_coefficients};
 
@@ -23,21 +23,21 @@ const MAGIC: u32 = 0x5053_474e;
 const GZIP: [u8; 2] = [0x1f, 0x8b];
 const ANTIALIASED: u8 = 1;
 const EXTENSIONS: u8 = 2;
-/// Fractional bits of positions that are written where their range allows it: a quarter of a millimetre.
+/// Fractional bits of written positions where their range allows it: steps of a quarter of a millimetre.
 const FRACTIONAL_BITS: u8 = 12;
-/// Splats may take this many bytes in memory, and this many times those of the file: trained ones take 12 times as many
-/// or fewer. More is a decompression bomb.
+/// Largest decoded size: this many bytes plus this factor times the file's size. Trained splats take at most 12 times the file's size; more
+/// is a decompression bomb.
 const MEMORY_BYTES: u64 = 32 << 20;
 const MEMORY_FACTOR: u64 = 20;
-/// The largest SH degree of the format; bands above the third are left out.
-const HIGHEST_DEGREE: u8 = 4;
+/// Largest SH degree of the format. Coefficients above degree 3 are dropped.
+const MAX_DEGREE: u8 = 4;
 
 /// A version that can be written.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Version {
-    /// Rotations of 24 bits; for old readers.
+    /// 24-bit rotations, for old readers.
     V2,
-    /// Rotations of 32 bits; what all readers of today accept.
+    /// 32-bit rotations; all current readers accept it.
     V3,
 }
 
@@ -60,24 +60,24 @@ impl Header {
         if !(2..=4).contains(&version) {
             return Err(CodecError::new(format!("SPZ of version {version}; versions 2 to 4 can be read")));
         }
-        if sh_degree > HIGHEST_DEGREE || fractional_bits > 24 {
+        if sh_degree > MAX_DEGREE || fractional_bits > 24 {
             let problem = format!("SPZ header with SH degree {sh_degree} and {fractional_bits} fractional bits");
             return Err(CodecError::new(problem));
         }
         if version < 4 && flags & EXTENSIONS != 0 {
-            return Err(CodecError::new("SPZ with extensions before version 4, which cannot be read"));
+            return Err(CodecError::new("SPZ extensions before version 4 are not supported"));
         }
         let antialiased = flags & ANTIALIASED != 0;
         Ok(Self { version, count: word(8) as usize, sh_degree, fractional_bits, antialiased })
     }
 
-    /// Refuses more splats than a file of this length can have: nothing is allocated for a count that lies.
+    /// Refuses more splats than a file of this length can hold, before anything is allocated.
     fn check_memory(&self, file_bytes: usize) -> Result<(), CodecError> {
         let columns = column::SH + 3 * sh_coefficients(self.sh_degree.min(3));
         if 4 * columns as u64 * self.count as u64 > MEMORY_BYTES + MEMORY_FACTOR * file_bytes as u64 {
             let count = self.count;
             return Err(CodecError::new(format!(
-                "{file_bytes} bytes do not hold the {count} splats that they announce"
+                "{file_bytes} bytes cannot hold the {count} splats that the header announces"
             )));
         }
         Ok(())
@@ -87,21 +87,21 @@ impl Header {
         if self.version == 2 { Rotation::FirstThree } else { Rotation::SmallestThree }
     }
 
-    /// Bytes of a splat in each plane.
-    fn planes(&self) -> [usize; 6] {
+    /// Bytes per splat in each plane.
+    fn plane_sizes(&self) -> [usize; 6] {
         [9, 1, 3, 3, self.rotation().bytes(), 3 * (sh_coefficients_of(self.sh_degree) - 1)]
     }
 }
 
-/// As [`sh_coefficients`], for the format's degree 4 too.
+/// As [`sh_coefficients`], including the format's degree 4.
 fn sh_coefficients_of(degree: u8) -> usize {
     (usize::from(degree) + 1).pow(2)
 }
 
-/// Splats, and whether they are to be drawn anti-aliased.
+/// Decodes splats. The flag is true if they are to be rendered anti-aliased.
 ///
 /// # Errors
-/// Not SPZ, of another version, cut short, damaged, or with more splats than the file can hold.
+/// Not SPZ, an unsupported version, truncated, damaged, or more splats than the file can hold.
 pub fn read(bytes: &[u8]) -> Result<(Splats, bool), CodecError> {
     let short = || CodecError::new("SPZ file is cut short");
     if bytes.starts_with(&GZIP) {
@@ -116,7 +116,7 @@ pub fn read(bytes: &[u8]) -> Result<(Splats, bool), CodecError> {
         let splats = decode(&header, &mut stream)?;
         return match stream.read(&mut [0]) {
             Ok(0) => Ok((splats, header.antialiased)),
-            Ok(_) => Err(CodecError::new("SPZ file has bytes too many at its end")),
+            Ok(_) => Err(CodecError::new("SPZ file has extra bytes at its end")),
             Err(error) => Err(damaged(&error)),
         };
     }
@@ -130,10 +130,10 @@ pub fn read(bytes: &[u8]) -> Result<(Splats, bool), CodecError> {
     Ok((splats, header.antialiased))
 }
 
-/// Splats as SPZ.
+/// Encodes splats as SPZ.
 ///
 /// # Errors
-/// A splat that is not finite or lies further than 8,388 km from the origin, or four billion splats.
+/// A splat that is not finite or is over 8,388 km from the origin, or over four billion splats.
 pub fn write(splats: &Splats, antialiased: bool, version: Version) -> Result<Vec<u8>, CodecError> {
     if let Some(row) = (0..splats.len()).find(|&i| !splats.is_finite(i)) {
         let all = (row..splats.len()).filter(|&i| !splats.is_finite(i)).count();
@@ -142,7 +142,7 @@ pub fn write(splats: &Splats, antialiased: bool, version: Version) -> Result<Vec
             splats.len()
         )));
     }
-    let count = u32::try_from(splats.len()).map_err(|_| CodecError::new("more splats than SPZ can count"))?;
+    let count = u32::try_from(splats.len()).map_err(|_| CodecError::new("more splats than SPZ supports"))?;
     let farthest = splats.columns()[..3].iter().flatten().fold(0.0f64, |far, &v| far.max(f64::from(v).abs()));
     let fits = |bits: &u8| (farthest * f64::from(1u32 << bits)).round() < f64::from(1 << 23);
     let fractional_bits = (0..=FRACTIONAL_BITS).rev().find(fits);
@@ -183,7 +183,7 @@ fn encode(splats: &Splats, header: &[u8], fractional_bits: u8, rotation: Rotatio
     }
     for i in rows {
         for k in 1..sh_coefficients(splats.sh_degree()) {
-            to.write_all(&[0, 1, 2].map(|c| quantise::sh(flipped_sh(k) * col(column::SH + 3 * k + c)[i], k)))?;
+            to.write_all(&[0, 1, 2].map(|c| quantise::sh(sh_sign(k) * col(column::SH + 3 * k + c)[i], k)))?;
         }
     }
     to.into_inner().map_err(io::IntoInnerError::into_error)?.finish()
@@ -194,7 +194,7 @@ fn decode(header: &Header, from: &mut impl Read) -> Result<Splats, CodecError> {
     let mut splats = Splats::new(header.sh_degree.min(3));
     let columns = splats.columns_mut();
     columns.iter_mut().for_each(|column| column.reserve_exact(count));
-    let [positions, opacities, colours, scales, rotations, sh] = header.planes();
+    let [positions, opacities, colours, scales, rotations, sh] = header.plane_sizes();
     rows(from, count, positions, |row| {
         for axis in 0..3 {
             let value =
@@ -216,13 +216,13 @@ fn decode(header: &Header, from: &mut impl Read) -> Result<Splats, CodecError> {
     })?;
     rows(from, count, sh, |row| {
         for (place, column) in columns[column::SH + 3..].iter_mut().enumerate() {
-            column.push(flipped_sh(place / 3 + 1) * quantise::from_sh(row[place]));
+            column.push(sh_sign(place / 3 + 1) * quantise::from_sh(row[place]));
         }
     })?;
     Ok(splats)
 }
 
-/// Calls `each` with every row of a plane.
+/// Calls `each` with every row of a plane of `size` bytes per row.
 fn rows(from: &mut impl Read, count: usize, size: usize, mut each: impl FnMut(&[u8])) -> Result<(), CodecError> {
     const AT_ONCE: usize = 512;
     if size == 0 {
@@ -246,18 +246,18 @@ fn damaged(error: &io::Error) -> CodecError {
     }
 }
 
-/// The zstd streams of version 4, one after the other: together they read like version 3.
+/// The zstd streams of version 4, concatenated to the byte order of version 3.
 struct Streams<'a> {
-    /// Compressed bytes and length of those to come, last first.
+    /// Compressed bytes and decoded length of the remaining streams, last first.
     rest: Vec<(&'a [u8], usize)>,
-    now: Option<(zstd::stream::read::Decoder<'static, &'a [u8]>, usize)>,
+    current: Option<(zstd::stream::read::Decoder<'static, &'a [u8]>, usize)>,
 }
 
 impl<'a> Streams<'a> {
-    /// From the table of contents behind the 32 bytes of the header and the extensions, which are left out.
+    /// Reads the table of contents after the 32-byte header and the extensions, which are skipped.
     fn new(bytes: &'a [u8], header: &Header) -> Result<Self, CodecError> {
-        let wrong = || CodecError::new("SPZ file's table of contents does not fit it");
-        let expected: Vec<usize> = header.planes().into_iter().filter(|&size| size > 0).collect();
+        let wrong = || CodecError::new("SPZ file's table of contents does not match the file");
+        let expected: Vec<usize> = header.plane_sizes().into_iter().filter(|&size| size > 0).collect();
         let (streams, at) = (*bytes.get(15).ok_or_else(wrong)?, bytes.get(16..20).ok_or_else(wrong)?);
         let at = u32::from_le_bytes(at.try_into().expect("four bytes")) as usize;
         if usize::from(streams) != expected.len() || at < 32 {
@@ -277,15 +277,15 @@ impl<'a> Streams<'a> {
             body = others;
         }
         rest.reverse();
-        Ok(Self { rest, now: None })
+        Ok(Self { rest, current: None })
     }
 }
 
 impl Read for Streams<'_> {
     fn read(&mut self, to: &mut [u8]) -> io::Result<usize> {
         loop {
-            match &mut self.now {
-                Some((_, 0)) => self.now = None,
+            match &mut self.current {
+                Some((_, 0)) => self.current = None,
                 Some((decoder, left)) => {
                     let some = to.len().min(*left);
                     let read = decoder.read(&mut to[..some])?;
@@ -298,10 +298,10 @@ impl Read for Streams<'_> {
                 None => {
                     let Some((stream, length)) = self.rest.pop() else { return Ok(0) };
                     let mut decoder = zstd::stream::read::Decoder::with_buffer(stream)?;
-                    // What a frame holds was checked; a window may be larger than that only up to 8 MiB, as the format
-                    // (RFC 8878, 3.1.1.1.2) asks decoders to accept.
+                    // The frame's content size was checked. Limit the window to it, but to no less than the 8 MiB that decoders
+                    // should accept (RFC 8878, 3.1.1.1.2).
                     decoder.window_log_max(length.max(8 << 20).next_power_of_two().ilog2().min(31))?;
-                    self.now = Some((decoder, length));
+                    self.current = Some((decoder, length));
                 }
             }
         }

@@ -1,9 +1,9 @@
-//! `transforms.json` of nerfstudio and instant-ngp: posed images of perspective and fisheye cameras.
+//! Reads and writes the `transforms.json` of nerfstudio and instant-ngp: posed images of perspective and fisheye cameras.
 //!
-//! A frame's `transform_matrix` is world_from_camera in OpenGL axes (x right, y up, z backward); ours is OpenCV
-//! camera_from_world. `applied_transform` needs nothing: nerfstudio has applied it to the frames and to the points of
-//! `ply_file_path` alike, so they agree. Intrinsics stand at the top, in a frame, or both (the frame's win).
-//! File paths are passed on as they stand: whoever opens them confines them.
+//! A frame's `transform_matrix` is world_from_camera in OpenGL axes (x right, y up, z backward); plat uses OpenCV
+//! camera_from_world. `applied_transform` is ignored: nerfstudio has applied it to both the frames and the points of
+//! `ply_file_path`. Intrinsics are at the top level, in a frame, or both (the frame's take precedence).
+//! File paths are not checked here: the caller that opens them confines them to the capture.
 //!
 //! Sources: nerfstudio, "Data conventions"; instant-ngp, `nerf_loader`.
 
@@ -15,13 +15,13 @@ use serde::{Deserialize, Serialize};
 use crate::camera::{CameraModel, Rigid};
 use crate::error::CodecError;
 
-/// How far from zero the cosine between two columns of a rotation may be.
-const ORTHOGONAL_WITHIN: f64 = 1e-3;
+/// Largest cosine between two columns of a rotation.
+const MAX_COSINE: f64 = 1e-3;
 
 /// A `transforms.json`.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Transforms {
-    /// At least one, in the file's order.
+    /// Frames in the file's order; at least one.
     pub frames: Vec<Frame>,
     /// A point cloud in the same world as the frames.
     pub ply_file_path: Option<String>,
@@ -30,28 +30,28 @@ pub struct Transforms {
 /// One posed image.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Frame {
-    /// The image, as the file says: relative to the file's folder, at times without an extension.
+    /// Path of the image as in the file: relative to the file's folder, sometimes without extension.
     pub file_path: String,
-    /// A mask, as the file says.
+    /// Path of the mask as in the file.
     pub mask_path: Option<String>,
-    /// What is known of the lens.
+    /// Intrinsics as far as the file has them.
     pub intrinsics: Intrinsics,
     /// Pose: OpenCV camera axes from world axes.
     pub camera_from_world: Rigid,
 }
 
-/// The intrinsics of a frame as far as the file says them; [`Intrinsics::model`] fills in the rest from the image.
+/// Intrinsics of a frame as far as the file has them. [`Intrinsics::model`] completes them from the image's size.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Intrinsics {
-    /// Width and height in pixels, where the file has them. All pixels below are pixels of an image of this size.
+    /// Width and height in pixels, if the file has them. All values in pixels refer to an image of this size.
     pub size: Option<(u32, u32)>,
-    /// Horizontal and vertical focal length; at least one is there, and pixels are square where the other is not.
+    /// Horizontal and vertical focal length. At least one is given; pixels are square if the other is missing.
     pub focal: [Option<Focal>; 2],
-    /// Principal point in pixels; absent coordinates are the image's middle.
+    /// Principal point in pixels; missing coordinates are the image's centre.
     pub centre: [Option<f64>; 2],
-    /// As [`CameraModel::distortion`] has it.
+    /// Coefficients in the order of [`CameraModel::distortion`].
     pub distortion: [f64; 8],
-    /// [`CameraModel::OpenCvFisheye`], not a perspective lens.
+    /// True for [`CameraModel::OpenCvFisheye`], false for perspective lenses.
     pub fisheye: bool,
 }
 
@@ -86,11 +86,11 @@ impl Intrinsics {
         }
     }
 
-    /// The camera model for the image of this width and height in pixels, which should be [`Intrinsics::size`] where
-    /// that is there: nothing is scaled here.
+    /// The camera model for an image of this width and height in pixels, which should equal [`Intrinsics::size`] if that is given:
+    /// nothing is scaled.
     pub fn model(&self, width: u32, height: u32) -> CameraModel {
         let [fx, fy] = [self.focal[0].map(|f| f.pixels(width)), self.focal[1].map(|f| f.pixels(height))];
-        // Neither: read refuses that, a caller who builds one by hand gets a focal length that is no number.
+        // `read` refuses files without any focal length; intrinsics built by hand get NaN.
         let (fx, fy) = (fx.or(fy).unwrap_or(f64::NAN), fy.or(fx).unwrap_or(f64::NAN));
         let cx = self.centre[0].unwrap_or(0.5 * f64::from(width));
         let cy = self.centre[1].unwrap_or(0.5 * f64::from(height));
@@ -105,11 +105,11 @@ impl Intrinsics {
     }
 }
 
-/// Frames and their intrinsics.
+/// Decodes a `transforms.json`.
 ///
 /// # Errors
-/// Malformed JSON, no frames, a lens model that plat does not know, intrinsics without a focal length or out of
-/// range, or a `transform_matrix` whose 3×3 part is not a rotation times a scale (which is dropped).
+/// Malformed JSON, no frames, an unsupported lens model, intrinsics without a focal length or out of range, or a `transform_matrix` whose
+/// 3×3 part is not a rotation times a scale. The scale is dropped.
 pub fn read(bytes: &[u8]) -> Result<Transforms, CodecError> {
     let file: File = serde_json::from_slice(bytes).map_err(|e| CodecError::new(format!("transforms.json: {e}")))?;
     if file.frames.is_empty() {
@@ -122,15 +122,15 @@ pub fn read(bytes: &[u8]) -> Result<Transforms, CodecError> {
             let name: String = frame.file_path.chars().take(120).collect();
             CodecError::new(format!("frame {name:?}: {problem}"))
         };
-        let intrinsics = frame.lens().over(&shared).resolve().map_err(named)?;
+        let intrinsics = frame.lens().or(&shared).resolve().map_err(named)?;
         let camera_from_world = pose(&frame.transform_matrix).map_err(named)?;
         frames.push(Frame { file_path: frame.file_path, mask_path: frame.mask_path, intrinsics, camera_from_world });
     }
     Ok(Transforms { frames, ply_file_path: file.ply_file_path })
 }
 
-/// The file, with all intrinsics in the frames; numbers that are not finite become `null`, which [`read`] refuses or
-/// takes for absent.
+/// Encodes a `transforms.json` with all intrinsics in the frames. Numbers that are not finite become `null`, which [`read`] refuses or
+/// treats as missing.
 pub fn write(transforms: &Transforms) -> Vec<u8> {
     let frames = transforms.frames.iter().map(|frame| {
         let (file_path, mask_path) = (frame.file_path.clone(), frame.mask_path.clone());
@@ -140,7 +140,7 @@ pub fn write(transforms: &Transforms) -> Vec<u8> {
     serde_json::to_vec_pretty(&file).expect("text and numbers always serialise")
 }
 
-/// OpenCV camera_from_world of the rows of an OpenGL world_from_camera.
+/// OpenCV camera_from_world from the rows of an OpenGL world_from_camera.
 fn pose(rows: &[[f64; 4]]) -> Result<Rigid, String> {
     let (rows, last) = match rows {
         [a, b, c] => ([a, b, c], &[0.0, 0.0, 0.0, 1.0]),
@@ -152,10 +152,10 @@ fn pose(rows: &[[f64; 4]]) -> Result<Rigid, String> {
     }
     let column = |k: usize| DVec3::new(rows[0][k], rows[1][k], rows[2][k]);
     let [Some(x), Some(y), Some(z)] = [column(0), column(1), column(2)].map(DVec3::try_normalize) else {
-        return Err("transform_matrix has an axis without length".into());
+        return Err("transform_matrix has an axis of length zero".into());
     };
     let cosine = x.dot(y).abs().max(y.dot(z).abs()).max(z.dot(x).abs());
-    if cosine > ORTHOGONAL_WITHIN || x.cross(y).dot(z) < 0.0 {
+    if cosine > MAX_COSINE || x.cross(y).dot(z) < 0.0 {
         return Err("transform_matrix is not a rotation: its axes are not orthogonal or not right-handed".into());
     }
     let rotation = DQuat::from_mat3(&DMat3::from_cols(x, -y, -z)).normalize();
@@ -166,7 +166,7 @@ fn pose(rows: &[[f64; 4]]) -> Result<Rigid, String> {
     Ok(camera_from_world)
 }
 
-/// The rows of the OpenGL world_from_camera of an OpenCV camera_from_world.
+/// Rows of the OpenGL world_from_camera, from an OpenCV camera_from_world.
 fn matrix(camera_from_world: &Rigid) -> Vec<[f64; 4]> {
     let world_from_camera = camera_from_world.inverse();
     let axes = DMat3::from_quat(world_from_camera.rotation);
@@ -176,8 +176,8 @@ fn matrix(camera_from_world: &Rigid) -> Vec<[f64; 4]> {
     rows
 }
 
-/// The keys of the file and of its frames, each with those of [`Lens`] among its own. Not by `serde(flatten)`: that keeps
-/// every value that nobody asked for, at many times its length in the file.
+/// Defines the JSON objects of the file and of its frames, which share the keys of [`Lens`]. `serde(flatten)` would buffer every unknown
+/// value, at many times its size in the file.
 macro_rules! lens {
     ($($field:ident: $type:ty),* $(,)?) => {
         /// The file as JSON.
@@ -225,10 +225,10 @@ macro_rules! lens {
         }
 
         impl Lens {
-            /// This where it says something, else `shared`.
-            fn over(&self, shared: &Self) -> Self {
+            /// These keys, completed from `shared`.
+            fn or(&self, shared: &Self) -> Self {
                 let mut both = Self { $($field: self.$field.clone().or_else(|| shared.$field.clone()),)* };
-                // Either of the two says the focal length, so a frame's angle beats the file's length.
+                // A frame's angle takes precedence over the file's focal length, as either determines it.
                 if self.fl_x.is_none() && self.camera_angle_x.is_some() {
                     both.fl_x = None;
                 }
@@ -288,11 +288,11 @@ impl Lens {
         const PERSPECTIVE: [&str; 6] =
             ["PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"];
         let model = self.camera_model.as_deref().unwrap_or("OPENCV");
-        // instant-ngp says it beside a model of its own.
+        // instant-ngp has a flag instead of a model name.
         let fisheye = self.is_fisheye == Some(true) || model == "OPENCV_FISHEYE";
         if !fisheye && !PERSPECTIVE.contains(&model) {
             let model: String = model.chars().take(40).collect();
-            return Err(format!("camera model {model:?} is not known; undistort the images first"));
+            return Err(format!("camera model {model:?} is not supported; undistort the images first"));
         }
         let side = |key: &str, value: Option<f64>| match value {
             Some(v) if !(v >= 1.0 && v <= f64::from(u32::MAX) && v.fract() == 0.0) => {
@@ -314,13 +314,13 @@ impl Lens {
         }
         let mut distortion =
             [self.k1, self.k2, self.p1, self.p2, self.k3, self.k4, self.k5, self.k6].map(Option::unwrap_or_default);
-        // In nerfstudio k4 is the factor of r⁸, in OpenCV it stands below the line: without a name nobody can say.
+        // k4 is the coefficient of r⁸ in nerfstudio and of the denominator in OpenCV. Without a model name it is ambiguous.
         if fisheye {
             let [k1, k2, _, _, k3, k4, ..] = distortion;
             distortion = [k1, k2, k3, k4, 0.0, 0.0, 0.0, 0.0];
         } else if model != "FULL_OPENCV" && distortion[5..].iter().any(|&k| k != 0.0) {
             return Err(
-                "'k4' and above are clear only with camera_model FULL_OPENCV; undistort the images first".into()
+                "'k4' and above are supported only with camera_model FULL_OPENCV; undistort the images first".into()
             );
         }
         let centre = [self.cx, self.cy];

@@ -234,9 +234,9 @@ mod tests {
         assert_eq!(psnr(&a, &b, Some(&[0; 4])), None);
     }
 
-    /// Noise of this amplitude, uniform, mean zero.
+    /// Uniform noise in `±amplitude`.
     fn noise(i: usize, amplitude: f32) -> f32 {
-        amplitude * (((i * 2_654_435_761) % 1009) as f32 / 504.5 - 1.0)
+        amplitude * (2.0 * crate::random::uniform(13, i as u64) - 1.0)
     }
 
     /// The same plane three times.
@@ -254,7 +254,8 @@ mod tests {
             let plain = psnr(&render, &photo, None).unwrap();
             let corrected = colour_corrected_psnr(&render, &photo, None).unwrap();
             assert!((25.0..28.0).contains(&plain), "{plain}");
-            assert!(corrected >= plain && corrected < plain + 6.0, "{plain} {corrected}");
+            // The fit may average the noise of the three channels, which gains 10 log10(3) = 4.8 dB.
+            assert!(corrected >= plain && corrected < plain + 5.5, "{plain} {corrected}");
         }
     }
 
@@ -306,7 +307,7 @@ mod tests {
         let clamped: Vec<f32> = render.iter().map(|v| v.clamp(0.0, 1.0)).collect();
         let corrected = colour_corrected_psnr(&render, &photo, None).unwrap();
         assert!(corrected >= psnr(&clamped, &photo, None).unwrap(), "{corrected}");
-        // Values that are not finite spoil the fit, not the other pixels' figure.
+        // Masked pixels may be NaN.
         let mut mask = vec![255; 40 * 30];
         mask[7] = 0;
         let mut broken = picture(40, 30, 0.0);

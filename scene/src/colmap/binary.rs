@@ -1,17 +1,17 @@
-//! The binary files: little endian, a count and then the things.
+//! COLMAP's binary files: little endian, a count followed by the entries.
 
 use std::collections::BTreeMap;
 
 use glam::{DVec2, DVec3};
 
-use super::{ColmapCamera, ColmapImage, ColmapPoints, MODELS, Reconstruction};
+use super::model::{self, ColmapCamera, ColmapImage, ColmapPoints, MODELS, Reconstruction};
 use crate::camera::CameraModel;
 use crate::error::CodecError;
 
 /// Reads `cameras.bin`.
 ///
 /// # Errors
-/// Cut short or padded, a lens model that plat does not know, or numbers that no camera has.
+/// Truncated or padded files, unsupported lens models, parameters out of range.
 pub fn read_cameras_bin(bytes: &[u8]) -> Result<BTreeMap<u32, ColmapCamera>, CodecError> {
     let mut from = Reader(bytes);
     let mut cameras = BTreeMap::new();
@@ -19,9 +19,9 @@ pub fn read_cameras_bin(bytes: &[u8]) -> Result<BTreeMap<u32, ColmapCamera>, Cod
         let (id, model, width, height) = (from.u32()?, from.u32()?, from.u64()?, from.u64()?);
         let unknown = format!("number {model}");
         let name = MODELS.get(model as usize).copied().unwrap_or(&unknown);
-        let parameters = (0..super::parameter_count(name, id)?).map(|_| from.f64());
+        let parameters = (0..model::parameter_count(name, id)?).map(|_| from.f64());
         let parameters = parameters.collect::<Result<Vec<_>, _>>()?;
-        super::insert(&mut cameras, id, super::camera(id, name, width, height, &parameters)?)?;
+        model::insert_camera(&mut cameras, id, model::camera(id, name, width, height, &parameters)?)?;
     }
     from.end(cameras)
 }
@@ -29,12 +29,12 @@ pub fn read_cameras_bin(bytes: &[u8]) -> Result<BTreeMap<u32, ColmapCamera>, Cod
 /// Reads `images.bin`.
 ///
 /// # Errors
-/// Cut short or padded, or an image without a name or a finite pose.
+/// Truncated or padded files, images without a name or a finite pose.
 pub fn read_images_bin(bytes: &[u8]) -> Result<Vec<ColmapImage>, CodecError> {
     images(bytes, |_, _| ())
 }
 
-/// Reads where `images.bin` says that points were seen: by image id, pixels of the distorted image and ids of points.
+/// Reads the 2D observations of `images.bin`: by image id, pixel in the distorted image and point id.
 ///
 /// # Errors
 /// As [`read_images_bin`].
@@ -46,14 +46,14 @@ pub fn read_keypoints_bin(bytes: &[u8]) -> Result<BTreeMap<u32, Vec<(DVec2, u64)
             let [x, y, point] = [0, 8, 16].map(|at| bytes[at..at + 8].try_into().expect("eight bytes"));
             (DVec2::new(f64::from_le_bytes(x), f64::from_le_bytes(y)), u64::from_le_bytes(point))
         };
-        // A feature that belongs to no point has the highest id.
-        let seen = observations.iter().map(keypoint).filter(|&(_, point)| point != u64::MAX).collect();
-        keypoints.insert(image, seen);
+        // Features without a point have the highest id.
+        let observed = observations.iter().map(keypoint).filter(|&(_, point)| point != u64::MAX).collect();
+        keypoints.insert(image, observed);
     })?;
     Ok(keypoints)
 }
 
-/// Reads images; `observed` gets the id and the observations, of 24 bytes each, of every one.
+/// Reads images and passes each id with its observations (24 bytes each) to `observed`.
 fn images<'a>(bytes: &'a [u8], mut observed: impl FnMut(u32, &'a [u8])) -> Result<Vec<ColmapImage>, CodecError> {
     let mut from = Reader(bytes);
     let mut images = Vec::new();
@@ -65,17 +65,17 @@ fn images<'a>(bytes: &'a [u8], mut observed: impl FnMut(u32, &'a [u8])) -> Resul
         }
         let camera_id = from.u32()?;
         let name = from.text()?;
-        images.push(super::image(id, pose, camera_id, name)?);
+        images.push(model::image(id, pose, camera_id, name)?);
         let observations = from.count(24)?;
         observed(id, from.take(24 * observations)?);
     }
-    super::each_once(from.end(images)?)
+    model::check_unique_ids(from.end(images)?)
 }
 
 /// Reads `points3D.bin`.
 ///
 /// # Errors
-/// Cut short or padded, or a position that is not finite.
+/// Truncated or padded files, positions that are not finite.
 pub fn read_points_bin(bytes: &[u8]) -> Result<ColmapPoints, CodecError> {
     let mut from = Reader(bytes);
     let mut points = ColmapPoints::default();
@@ -91,7 +91,7 @@ pub fn read_points_bin(bytes: &[u8]) -> Result<ColmapPoints, CodecError> {
     from.end(points)
 }
 
-/// `cameras.bin`.
+/// Encodes `cameras.bin`.
 pub fn write_cameras_bin(model: &Reconstruction) -> Vec<u8> {
     let mut to = Writer::counted(model.cameras.len());
     for (&id, camera) in &model.cameras {
@@ -109,7 +109,7 @@ pub fn write_cameras_bin(model: &Reconstruction) -> Vec<u8> {
     to.0
 }
 
-/// `images.bin`: each image observes the points of whose tracks it is part where they project to, in point order.
+/// Encodes `images.bin`. Each image observes the points whose tracks contain it, in point order, at their projections.
 pub fn write_images_bin(model: &Reconstruction) -> Vec<u8> {
     let index: BTreeMap<u32, usize> = model.images.iter().enumerate().map(|(i, image)| (image.id, i)).collect();
     let mut observed: Vec<Vec<usize>> = vec![Vec::new(); model.images.len()];
@@ -126,10 +126,11 @@ pub fn write_images_bin(model: &Reconstruction) -> Vec<u8> {
         to.0.extend(image.name.bytes().filter(|&b| b != 0).chain([0]));
         to.u64(observed.len() as u64);
         for point in observed {
-            let seen = pose.apply(model.points.positions[point]);
+            let point_in_camera = pose.apply(model.points.positions[point]);
             let pixel = model.cameras.get(&image.camera_id).map_or(DVec2::ZERO, |camera| {
                 let [fx, fy, cx, cy] = camera.model.focal_and_centre();
-                camera.model.distort(seen.truncate() / seen.z) * DVec2::new(fx, fy) + DVec2::new(cx, cy)
+                camera.model.distort(point_in_camera.truncate() / point_in_camera.z) * DVec2::new(fx, fy)
+                    + DVec2::new(cx, cy)
             });
             to.f64s(&pixel.to_array()).u64(model.points.ids[point]);
         }
@@ -137,7 +138,7 @@ pub fn write_images_bin(model: &Reconstruction) -> Vec<u8> {
     to.0
 }
 
-/// `points3D.bin`, whose tracks point to the observations of [`write_images_bin`].
+/// Encodes `points3D.bin`, with tracks that refer to the observations of [`write_images_bin`].
 pub fn write_points_bin(model: &Reconstruction) -> Vec<u8> {
     let points = &model.points;
     let mut observations: BTreeMap<u32, u32> = BTreeMap::new();
@@ -180,7 +181,7 @@ impl<'a> Reader<'a> {
         self.array().map(f64::from_le_bytes)
     }
 
-    /// A number of things that take at least `size` bytes each and so have to fit the rest.
+    /// A count of entries of at least `size` bytes each, checked against the remaining bytes before anything is allocated.
     fn count(&mut self, size: usize) -> Result<usize, CodecError> {
         let count = self.u64()?;
         match usize::try_from(count) {
@@ -189,7 +190,7 @@ impl<'a> Reader<'a> {
         }
     }
 
-    /// UTF-8 up to a zero byte.
+    /// Zero-terminated UTF-8.
     fn text(&mut self) -> Result<&'a str, CodecError> {
         let length = self.0.iter().position(|&b| b == 0).ok_or_else(|| CodecError::new("is cut short in a name"))?;
         let text = self.take(length + 1)?;
@@ -199,7 +200,7 @@ impl<'a> Reader<'a> {
     fn end<T>(self, value: T) -> Result<T, CodecError> {
         match self.0.len() {
             0 => Ok(value),
-            extra => Err(CodecError::new(format!("has {extra} bytes too many at its end"))),
+            extra => Err(CodecError::new(format!("has {extra} extra bytes at its end"))),
         }
     }
 }

@@ -1,6 +1,10 @@
+use std::collections::BTreeMap;
+
+use glam::{DQuat, DVec3};
 use proptest::prelude::*;
 
 use super::*;
+use crate::camera::{CameraModel, Rigid};
 
 fn model(lens: CameraModel, turn: [f64; 4], at: [f64; 3], tracks: &[Vec<bool>]) -> Reconstruction {
     let pose = Rigid { rotation: DQuat::from_array(turn).normalize(), translation: DVec3::from_array(at) };
@@ -57,7 +61,7 @@ fn near(a: &[ColmapImage], b: &[ColmapImage]) -> bool {
 }
 
 #[test]
-fn text_says_what_binary_says() {
+fn text_and_binary_agree() {
     let model = example();
     let [cameras, images, points] = texts(&model);
     assert_eq!(read_cameras_txt(cameras.as_bytes()), Ok(model.cameras.clone()));
@@ -70,11 +74,11 @@ fn text_says_what_binary_says() {
 }
 
 #[test]
-fn text_that_was_cut_is_noticed() {
+fn truncated_text_is_refused() {
     let [cameras, images, points] = texts(&example());
-    let said = |what: &str, count: usize| format!("# List\n# Number of {what}: {count}, mean of something: 2.5\n");
+    let comment = |what: &str, count: usize| format!("# List\n# Number of {what}: {count}, mean of something: 2.5\n");
     let (cameras, images, points) =
-        (said("cameras", 1) + &cameras, said("images", 3) + &images, said("points", 3) + &points);
+        (comment("cameras", 1) + &cameras, comment("images", 3) + &images, comment("points", 3) + &points);
     let check = |text: &str, is_err: &dyn Fn(&[u8]) -> bool| {
         assert!(!is_err(text.as_bytes()));
         let header = text.find("# Number").unwrap() + 40;
@@ -88,7 +92,7 @@ fn text_that_was_cut_is_noticed() {
 }
 
 #[test]
-fn keypoints_are_those_of_the_tracks() {
+fn keypoints_match_the_tracks() {
     let model = example();
     let keypoints = read_keypoints_bin(&write_images_bin(&model)).unwrap();
     assert_eq!(keypoints.values().map(Vec::len).collect::<Vec<_>>(), [2, 1, 2]);
@@ -96,7 +100,7 @@ fn keypoints_are_those_of_the_tracks() {
 }
 
 #[test]
-fn what_is_cut_or_padded_is_refused() {
+fn truncated_and_padded_files_are_refused() {
     let model = example();
     let (cameras, images, points) = (write_cameras_bin(&model), write_images_bin(&model), write_points_bin(&model));
     let check = |bytes: &[u8], is_err: &dyn Fn(&[u8]) -> bool| {
@@ -108,7 +112,7 @@ fn what_is_cut_or_padded_is_refused() {
             absurd[..8].copy_from_slice(&count.to_le_bytes());
             assert!(is_err(&absurd), "{count}");
         }
-        // No byte makes a reader panic.
+        // Damaged bytes must not panic.
         for at in 0..bytes.len() {
             let mut damaged = bytes.to_vec();
             damaged[at] ^= 0xff;
@@ -126,7 +130,7 @@ fn what_is_cut_or_padded_is_refused() {
 }
 
 #[test]
-fn fisheyes_of_fewer_parameters_are_opencv_s() {
+fn fisheyes_with_fewer_parameters_become_opencv_fisheyes() {
     let lens = |line: &str| read_cameras_txt(line.as_bytes()).unwrap()[&1].model;
     let bent = |k1, k2| CameraModel::OpenCvFisheye([9.0, 9.0, 5.0, 4.0, k1, k2, 0.0, 0.0]);
     assert_eq!(lens("1 SIMPLE_RADIAL_FISHEYE 10 8 9 5 4 0.1"), bent(0.1, 0.0));
@@ -134,7 +138,7 @@ fn fisheyes_of_fewer_parameters_are_opencv_s() {
 }
 
 #[test]
-fn what_is_wrong_is_named() {
+fn errors_name_the_entry() {
     let images = |line: &str| read_images_txt(line.as_bytes()).unwrap_err().to_string();
     assert!(images("3 0 0 0 0 1 2 3 1 a.jpg\n\n").contains("a.jpg"));
     assert!(images("3 1 0 0 0 1 NaN 3 1 b c.jpg\n\n").contains("b c.jpg"));

@@ -1,26 +1,28 @@
-//! The text files: a line for each thing, two for an image; `#` starts a comment. Where COLMAP's comment says how many
-//! things there are, as many have to be there, and the last line has to end: a file that was cut short is noticed.
+//! COLMAP's text files: one line per entry, two per image; `#` starts a comment.
+//!
+//! If COLMAP's comment states the number of entries, the file must have that many and end with a line break. This detects
+//! truncated files.
 
 use std::collections::BTreeMap;
 use std::str::FromStr;
 
 use glam::DVec3;
 
-use super::{ColmapCamera, ColmapImage, ColmapPoints};
+use super::model::{self, ColmapCamera, ColmapImage, ColmapPoints};
 use crate::error::CodecError;
 
 /// Reads `cameras.txt`.
 ///
 /// # Errors
-/// A line that is no camera, a lens model that plat does not know, or numbers that no camera has.
+/// Malformed lines, unsupported lens models, parameters out of range.
 pub fn read_cameras_txt(bytes: &[u8]) -> Result<BTreeMap<u32, ColmapCamera>, CodecError> {
     let mut cameras = BTreeMap::new();
     for (number, line) in lines(bytes)?.filter(|(_, line)| is_content(line)) {
         let mut words = Words { number, words: line.split_ascii_whitespace() };
-        let (id, model) = (words.next()?, words.word()?);
+        let (id, name) = (words.next()?, words.word()?);
         let (width, height) = (words.next()?, words.next()?);
         let parameters = words.rest()?;
-        super::insert(&mut cameras, id, super::camera(id, model, width, height, &parameters)?)?;
+        model::insert_camera(&mut cameras, id, model::camera(id, name, width, height, &parameters)?)?;
     }
     check_count(bytes, "cameras", cameras.len())?;
     Ok(cameras)
@@ -29,7 +31,7 @@ pub fn read_cameras_txt(bytes: &[u8]) -> Result<BTreeMap<u32, ColmapCamera>, Cod
 /// Reads `images.txt`.
 ///
 /// # Errors
-/// A line that is no image, or an image without a name or a finite pose.
+/// Malformed lines, images without a name or a finite pose.
 pub fn read_images_txt(bytes: &[u8]) -> Result<Vec<ColmapImage>, CodecError> {
     let mut images = Vec::new();
     let mut lines = lines(bytes)?;
@@ -44,30 +46,30 @@ pub fn read_images_txt(bytes: &[u8]) -> Result<Vec<ColmapImage>, CodecError> {
             *value = words.next()?;
         }
         let camera_id = words.next()?;
-        // The name is the rest of the line: it may contain spaces.
+        // The name is the rest of the line, as it may contain spaces.
         let mut name = line.trim_start();
         for _ in 0..9 {
             name = name.trim_start_matches(|c: char| !c.is_ascii_whitespace()).trim_start();
         }
-        images.push(super::image(id, pose, camera_id, name.trim_end())?);
-        // Then x, y and point of each observation, often none: the line is there all the same.
+        images.push(model::image(id, pose, camera_id, name.trim_end())?);
+        // The next line has x, y and point id of each observation. It is present even if empty.
         let Some((number, line)) = lines.next() else {
             let problem =
                 format!("is cut short: line {number} is the last, but an image has two (the second may be empty)");
             return Err(CodecError::new(problem));
         };
         if !line.split_ascii_whitespace().count().is_multiple_of(3) {
-            return Err(CodecError::new(format!("line {number} is no list of x, y and point id of observations")));
+            return Err(CodecError::new(format!("line {number} is not a list of observations (x, y, point id)")));
         }
     }
     check_count(bytes, "images", images.len())?;
-    super::each_once(images)
+    model::check_unique_ids(images)
 }
 
 /// Reads `points3D.txt`.
 ///
 /// # Errors
-/// A line that is no point, or a position that is not finite.
+/// Malformed lines, positions that are not finite.
 pub fn read_points_txt(bytes: &[u8]) -> Result<ColmapPoints, CodecError> {
     let mut points = ColmapPoints::default();
     for (number, line) in lines(bytes)?.filter(|(_, line)| is_content(line)) {
@@ -87,24 +89,24 @@ pub fn read_points_txt(bytes: &[u8]) -> Result<ColmapPoints, CodecError> {
     Ok(points)
 }
 
-/// Numbered lines, from 1.
+/// Lines with their numbers, from 1.
 fn lines(bytes: &[u8]) -> Result<impl Iterator<Item = (usize, &str)>, CodecError> {
     let text = std::str::from_utf8(bytes).map_err(|_| CodecError::new("is not UTF-8 text"))?;
     Ok(text.lines().enumerate().map(|(i, line)| (i + 1, line)))
 }
 
-/// Compares with `# Number of images: 50, mean observations per image: 9.5`, if a comment at the start says so.
+/// Compares `count` with a leading comment such as `# Number of images: 50, mean observations per image: 9.5`, if there is one.
 fn check_count(bytes: &[u8], what: &str, count: usize) -> Result<(), CodecError> {
     let comments = lines(bytes)?.take_while(|(_, line)| !is_content(line));
-    let said = comments.filter_map(|(_, line)| {
+    let stated = comments.filter_map(|(_, line)| {
         let rest = line.trim_start_matches(['#', ' ']).strip_prefix("Number of ")?.strip_prefix(what)?;
         rest.strip_prefix(':')?.split(',').next()?.trim().parse::<usize>().ok()
     });
-    match said.last() {
-        Some(said) if said != count => Err(CodecError::new(format!(
-            "is cut short or was changed: its comment says {said} {what}, {count} are there"
+    match stated.last() {
+        Some(stated) if stated != count => Err(CodecError::new(format!(
+            "is cut short or was edited: its comment states {stated} {what}, the file has {count}"
         ))),
-        Some(_) if !bytes.ends_with(b"\n") => Err(CodecError::new("is cut short: its last line does not end")),
+        Some(_) if !bytes.ends_with(b"\n") => Err(CodecError::new("is cut short: its last line has no line break")),
         _ => Ok(()),
     }
 }
@@ -140,7 +142,7 @@ impl<'a> Words<'a> {
     fn parse<T: FromStr>(&self, word: &str) -> Result<T, CodecError> {
         word.parse().map_err(|_| {
             let word: String = word.escape_debug().take(40).collect();
-            CodecError::new(format!("line {}: '{word}' is not a number that belongs there", self.number))
+            CodecError::new(format!("line {}: '{word}' is not a valid number here", self.number))
         })
     }
 }

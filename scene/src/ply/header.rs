@@ -1,11 +1,11 @@
-//! What a PLY header declares, and its elements as columns.
+//! Parses PLY headers and reads elements as columns.
 
 use crate::error::CodecError;
 
-/// Rows that are transposed at a time: few enough for them to stay in the cache, enough for long runs in each column.
+/// Rows transposed at a time: few enough to stay in cache, enough for long runs in each column.
 const ROWS: usize = 256;
-/// More declared elements than any PLY has.
-const ELEMENTS: usize = 64;
+/// Largest number of declared elements.
+const MAX_ELEMENTS: usize = 64;
 
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Encoding {
@@ -52,7 +52,7 @@ impl Kind {
     }
 }
 
-/// A number that columns can be made of.
+/// A scalar type of columns.
 pub(super) trait Number: Copy + std::str::FromStr {
     fn from_f32(value: f32) -> Self;
     fn from_f64(value: f64) -> Self;
@@ -85,25 +85,25 @@ pub(super) struct Property {
     offset: usize,
 }
 
-struct Declared {
+struct ElementDeclaration {
     name: String,
     count: usize,
     properties: Vec<Property>,
     /// Bytes of a binary row.
     stride: usize,
-    /// Without lists: all rows are as long as the others.
+    /// True without list properties: all rows have the same length.
     regular: bool,
 }
 
-/// A header, and the bytes that follow it.
+/// A header and the bytes that follow it.
 pub(super) struct Header<'a> {
     encoding: Encoding,
     pub(super) comments: Vec<String>,
-    elements: Vec<Declared>,
+    elements: Vec<ElementDeclaration>,
     body: &'a [u8],
 }
 
-/// An element whose rows are known to fit the body.
+/// An element whose rows were checked to fit the body.
 pub(super) struct Element<'a> {
     name: &'a str,
     encoding: Encoding,
@@ -111,7 +111,7 @@ pub(super) struct Element<'a> {
     pub(super) count: usize,
     pub(super) properties: &'a [Property],
     stride: usize,
-    /// From the first row on.
+    /// Bytes from the first row on.
     body: &'a [u8],
 }
 
@@ -128,7 +128,7 @@ impl<'a> Header<'a> {
             Some((b"ply", _)) => {}
             _ => return Err(CodecError::new("not a PLY: it does not begin with the line 'ply'")),
         }
-        let (mut encoding, mut comments, mut elements) = (None, Vec::new(), Vec::<Declared>::new());
+        let (mut encoding, mut comments, mut elements) = (None, Vec::new(), Vec::<ElementDeclaration>::new());
         loop {
             let (line, body) = next_line().ok_or_else(|| CodecError::new("the PLY header has no end_header"))?;
             let line = String::from_utf8_lossy(line);
@@ -143,10 +143,10 @@ impl<'a> Header<'a> {
                     comments.push(text.strip_prefix(' ').unwrap_or(text).to_owned());
                 }
                 (None | Some("obj_info"), _, _) => {}
-                (Some("element"), Some(name), Some(number)) if elements.len() < ELEMENTS => {
+                (Some("element"), Some(name), Some(number)) if elements.len() < MAX_ELEMENTS => {
                     let count = number.parse().map_err(|_| bad())?;
                     let name = name.to_owned();
-                    elements.push(Declared { name, count, properties: Vec::new(), stride: 0, regular: true });
+                    elements.push(ElementDeclaration { name, count, properties: Vec::new(), stride: 0, regular: true });
                 }
                 (Some("property"), Some(kind), Some(name)) => {
                     let element = elements.last_mut().ok_or_else(bad)?;
@@ -180,28 +180,28 @@ impl<'a> Header<'a> {
         }
     }
 
-    /// True if this element is declared with this property.
+    /// True if the header declares this element with this property.
     pub(super) fn declares(&self, element: &str, property: &str) -> bool {
         let element = self.elements.iter().find(|e| e.name == element);
         element.is_some_and(|e| e.properties.iter().any(|p| p.name == property))
     }
 
-    /// True if this element is declared.
+    /// True if the header declares this element.
     pub(super) fn has(&self, element: &str) -> bool {
         self.elements.iter().any(|e| e.name == element)
     }
 
-    /// An element of the file by its name. That its rows fit the body is checked here: nothing is allocated for a count
-    /// that lies. In text the elements before it must not be there.
+    /// The element of this name. Checks that its rows fit the body before anything is allocated. In a text PLY only the first element
+    /// can be read.
     pub(super) fn element(&self, name: &str) -> Result<Element<'_>, CodecError> {
         let mut body = self.body;
         for element in &self.elements {
             if !element.regular {
                 return Err(CodecError::new(format!("element '{name}' has a list, or one comes before it")));
             }
-            let Declared { count, properties, stride, .. } = element;
+            let ElementDeclaration { count, properties, stride, .. } = element;
             let needed = match self.encoding {
-                // A number takes a digit and a separator, which the last one may lack.
+                // A number takes at least a digit and a separator, which the last one may lack.
                 Encoding::Ascii => count.checked_mul(2 * properties.len()).map(|n| n.saturating_sub(1)),
                 Encoding::Little | Encoding::Big => count.checked_mul(*stride),
             };
@@ -224,13 +224,13 @@ impl<'a> Header<'a> {
 }
 
 impl Element<'_> {
-    /// The place of a property.
+    /// Index of a property.
     pub(super) fn find(&self, name: &str) -> Result<usize, CodecError> {
         (self.properties.iter().position(|p| p.name == name))
             .ok_or_else(|| CodecError::new(format!("the {} element has no property '{name}'", self.name)))
     }
 
-    /// These properties as columns.
+    /// Reads these properties as columns.
     pub(super) fn columns<T: Number>(&self, wanted: &[usize]) -> Result<Vec<Vec<T>>, CodecError> {
         let mut columns: Vec<Vec<T>> = wanted.iter().map(|_| Vec::with_capacity(self.count)).collect();
         match self.encoding {
@@ -249,7 +249,7 @@ impl Element<'_> {
 
     fn binary<T: Number>(&self, property: &Property, rows: &[u8], column: &mut Vec<T>) {
         let values = rows.chunks_exact(self.stride).map(|row| &row[property.offset..]);
-        // One loop for each type and order of bytes: nothing is decided inside.
+        // One loop per type and byte order, so that the loops have no branches.
         macro_rules! extend {
             ($type:ty, $into:expr) => {{
                 let bytes = |row: &[u8]| *row.first_chunk().expect("a row is as long as its properties");

@@ -1,9 +1,9 @@
-//! PlayCanvas' `.compressed.ply`: 16 bytes a splat and their range for every 256 of them.
+//! Reads PlayCanvas' `.compressed.ply`: 16 bytes per splat, quantised to the value range of each chunk of 256 splats.
 //!
-//! Element `chunk` holds min and max of positions, log scales and (in newer files) colours; element `vertex` four words:
-//! position and log scale of 11, 10 and 11 bits between min and max, the rotation's three smaller components of 10 bits
-//! after two bits that name the largest (in the order w, x, y, z), colour and opacity of 8 bits each. Element `sh` has
-//! the higher coefficients as bytes over -4 to 4, channel-major as INRIA's.
+//! Element `chunk` holds min and max of positions, log scales and (in newer files) colours. Element `vertex` holds four words:
+//! position and log scale with 11, 10 and 11 bits between min and max; the rotation as two bits for the index of the largest component
+//! (in the order w, x, y, z) and 10 bits for each of the others; colour and opacity with 8 bits each. Element `sh` holds
+//! the coefficients of higher degrees as bytes over -4 to 4, channel-major like INRIA's.
 //!
 //! Source: PlayCanvas' `splat-transform` (`write-compressed-ply`) and engine (`gsplat-compressed-data`).
 
@@ -11,11 +11,11 @@ use super::header::{Header, Kind};
 use crate::error::CodecError;
 use crate::splats::{SH_C0, Splats, column, sh_coefficients};
 
-/// Splats that share a chunk.
+/// Splats per chunk.
 const CHUNK: usize = 256;
 const WORDS: [&str; 4] = ["packed_position", "packed_scale", "packed_rotation", "packed_color"];
 
-/// True where vertices are packed.
+/// True if the vertices are packed.
 pub(super) fn is_packed(header: &Header) -> bool {
     header.has("chunk") && header.declares("vertex", WORDS[0])
 }
@@ -29,7 +29,7 @@ pub(super) fn read(header: &Header) -> Result<Splats, CodecError> {
         wanted.push(word?);
     }
     if wanted.iter().any(|&p| vertices.properties[p].kind != Kind::U32) {
-        return Err(CodecError::new("packed splats that are not of 32 bits"));
+        return Err(CodecError::new("packed splats are not words of 32 bits"));
     }
     if chunks.count != vertices.count.div_ceil(CHUNK) {
         let (chunks, count) = (chunks.count, vertices.count);
@@ -44,7 +44,7 @@ pub(super) fn read(header: &Header) -> Result<Splats, CodecError> {
         what.iter().map(range).collect()
     };
     let (positions, scales) = (ranges(&["x", "y", "z"])?, ranges(&["scale_x", "scale_y", "scale_z"])?);
-    // Files of the first version have no range of colours: it is 0 to 1.
+    // Files of the first version have no colour range: it is 0 to 1.
     let colours = if header.declares("chunk", "min_r") { ranges(&["r", "g", "b"])? } else { Vec::new() };
     let all = positions.iter().chain(&scales).chain(&colours).flatten().flatten();
     if all.into_iter().any(|v| !v.is_finite()) {
@@ -79,14 +79,14 @@ pub(super) fn read(header: &Header) -> Result<Splats, CodecError> {
     Splats::from_columns(columns).ok_or_else(|| CodecError::new("columns of unequal length"))
 }
 
-/// SH degree and the columns of the coefficients above zero.
+/// SH degree and the columns of the coefficients of degree 1 and above.
 fn higher(header: &Header, count: usize) -> Result<(u8, Vec<Vec<f32>>), CodecError> {
     if !header.has("sh") {
         return Ok((0, Vec::new()));
     }
     let sh = header.element("sh")?;
     if sh.count != count || sh.properties.iter().any(|p| p.kind != Kind::U8) {
-        return Err(CodecError::new("element 'sh' is not of bytes, or has not as many rows as there are splats"));
+        return Err(CodecError::new("element 'sh' is not bytes, or its number of rows is not that of the splats"));
     }
     let number = sh.properties.len();
     let sh_degree = (1..=3).find(|&d| 3 * (sh_coefficients(d) - 1) == number);
@@ -95,7 +95,7 @@ fn higher(header: &Header, count: usize) -> Result<(u8, Vec<Vec<f32>>), CodecErr
     let names = (0..coefficients).flat_map(|k| (0..3).map(move |c| format!("f_rest_{}", c * coefficients + k)));
     let wanted = names.map(|name| sh.find(&name)).collect::<Result<Vec<_>, _>>()?;
     let mut columns = sh.columns::<f32>(&wanted)?;
-    // The outermost bytes stand for the ends of the range, the others for the middle of their step.
+    // The outermost bytes stand for the ends of the range, the others for the middle of their interval.
     let value = |byte: f32| match byte {
         0.0 => -4.0,
         255.0 => 4.0,
@@ -105,13 +105,13 @@ fn higher(header: &Header, count: usize) -> Result<(u8, Vec<Vec<f32>>), CodecErr
     Ok((sh_degree, columns))
 }
 
-/// The lowest bits of a word over 0 to 1.
+/// The lowest `bits` bits of a word, scaled to 0..1.
 fn unit(word: u32, bits: u32) -> f32 {
     let mask = (1u32 << bits) - 1;
     (word & mask) as f32 / mask as f32
 }
 
-/// wxyz.
+/// Unpacks a rotation, wxyz.
 fn unpack_rotation(word: u32) -> [f32; 4] {
     let largest = (word >> 30) as usize;
     let mut others = [20, 10, 0].into_iter().map(|shift| (unit(word >> shift, 10) - 0.5) * std::f32::consts::SQRT_2);
@@ -121,8 +121,8 @@ fn unpack_rotation(word: u32) -> [f32; 4] {
     quat
 }
 
-/// The logit of an opacity of `byte / 255`; the outermost bytes stand for opacities a quarter of a step inside, so that
-/// none is infinite and all come back as the same byte.
+/// The logit of an opacity of `byte / 255`. The outermost bytes are moved inwards by a quarter of a step, so that every logit is finite and
+/// is quantised to the same byte again.
 pub(crate) fn logit_of_byte(byte: u8) -> f32 {
     let opacity = f32::from(byte).clamp(0.25, 254.75) / 255.0;
     (opacity / (1.0 - opacity)).ln()
@@ -157,10 +157,10 @@ mod tests {
     }
 
     #[test]
-    fn words_unpack_to_what_they_say() {
+    fn words_unpack_to_their_values() {
         let position = (2047 << 21) | 2047;
         let scale = 1023 << 11;
-        // Largest is y (2): w and z are 0.7071·(2·600/1023 - 1), x the other way.
+        // Largest is y (2): w and z are 0.7071·(2·600/1023 - 1), x is the negative.
         let rotation = (2u32 << 30) | (600 << 20) | (423 << 10) | 600;
         let colour = (255 << 24) | (255 << 8) | 51;
         let sh: Vec<u8> = (0..9).map(|k| [0, 128, 255][k / 3]).collect();
@@ -182,7 +182,7 @@ mod tests {
     }
 
     #[test]
-    fn what_does_not_fit_is_refused() {
+    fn inconsistent_files_are_refused() {
         let good = file(300, [7; 4], &[1; 9]);
         assert!(super::super::read(&good).is_ok());
         for end in (0..good.len()).step_by(13) {
@@ -208,7 +208,7 @@ mod tests {
     }
 
     #[test]
-    fn the_guitar_is_one_solid_thing() {
+    fn guitar_has_consistent_normals() {
         let shared =
             std::env::var("PLAT_SHARED").unwrap_or(concat!(env!("CARGO_MANIFEST_DIR"), "/../../shared").into());
         let path = std::path::Path::new(&shared).join("data/splats/playcanvas/guitar.compressed.ply");
@@ -219,7 +219,7 @@ mod tests {
         let splats = super::super::read(&bytes).unwrap();
         assert_eq!((splats.len(), splats.sh_degree()), (90_854, 0));
         assert!((0..splats.len()).all(|i| splats.is_finite(i)));
-        // Splats lie flat on the body and neighbours in the file are neighbours on it, so their shortest axes agree.
+        // Splats are flat on the surface and neighbours in the file are neighbours on it, so their shortest axes agree.
         let agreement = |order: [usize; 4]| {
             let normal = |i: usize| {
                 let splat = splats.get(i);

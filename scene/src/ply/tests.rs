@@ -36,7 +36,7 @@ proptest! {
 }
 
 #[test]
-fn many_rows_cross_the_blocks() {
+fn rows_beyond_one_block_round_trip() {
     let seed: Vec<u32> = (0..59 * 300).map(|i: u32| i.wrapping_mul(2_654_435_761)).collect();
     let splats = splats(3, &seed);
     assert_eq!(bits(&read(&write(&splats, &[])).unwrap()), bits(&splats));
@@ -50,7 +50,7 @@ fn nan_payloads_survive() {
 }
 
 #[test]
-fn the_higher_coefficients_are_channel_major() {
+fn higher_sh_coefficients_are_channel_major() {
     let seed: Vec<u32> = (0..23).map(|k| (k as f32).to_bits()).collect();
     let bytes = write(&splats(1, &seed), &[]);
     let body: Vec<f32> = bytes[bytes.len() - 4 * 26..].as_chunks().0.iter().map(|b| f32::from_le_bytes(*b)).collect();
@@ -68,8 +68,8 @@ fn the_higher_coefficients_are_channel_major() {
     assert_eq!(body, expected.iter().map(|&k| k as f32).collect::<Vec<_>>());
 }
 
-/// A file of SH degree 0 in another order, with foreign properties, doubles and bytes, in each encoding.
-fn foreign(encoding: &str, newline: &str) -> Vec<u8> {
+/// A file of SH degree 0 with another property order, additional properties and mixed scalar types.
+fn unusual_file(encoding: &str, newline: &str) -> Vec<u8> {
     let properties = [
         ("uchar", "red"),
         ("double", "x"),
@@ -123,7 +123,7 @@ fn foreign(encoding: &str, newline: &str) -> Vec<u8> {
 fn any_order_type_and_encoding_is_read() {
     for encoding in ["ascii", "binary_little_endian", "binary_big_endian"] {
         for newline in ["\n", "\r\n"] {
-            let bytes = foreign(encoding, newline);
+            let bytes = unusual_file(encoding, newline);
             let splats = read(&bytes).unwrap();
             let row: Vec<f32> = splats.columns().iter().map(|c| c[1] - 100.0).collect();
             assert_eq!(row, [1, 10, 11, 12, 13, 14, 3, 4, 5, 2, 9, 8, 7, 6].map(|k| k as f32), "{encoding}");
@@ -154,7 +154,7 @@ fn points_without_colours_are_grey_and_must_be_finite() {
 }
 
 #[test]
-fn absurd_headers_are_refused_before_anything_is_allocated() {
+fn impossible_headers_are_refused_before_allocation() {
     let names: String = column_names(0).iter().map(|name| format!("property float {name}\n")).collect();
     for count in ["18446744073709551615", "4611686018427387904", "1000000000000", "-1", "1e3", "99999999999999999999"] {
         for encoding in ["ascii", "binary_little_endian"] {
@@ -182,7 +182,7 @@ fn absurd_headers_are_refused_before_anything_is_allocated() {
 }
 
 #[test]
-fn a_real_file_of_inria_passes_unchanged() {
+fn inria_file_round_trips() {
     let shared = std::env::var("PLAT_SHARED").unwrap_or(concat!(env!("CARGO_MANIFEST_DIR"), "/../../shared").into());
     let path = "data/splats/inria_style_ply/point_cloud/iteration_7000/point_cloud.ply";
     let Ok(bytes) = std::fs::read(std::path::Path::new(&shared).join(path)) else {

@@ -1,17 +1,16 @@
-//! The numbers of SPZ: floats to bits and back. Every code that comes out of a `pack` is one that the way back and forth
-//! leaves as it is.
+//! Quantises the attributes of SPZ. Codes are fixed points: decoding and encoding a written code gives the same code.
 
 use std::f32::consts::FRAC_1_SQRT_2;
 
 /// Signs of x, y and z between SPZ's axes and INRIA's.
 pub(super) const FLIP: [f32; 3] = [1.0, -1.0, -1.0];
-/// Colours are stored over a range wider than that of the eye.
+/// Scale of stored colours, whose range is wider than that of a display.
 const COLOUR_SCALE: f32 = 0.15;
-/// Largest magnitude of a component of nine bits.
-const LARGEST: f32 = 511.0;
+/// Largest magnitude of a 9-bit component.
+const MAX_MAGNITUDE: f32 = 511.0;
 
 /// Sign of SH coefficient `k` (1 to 15) under [`FLIP`]: the product of the signs of its polynomial's odd powers.
-pub(super) const fn flipped_sh(k: usize) -> f32 {
+pub(super) const fn sh_sign(k: usize) -> f32 {
     const SIGNS: [f32; 16] = [1.0, -1.0, -1.0, 1.0, -1.0, 1.0, 1.0, -1.0, 1.0, -1.0, 1.0, -1.0, -1.0, 1.0, -1.0, 1.0];
     SIGNS[k]
 }
@@ -32,12 +31,12 @@ pub(super) fn from_position([a, b, c]: [u8; 3], fractional_bits: u8) -> f32 {
     fixed as f32 / (1u32 << fractional_bits) as f32
 }
 
-/// From a logit.
+/// Opacity from a logit.
 pub(super) fn opacity(logit: f32) -> u8 {
     byte(255.0 / (1.0 + (-logit).exp()))
 }
 
-/// From the zeroth SH coefficient.
+/// Colour from the SH coefficient of degree 0.
 pub(super) fn colour(value: f32) -> u8 {
     byte(value * (COLOUR_SCALE * 255.0) + 127.5)
 }
@@ -54,7 +53,7 @@ pub(super) fn from_log_scale(byte: u8) -> f32 {
     f32::from(byte) / 16.0 - 10.0
 }
 
-/// A coefficient, rounded to the 5 bits of the first band or the 4 of the others; zero stays zero.
+/// An SH coefficient, rounded to 5 bits in degree 1 and to 4 bits above; zero stays zero.
 pub(super) fn sh(value: f32, coefficient: usize) -> u8 {
     let step = if coefficient < 4 { 8 } else { 16 };
     let fixed = (value * 128.0).round().clamp(-256.0, 256.0) as i32 + 128;
@@ -68,9 +67,9 @@ pub(super) fn from_sh(byte: u8) -> f32 {
 /// How rotations are stored.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum Rotation {
-    /// x, y and z of 8 bits over -1 to 1, w not negative.
+    /// x, y and z with 8 bits over -1 to 1, where w is not negative.
     FirstThree,
-    /// Two bits that name the largest of x, y, z, w, then sign and 9 bits of each of the others over 0 to √½.
+    /// Two bits for the index of the largest of x, y, z, w, then sign and 9 bits over 0 to √½ for each of the others.
     SmallestThree,
 }
 
@@ -82,13 +81,13 @@ impl Rotation {
         }
     }
 
-    /// From wxyz of INRIA's axes, of any length.
+    /// Packs wxyz in INRIA's axes, of any length.
     pub(super) fn pack(self, [w, x, y, z]: [f32; 4]) -> u32 {
         let code = |xyzw: [f32; 4]| match self {
             Self::FirstThree => first_three(xyzw),
             Self::SmallestThree => smallest_three(xyzw),
         };
-        // Where rounding makes another component the largest, or the three longer than one, the code moves a little.
+        // Rounding may make another component the largest or the three longer than one: iterate to a fixed point.
         let mut word = code([FLIP[0] * x, FLIP[1] * y, FLIP[2] * z, w]);
         for _ in 0..8 {
             let again = code(self.components(word));
@@ -100,13 +99,13 @@ impl Rotation {
         word
     }
 
-    /// wxyz of INRIA's axes, of length one.
+    /// Unpacks wxyz in INRIA's axes, of unit length.
     pub(super) fn unpack(self, word: u32) -> [f32; 4] {
         let [x, y, z, w] = self.components(word);
         [w, FLIP[0] * x, FLIP[1] * y, FLIP[2] * z]
     }
 
-    /// xyzw of SPZ's axes.
+    /// Unpacks xyzw in SPZ's axes.
     fn components(self, word: u32) -> [f32; 4] {
         let rest = |sum: f32| (1.0 - sum).max(0.0).sqrt();
         let mut xyzw = [0.0; 4];
@@ -119,7 +118,7 @@ impl Rotation {
                 let largest = (word >> 30) as usize;
                 let (mut bits, mut sum) = (word, 0.0);
                 for k in (0..4).rev().filter(|&k| k != largest) {
-                    let magnitude = FRAC_1_SQRT_2 * (bits & 511) as f32 / LARGEST;
+                    let magnitude = FRAC_1_SQRT_2 * (bits & 511) as f32 / MAX_MAGNITUDE;
                     xyzw[k] = if bits & 512 == 0 { magnitude } else { -magnitude };
                     sum += magnitude * magnitude;
                     bits >>= 10;
@@ -144,15 +143,15 @@ fn first_three(xyzw: [f32; 4]) -> u32 {
 
 fn smallest_three(xyzw: [f32; 4]) -> u32 {
     let xyzw = normalised(xyzw);
-    let most = xyzw.iter().fold(0.0f32, |most, v| most.max(v.abs()));
-    // Of components alike within what rounding can turn around, the first: one and a half steps, as whole ones would
-    // let two codes turn into each other.
-    let alike = most - 1.5 * FRAC_1_SQRT_2 / LARGEST;
-    let largest = xyzw.iter().position(|v| v.abs() >= alike).unwrap_or(3);
+    let largest_magnitude = xyzw.iter().fold(0.0f32, |largest_magnitude, v| largest_magnitude.max(v.abs()));
+    // The first of the components that rounding could reorder. The margin is one and a half steps: with a whole number, two codes could
+    // map to each other.
+    let threshold = largest_magnitude - 1.5 * FRAC_1_SQRT_2 / MAX_MAGNITUDE;
+    let largest = xyzw.iter().position(|v| v.abs() >= threshold).unwrap_or(3);
     let negative = xyzw[largest] < 0.0;
     let mut word = largest as u32;
     for v in (0..4).filter(|&k| k != largest).map(|k| xyzw[k]) {
-        let magnitude = (LARGEST * v.abs() / FRAC_1_SQRT_2).round().min(LARGEST) as u32;
+        let magnitude = (MAX_MAGNITUDE * v.abs() / FRAC_1_SQRT_2).round().min(MAX_MAGNITUDE) as u32;
         let sign = u32::from(magnitude > 0 && (v < 0.0) != negative);
         word = word << 10 | sign << 9 | magnitude;
     }

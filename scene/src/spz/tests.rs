@@ -4,7 +4,7 @@ use proptest::prelude::*;
 use super::*;
 use crate::splats::Splat;
 
-/// Small whole numbers that look random.
+/// Pseudo-random numbers in -1..1.
 fn noise(seed: &mut u32) -> f32 {
     *seed = seed.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
     (*seed >> 8) as f32 / (1 << 24) as f32 * 2.0 - 1.0
@@ -28,13 +28,13 @@ fn splats(count: usize, sh_degree: u8) -> Splats {
     splats
 }
 
-fn turn(q: [f32; 4]) -> Quat {
+fn rotation(q: [f32; 4]) -> Quat {
     Quat::from_xyzw(q[1], q[2], q[3], q[0]).normalize()
 }
 
 #[test]
-fn round_trips_within_the_steps_and_then_exactly() {
-    // Where w is nearly zero, version 2 loses it in the rounding of the others.
+fn round_trips_within_the_quantisation_steps_and_then_exactly() {
+    // Version 2 loses a w near zero in the rounding of the others.
     for (version, degrees) in [(Version::V2, 12.0), (Version::V3, 0.3)] {
         for sh_degree in 0..=3 {
             let splats = splats(1500, sh_degree);
@@ -48,7 +48,7 @@ fn round_trips_within_the_steps_and_then_exactly() {
                 assert!((a.log_scale - b.log_scale).abs().max_element() <= 0.501 / 16.0);
                 let opacity = |logit: f32| 1.0 / (1.0 + (-logit).exp());
                 assert!((opacity(a.opacity_logit) - opacity(b.opacity_logit)).abs() <= 0.501 / 255.0);
-                let angle = turn(a.quat).angle_between(turn(b.quat)).to_degrees();
+                let angle = rotation(a.quat).angle_between(rotation(b.quat)).to_degrees();
                 assert!(angle < degrees, "{angle}");
                 angles += angle;
                 for (k, (a, b)) in a.sh.iter().zip(b.sh).enumerate() {
@@ -67,7 +67,7 @@ fn codes_are_fixed_points() {
     let mut seed = 3;
     for i in 0..200_000 {
         let mut quat = [(); 4].map(|()| noise(&mut seed));
-        // Many with two, three or four components that are nearly alike, and many with zeros.
+        // Many with two or four nearly equal components, and many with zeros.
         match i % 5 {
             0 => quat[1] = quat[0] * (1.0 + 0.004 * noise(&mut seed)),
             1 => quat = quat.map(|v| v.signum() * (1.0 + 0.004 * noise(&mut seed))),
@@ -94,7 +94,7 @@ fn codes_are_fixed_points() {
     }
 }
 
-/// The basis of real spherical harmonics up to the third band, without constants.
+/// The real spherical harmonics up to degree 3, without constants.
 fn basis([x, y, z]: [f32; 3]) -> [f32; 16] {
     let (xx, yy, zz) = (x * x, y * y, z * z);
     let third = [
@@ -111,13 +111,13 @@ fn basis([x, y, z]: [f32; 3]) -> [f32; 16] {
 }
 
 #[test]
-fn harmonics_turn_with_the_axes() {
+fn sh_signs_match_the_axis_flip() {
     let at = [0.3, -0.7, 0.5];
     let turned = basis([0, 1, 2].map(|k| quantise::FLIP[k] * at[k]));
     for (k, (a, b)) in basis(at).into_iter().zip(turned).enumerate() {
-        assert_eq!(flipped_sh(k) * a, b, "{k}");
+        assert_eq!(sh_sign(k) * a, b, "{k}");
     }
-    // Rotations too: half a turn about x after, and before on the axes.
+    // Rotations are conjugated with the flip of the axes.
     let q = [0.5, -0.1, 0.8, 0.3];
     let word = Rotation::SmallestThree.pack(q);
     let [x, y, z, w] = {
@@ -127,11 +127,11 @@ fn harmonics_turn_with_the_axes() {
     let flip = Vec3::from_array(quantise::FLIP);
     let v = Vec3::new(0.2, 0.4, -0.6);
     let spz = Quat::from_xyzw(x, y, z, w) * (flip * v);
-    assert!((flip * (turn(q) * v) - spz).length() < 5e-3);
+    assert!((flip * (rotation(q) * v) - spz).length() < 5e-3);
 }
 
 #[test]
-fn far_scenes_give_up_fractional_bits() {
+fn distant_scenes_use_fewer_fractional_bits() {
     let mut splats = splats(3, 0);
     splats.columns_mut()[0][1] = -30_000.25;
     let (back, _) = read(&write(&splats, false, Version::V3).unwrap()).unwrap();
@@ -153,20 +153,20 @@ fn gzip(bytes: &[u8]) -> Vec<u8> {
     to.finish().unwrap()
 }
 
-/// What is inside the gzip stream.
-fn inside(bytes: &[u8]) -> Vec<u8> {
+/// The decompressed gzip stream.
+fn gunzip(bytes: &[u8]) -> Vec<u8> {
     let mut inside = Vec::new();
     GzDecoder::new(bytes).read_to_end(&mut inside).unwrap();
     inside
 }
 
 #[test]
-fn lies_and_damage_are_refused() {
+fn inconsistent_and_damaged_files_are_refused() {
     let bytes = write(&splats(40, 1), false, Version::V3).unwrap();
     for end in 0..bytes.len() {
         assert!(read(&bytes[..end]).is_err(), "{end}");
     }
-    let raw = inside(&bytes);
+    let raw = gunzip(&bytes);
     let with = |at: usize, value: &[u8]| {
         let mut bad = raw.clone();
         bad[at..at + value.len()].copy_from_slice(value);
@@ -178,18 +178,18 @@ fn lies_and_damage_are_refused() {
     assert!(with(12, &[5]).is_err() && with(13, &[25]).is_err() && with(14, &[2]).is_err());
     assert!(with(12, &[2]).is_err() && read(&gzip(&[&raw[..], &[0]].concat())).is_err());
     assert!(read(&raw).is_err() && read(b"").is_err());
-    // A bomb: half a gigabyte of splats, all zero, in less than a megabyte.
+    // A decompression bomb: two gigabytes of zero splats.
     let count = 1u32 << 23;
     let header = [&MAGIC.to_le_bytes()[..], &3u32.to_le_bytes(), &count.to_le_bytes(), &[3, 12, 0, 0]].concat();
     assert!(read(&gzip(&header)).unwrap_err().to_string().contains("announce"));
 }
 
-/// Version 4 of what version 3 holds.
+/// Converts version 3 to version 4.
 fn version_4(bytes: &[u8]) -> Vec<u8> {
-    let raw = inside(bytes);
+    let raw = gunzip(bytes);
     let header = Header::parse(*raw.first_chunk().unwrap()).unwrap();
     let (mut contents, mut body, mut planes) = (Vec::new(), Vec::new(), &raw[16..]);
-    for size in header.planes().into_iter().filter(|&size| size > 0) {
+    for size in header.plane_sizes().into_iter().filter(|&size| size > 0) {
         let (plane, rest) = planes.split_at(size * header.count);
         let stream = zstd::encode_all(plane, 3).unwrap();
         contents.extend((stream.len() as u64).to_le_bytes().into_iter().chain((plane.len() as u64).to_le_bytes()));
@@ -203,7 +203,7 @@ fn version_4(bytes: &[u8]) -> Vec<u8> {
 }
 
 #[test]
-fn version_4_says_what_version_3_says() {
+fn version_4_decodes_like_version_3() {
     for sh_degree in [0, 2, 3] {
         let third = write(&splats(700, sh_degree), true, Version::V3).unwrap();
         let fourth = version_4(&third);
@@ -220,7 +220,7 @@ fn version_4_says_what_version_3_says() {
 }
 
 #[test]
-fn the_biker_is_read() {
+fn biker_is_read() {
     let shared = std::env::var("PLAT_SHARED").unwrap_or(concat!(env!("CARGO_MANIFEST_DIR"), "/../../shared").into());
     let Ok(bytes) = std::fs::read(std::path::Path::new(&shared).join("data/splats/playcanvas/biker.spz")) else {
         println!("skipped: ../shared/data not present");

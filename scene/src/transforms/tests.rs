@@ -25,7 +25,7 @@ fn opengl_axes_become_opencv_axes() {
 }
 
 #[test]
-fn intrinsics_come_from_the_file_and_from_the_frame() {
+fn frame_intrinsics_override_those_of_the_file() {
     let shared =
         r#""w": 100, "h": 50.0, "fl_x": 80, "fl_y": 81, "cx": 49, "k1": 0.1, "p2": 0.2, "k4": 0, "other": {},"#;
     let taken = frame(shared, r#""mask_path": "m.png", "fl_x": 90, "cy": 20, "k1": null,"#).unwrap();
@@ -38,7 +38,7 @@ fn intrinsics_come_from_the_file_and_from_the_frame() {
 }
 
 #[test]
-fn fields_of_view_wait_for_the_image() {
+fn fields_of_view_need_the_image_size() {
     let quarter = std::f64::consts::FRAC_PI_2;
     let angle = format!(r#""camera_angle_x": {quarter}, "#);
     let focal = |shared: &str, own: &str| frame(shared, own).unwrap().intrinsics.model(800, 600).focal_and_centre();
@@ -51,7 +51,7 @@ fn fields_of_view_wait_for_the_image() {
 }
 
 #[test]
-fn scaled_rotations_lose_their_scale_and_others_are_refused() {
+fn scale_is_dropped_and_non_rotations_are_refused() {
     let scaled = "[[0,-2,0,1],[2,0,0,2],[0,0,2,3]]";
     let plain = "[[0,-1,0,1],[1,0,0,2],[0,0,1,3],[0,0,0,1]]";
     let pose = |matrix: &str| read(&file(r#""fl_x": 1,"#, "", matrix)).map(|t| t.frames[0].camera_from_world);
@@ -76,7 +76,7 @@ fn scaled_rotations_lose_their_scale_and_others_are_refused() {
 }
 
 #[test]
-fn fisheyes_are_known_by_either_name() {
+fn fisheyes_are_recognised_by_model_or_flag() {
     let expected = CameraModel::OpenCvFisheye([9.0, 9.0, 10.0, 5.0, 0.1, 0.2, 0.3, 0.4]);
     let bend = r#""fl_x": 9, "k1": 0.1, "k2": 0.2, "k3": 0.3, "k4": 0.4,"#;
     for name in [r#""camera_model": "OPENCV_FISHEYE","#, r#""is_fisheye": true,"#] {
@@ -87,7 +87,7 @@ fn fisheyes_are_known_by_either_name() {
 }
 
 #[test]
-fn lenses_that_plat_does_not_know_are_refused() {
+fn unsupported_lenses_are_refused() {
     for bad in [
         r#""fl_x": 9, "camera_model": "EQUIRECTANGULAR","#,
         r#""fl_x": 9, "k4": 0.1,"#,
