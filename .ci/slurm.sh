@@ -83,7 +83,7 @@ array=$(squeue --noheader --name plat-worker --format %A --states all | sort -n 
 scontrol requeue "${array}_1"
 wait "$submit"
 cmp "$scratch/calm/merged.ply" "$scratch/far/merged.ply"
-grep -q "left after" "$scratch"/cluster/worker-*-1.log
-is_back() { [[ $(scontrol show job "${array}_1") == *Restarts=1*  ]] && grep -q "$node-[0-9]*-1-1 works for" "$scratch"/cluster/worker-*-1.log; }
+grep -q "stopped after" "$scratch"/cluster/worker-*-1.log
+is_back() { [[ $(scontrol show job "${array}_1") == *Restarts=1*  ]] && grep -q "worker $node-[0-9]*-1-1 for" "$scratch"/cluster/worker-*-1.log; }
 within 60 is_back
 echo "a worker of the array was requeued, left in time and came back; the model is that of one process"

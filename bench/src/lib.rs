@@ -4,12 +4,10 @@
 //! are functions of it and of what other trainers reached ([`reference`]). Lines with a `kind` are measurements of a part
 //! ([`PartLine`]).
 
-pub mod birdseye;
 pub mod chart;
 pub mod parts;
 pub mod reference;
 pub mod seeds;
-pub mod sheet;
 pub mod table;
 
 use std::fs;
@@ -19,11 +17,9 @@ use scene::BadInput;
 use serde::{Deserialize, Serialize};
 use store::file::SaveError;
 
-pub use birdseye::{birdseye_camera, oblique_camera};
 pub use chart::chart;
 pub use parts::{PartLine, append_part};
 pub use seeds::{Averaged, averaged};
-pub use sheet::{SheetRow, contact_sheet, write_png};
 pub use table::{replace_table, short_table, table};
 
 /// One run, as one line of JSON. What was not measured is null.

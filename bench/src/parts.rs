@@ -99,7 +99,7 @@ pub struct StageTime {
 }
 
 /// Training one block with one variant of the recipe. Clocks leave out ingest and measurements.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Ablation {
     /// The program's git commit.
     pub commit: String,

@@ -1,8 +1,8 @@
-//! The one place in the program that reads clocks and counters of the operating system.
+//! Reads clocks and memory counters of the operating system.
 
 pub(crate) use worker::clock::Stopwatch;
 
-/// Largest resident memory of this process so far, bytes; `None` where the system does not say.
+/// Largest resident memory of this process so far, bytes; `None` if the system does not report it.
 pub(crate) fn peak_memory_bytes() -> Option<u64> {
     let status = std::fs::read_to_string("/proc/self/status").ok()?;
     let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"))?;
@@ -10,8 +10,8 @@ pub(crate) fn peak_memory_bytes() -> Option<u64> {
     Some(kilobytes * 1024)
 }
 
-/// From now on the peak is that of what follows; where the system does not do that, it stays what it was.
-pub(crate) fn forget_peak_memory() {
-    // A file of the kernel's: nothing is kept there.
+/// Resets the peak of resident memory, where the system supports that.
+pub(crate) fn reset_peak_memory() {
+    // A file of the kernel: the write only resets the counter.
     let _ = std::fs::write("/proc/self/clear_refs", "5");
 }

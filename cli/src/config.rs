@@ -1,7 +1,7 @@
-//! Options from the command line and from a TOML file, and the file that a run leaves.
+//! Reads options from the command line and from a TOML file, and writes the configuration file of a run.
 //!
-//! The keys of the file are the names of the flags, so the file is put into the command line as flags, before the
-//! person's own: the last one wins, and one parser judges both.
+//! The keys of the file are the names of the flags. The file is inserted into the command line as flags before the user's own: the last
+//! one wins, and one parser checks both.
 
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
@@ -13,19 +13,19 @@ use serde::Serialize;
 
 use crate::args::Cli;
 
-/// Configuration files are small.
-const FILE_LIMIT: u64 = 1 << 20;
+/// Largest configuration file, bytes.
+const MAX_FILE_BYTES: u64 = 1 << 20;
 
 /// Why there is no command to run.
 #[derive(Debug)]
 pub(crate) enum Stop {
-    /// The person asked for help or the version: this is it.
+    /// Text of help or version, to be printed.
     Shown(String),
     /// Bad usage, in one line.
     Usage(String),
 }
 
-/// The command line, options of its `--config` file included.
+/// Parses the command line, including the options of its `--config` file.
 pub(crate) fn parse(argv: Vec<OsString>) -> Result<Cli, Stop> {
     let argv = match config_file(&argv) {
         Some(file) => with_file(argv, &file).map_err(|error| Stop::Usage(error.to_string()))?,
@@ -40,12 +40,12 @@ pub(crate) fn parse(argv: Vec<OsString>) -> Result<Cli, Stop> {
     })
 }
 
-/// What clap says before it comes to usage and tips, on one line.
+/// clap's message without usage and tips, on one line.
 fn one_line(text: &str) -> String {
-    let said = text.split("\n\nUsage:").next().unwrap_or(text).split("\n\nFor more").next().unwrap_or(text);
-    let words: Vec<&str> = said.split_whitespace().collect();
+    let message = text.split("\n\nUsage:").next().unwrap_or(text).split("\n\nFor more").next().unwrap_or(text);
+    let words: Vec<&str> = message.split_whitespace().collect();
     let line = words.join(" ");
-    format!("{}; --help lists what there is", line.strip_prefix("error: ").unwrap_or(&line))
+    format!("{}; --help lists all options", line.strip_prefix("error: ").unwrap_or(&line))
 }
 
 /// The value of the last `--config`.
@@ -62,14 +62,14 @@ fn config_file(argv: &[OsString]) -> Option<PathBuf> {
     found
 }
 
-/// The command line with the file's options right after the command's name.
+/// Inserts the file's options after the command's name.
 fn with_file(mut argv: Vec<OsString>, file: &Path) -> Result<Vec<OsString>, BadInput> {
     let name = file.display().to_string();
     let bad = |problem: String, advice: &str| BadInput::new(name.clone(), problem, advice);
     let unreadable = |problem: String| bad(problem, "give --config a TOML file with a command's options");
     let length = std::fs::metadata(file).map_err(|e| unreadable(format!("cannot be read ({e})")))?.len();
-    if length > FILE_LIMIT {
-        return Err(unreadable(format!("has {length} bytes, which no configuration needs")));
+    if length > MAX_FILE_BYTES {
+        return Err(unreadable(format!("has {length} bytes, which is too large for a configuration")));
     }
     let text = std::fs::read_to_string(file).map_err(|e| unreadable(format!("cannot be read ({e})")))?;
     let table: toml::Table = text.parse().map_err(|e: toml::de::Error| {
@@ -77,7 +77,7 @@ fn with_file(mut argv: Vec<OsString>, file: &Path) -> Result<Vec<OsString>, BadI
         bad(format!("line {line} is not TOML ({})", e.message()), "correct it")
     })?;
 
-    // Down the command's names, as far as they go.
+    // Descends through command and subcommand.
     let mut command = Cli::command();
     let globals: Vec<clap::Arg> = command.get_arguments().cloned().collect();
     let (mut at, mut i) = (None, 1);
@@ -100,8 +100,8 @@ fn with_file(mut argv: Vec<OsString>, file: &Path) -> Result<Vec<OsString>, BadI
     for (key, value) in &table {
         let option = options.iter().find(|option| option.get_long() == Some(key) && key != "config");
         let option = option.ok_or_else(|| {
-            let problem = format!("'{key}' is no option of plat {}", command.get_name());
-            bad(problem, "remove it, or look for its name with --help")
+            let problem = format!("'{key}' is not an option of plat {}", command.get_name());
+            bad(problem, "remove it, or look up its name with --help")
         })?;
         match (option.get_action(), value) {
             (ArgAction::SetTrue, toml::Value::Boolean(on)) => flags.extend(on.then(|| format!("--{key}").into())),
@@ -111,10 +111,10 @@ fn with_file(mut argv: Vec<OsString>, file: &Path) -> Result<Vec<OsString>, BadI
             (ArgAction::Append, toml::Value::Array(values)) if values.iter().all(toml::Value::is_str) => {
                 flags.extend(values.iter().filter_map(|text| Some(format!("--{key}={}", text.as_str()?).into())));
             }
-            _ => return Err(bad(format!("'{key}' has a value of the wrong kind"), "see --help for what it takes")),
+            _ => return Err(bad(format!("'{key}' has a value of the wrong type"), "see --help for its values")),
         }
     }
-    // Judged alone first, so that the file is named where it is at fault, and not a flag that the person never typed.
+    // Each option is checked alone first, so that an error names the file instead of a flag that the user did not type.
     for flag in &flags {
         let alone = argv[..at].iter().chain([flag]).cloned();
         if let Err(error) = Cli::try_parse_from(alone)
@@ -177,7 +177,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_run_leaves_can_be_given_back() {
+    fn the_configuration_of_a_run_can_be_read_back() {
         let cli = parse(&["plat", "train", "a", "--out", "b", "--budget", "900", "--blocks", "flat"]).unwrap();
         let Command::Train(train) = cli.command else { panic!("not train") };
         let (text, id) = resolved(&train);
@@ -188,7 +188,7 @@ mod tests {
     }
 
     #[test]
-    fn a_list_is_an_option_given_more_than_once() {
+    fn a_list_repeats_an_option() {
         let file = file("fault = [\"fog=0.5\", \"night\"]\n");
         let path = file.path().to_str().unwrap();
         let cli = parse(&["plat", "synth", "--out", "a", "--fault", "rain", "--config", path]).unwrap();

@@ -1,27 +1,27 @@
-//! `plat`: photos in, merged city out.
+//! `plat`, the command line program.
 //!
-//! Parses the command line, runs the command, and says with the exit code how it went: 0 done, 1 the work failed,
-//! 2 bad usage or bad input. Results go to stdout, everything else to stderr.
+//! Parses the command line and runs the command. Exit codes: 0 done, 1 the work failed, 2 bad usage or bad input. Results go to stdout,
+//! everything else to stderr.
 
+mod ablation_variants;
 mod args;
-mod cameras;
+mod backend;
+mod captures;
 mod clock;
 mod commands;
 mod config;
-mod cuts;
+mod eval_report;
 mod failure;
-mod journal;
-mod live;
-mod lpips;
-mod maps;
-mod model;
+mod live_status;
+mod metrics_log;
+mod observer;
 mod output;
-mod record;
+mod planning;
 mod remote;
-mod seams;
+mod result_lines;
+mod run_record;
 mod signals;
-mod told;
-mod variants;
+mod telemetry_setup;
 
 use std::process::ExitCode;
 
@@ -30,8 +30,8 @@ use failure::Failure;
 use output::Output;
 
 fn main() -> ExitCode {
-    give_buffers_back();
-    leave_adapters_to_us();
+    return_buffers_to_system();
+    disable_device_select_layer();
     let cli = match config::parse(std::env::args_os().collect()) {
         Ok(cli) => cli,
         Err(config::Stop::Shown(text)) => {
@@ -39,11 +39,11 @@ fn main() -> ExitCode {
         }
         Err(config::Stop::Usage(line)) => return fail(&Failure::Input(line)),
     };
-    let telemetry = match told::start(&cli) {
+    let telemetry = match telemetry_setup::start(&cli) {
         Ok(telemetry) => telemetry,
         Err(error) => return fail(&error.into()),
     };
-    let output = Output::new(cli.json, cli.quiet, told::format(&cli) == telemetry::Format::Json);
+    let output = Output::new(cli.json, cli.quiet, telemetry_setup::format(&cli) == telemetry::Format::Json);
     let done = match &cli.command {
         Command::Demo(args) => commands::demo::run(args, &output),
         Command::Synth(args) => commands::synth::run(args, &output),
@@ -79,7 +79,7 @@ fn main() -> ExitCode {
     };
     let code = done.map_or_else(
         |failure| {
-            output.complain(&failure);
+            output.error(&failure);
             ExitCode::from(failure.exit_code())
         },
         |()| ExitCode::SUCCESS,
@@ -89,27 +89,27 @@ fn main() -> ExitCode {
 }
 
 fn fail(failure: &Failure) -> ExitCode {
-    output::complain(&failure.to_string());
+    output::print_error(&failure.to_string());
     ExitCode::from(failure.exit_code())
 }
 
-/// Buffers of a megabyte and more go back to the system once a task is done with them. glibc moves that border up to 32 MB by
-/// itself when such are freed, and what the tasks of a city left behind piled up in the heap: a third of the most memory it took.
-/// Smaller ones share one heap: with one for each thread every heap keeps what the largest task left in it, half of what a city took
-/// at its end.
-fn give_buffers_back() {
+/// Makes glibc return freed buffers of 1 MiB and more to the system, and use one heap for all threads.
+///
+/// By default glibc raises that threshold to 32 MB as such buffers are freed, and freed buffers of finished tasks then stay in the heap:
+/// a third of the peak memory of a city. With a heap per thread, each keeps the pages of its largest task: half of the memory at the end.
+fn return_buffers_to_system() {
     #[cfg(all(target_os = "linux", target_env = "gnu"))]
-    // SAFETY: it sets numbers of the allocator, before there is another thread.
+    // SAFETY: mallopt sets parameters of the allocator; no other thread exists yet.
     unsafe {
         libc::mallopt(libc::M_MMAP_THRESHOLD, 1 << 20);
         libc::mallopt(libc::M_ARENA_MAX, 1);
     }
 }
 
-/// Mesa's layer that puts the display's adapter first looks for a display, and complains on stderr where there is none.
-fn leave_adapters_to_us() {
+/// Disables Mesa's device select layer, which prints errors on stderr if there is no display.
+fn disable_device_select_layer() {
     #[cfg(target_os = "linux")]
-    // SAFETY: there is no other thread yet that could read the environment.
+    // SAFETY: no other thread exists yet that could read the environment.
     unsafe {
         std::env::set_var("NODEVICE_SELECT", "1");
     }

@@ -1,4 +1,4 @@
-//! What a person or a script sees: results on stdout, notes and progress on stderr.
+//! Prints results on stdout, notes and progress on stderr.
 
 use std::fmt::Display;
 use std::io::{ErrorKind, IsTerminal, Write};
@@ -12,12 +12,12 @@ use store::file::SaveError;
 
 use crate::failure::Failure;
 
-/// How to talk.
+/// Where and how to print.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Output {
     json: bool,
     quiet: bool,
-    /// Notes go into the log, which is for tools.
+    /// Notes go into the structured log instead of stderr.
     logged: bool,
     terminal: bool,
 }
@@ -27,12 +27,17 @@ impl Output {
         Self { json, quiet, logged, terminal: std::io::stderr().is_terminal() }
     }
 
-    /// Whether the result is an object for a program.
+    /// Prints no notes and no progress.
+    pub(crate) fn silent() -> Self {
+        Self::new(false, true, false)
+    }
+
+    /// Whether the result is printed as JSON.
     pub(crate) fn is_json(&self) -> bool {
         self.json
     }
 
-    /// A line on the way, on stderr.
+    /// Prints a line on stderr while the command runs.
     pub(crate) fn note(&self, line: impl Display) {
         match (self.quiet, self.logged) {
             (true, _) => {}
@@ -41,16 +46,16 @@ impl Output {
         }
     }
 
-    /// The one line of an error; said in any case.
-    pub(crate) fn complain(&self, failure: &Failure) {
+    /// Prints the one line of an error, with `--quiet` too.
+    pub(crate) fn error(&self, failure: &Failure) {
         if self.logged && tracing::enabled!(tracing::Level::ERROR) {
             tracing::error!("{failure}");
         } else {
-            complain(&failure.to_string());
+            print_error(&failure.to_string());
         }
     }
 
-    /// The command's result: the object with `--json`, else the text.
+    /// Prints the command's result: the object with `--json`, else the text.
     pub(crate) fn result(&self, object: &impl Serialize, text: &str) -> Result<(), Failure> {
         if self.json {
             let line = serde_json::to_string(object).map_err(|error| Failure::Work(error.to_string()))?;
@@ -60,12 +65,12 @@ impl Output {
         }
     }
 
-    /// A part of the terminal that is drawn again and again; `None` where stderr is no terminal, or quiet is asked for.
+    /// A region of the terminal that can be redrawn; `None` if stderr is not a terminal, or with `--quiet`.
     pub(crate) fn screen(&self) -> Option<Screen> {
         (self.terminal && !self.quiet).then_some(Screen { lines: 0 })
     }
 
-    /// Progress of something with this many parts.
+    /// A progress display of this many parts.
     pub(crate) fn progress(&self, what: &str, total: u64) -> Progress {
         let bar = (self.terminal && !self.quiet).then(|| {
             let bar = ProgressBar::with_draw_target(Some(total), ProgressDrawTarget::stderr());
@@ -77,20 +82,20 @@ impl Output {
         Progress { bar, what: what.to_owned(), total, output: *self, tenths: AtomicU64::new(0) }
     }
 
-    /// Progress of something whose stages become known on the way.
+    /// A progress display for stages that are not known in advance.
     pub(crate) fn stages(&self) -> Stages {
         Stages { output: *self, now: Mutex::new(None) }
     }
 }
 
-/// The last lines of the terminal.
+/// The redrawn last lines of the terminal.
 #[derive(Debug)]
 pub(crate) struct Screen {
     lines: usize,
 }
 
 impl Screen {
-    /// Draws these lines in the place of those before.
+    /// Replaces the lines that were drawn before.
     pub(crate) fn draw(&mut self, lines: &[String]) {
         let up = if self.lines > 0 { format!("\x1b[{}A", self.lines) } else { String::new() };
         to_stderr(&format!("{up}\x1b[J{}\n", lines.join("\n")));
@@ -98,7 +103,7 @@ impl Screen {
     }
 }
 
-/// A bar on a terminal, a line for every tenth elsewhere.
+/// A bar on a terminal; elsewhere a line for every tenth.
 pub(crate) struct Progress {
     bar: Option<ProgressBar>,
     what: String,
@@ -108,7 +113,7 @@ pub(crate) struct Progress {
 }
 
 impl Progress {
-    /// So much is done now; from any thread.
+    /// Shows the parts that are done. May be called from any thread.
     pub(crate) fn at(&self, done: u64, message: impl Display) {
         if let Some(bar) = &self.bar {
             bar.set_message(message.to_string());
@@ -121,7 +126,7 @@ impl Progress {
         }
     }
 
-    /// A line beside the bar.
+    /// Prints a line above the bar.
     pub(crate) fn note(&self, line: impl Display) {
         match &self.bar {
             Some(bar) => bar.suspend(|| self.output.note(line)),
@@ -138,28 +143,28 @@ impl Drop for Progress {
     }
 }
 
-/// Progress of work in stages that are named as they begin: a bar for each, one after the other.
+/// A progress display for each stage, one after the other.
 pub(crate) struct Stages {
     output: Output,
     now: Mutex<Option<(&'static str, Progress)>>,
 }
 
 impl Stages {
-    /// So much of this stage is done now; from any thread.
-    pub(crate) fn at(&self, what: &'static str, done: usize, total: usize) {
+    /// Shows the parts of a stage that are done. A new stage replaces the one before. May be called from any thread.
+    pub(crate) fn at(&self, what: &'static str, done: u64, total: u64, message: &str) {
         let mut now = self.now.lock().unwrap_or_else(PoisonError::into_inner);
         if now.as_ref().is_none_or(|(shown, _)| *shown != what) {
-            // The old one goes before there is a new one.
+            // The old bar is cleared before the new one is drawn.
             *now = None;
-            *now = Some((what, self.output.progress(what, total as u64)));
+            *now = Some((what, self.output.progress(what, total)));
         }
         if let Some((_, progress)) = now.as_ref() {
-            progress.at(done as u64, "");
+            progress.at(done, message);
         }
     }
 }
 
-/// Text on stdout. A reader that went away (`plat … | head`) is no reason to fail, a full disk is.
+/// Prints text on stdout. A closed pipe (`plat … | head`) is not an error, a full disk is.
 pub(crate) fn print(text: &str) -> Result<(), Failure> {
     let mut out = std::io::stdout().lock();
     match out.write_all(text.as_bytes()).and_then(|()| out.flush()) {
@@ -170,8 +175,8 @@ pub(crate) fn print(text: &str) -> Result<(), Failure> {
     }
 }
 
-/// The one line of an error, on stderr.
-pub(crate) fn complain(line: &str) {
+/// Prints the one line of an error on stderr.
+pub(crate) fn print_error(line: &str) {
     to_stderr(&format!("plat: {line}\n"));
 }
 

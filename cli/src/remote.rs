@@ -1,11 +1,11 @@
-//! The coordinator of a cluster, as the commands that ask it for something see it.
+//! A client of a cluster's coordinator for the commands that query and control it.
 
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use coordinator::{LocalError, Results, of_status};
-use proto::watch_event::Event as News;
+use proto::watch_event::Event;
 use proto::{Access, Client, KeyPair, Outcome, Token};
 use scene::{BadInput, BlockId};
 use store::Store;
@@ -16,19 +16,19 @@ use crate::args::Connection;
 use crate::failure::Failure;
 use crate::output::Output;
 
-/// Files of certificates and tokens are small.
-const FILE_LIMIT: u64 = 1 << 20;
-/// The longest pause between two tries to reach a coordinator that was there before.
-const PAUSE_LIMIT: Duration = Duration::from_secs(5);
+/// Largest certificate or token file, bytes.
+const MAX_FILE_BYTES: u64 = 1 << 20;
+/// Longest pause between two attempts to reconnect.
+const MAX_PAUSE: Duration = Duration::from_secs(5);
 
-/// A coordinator.
+/// A connection to a coordinator.
 pub(crate) struct Remote {
     runtime: Runtime,
     client: Client,
     access: Access,
-    /// As it was given.
+    /// As given by the user.
     url: String,
-    /// What says who leads, where no coordinator was named.
+    /// The store whose leases name the leader, if no coordinator was named.
     leases: Option<Store>,
 }
 
@@ -43,13 +43,13 @@ impl Remote {
         Ok(Self { runtime, client, access, url, leases })
     }
 
-    /// One call.
+    /// Makes one call.
     pub(crate) fn call<T>(
         &mut self,
-        what: impl AsyncFnOnce(&mut Client) -> Result<Response<T>, Status>,
+        request: impl AsyncFnOnce(&mut Client) -> Result<Response<T>, Status>,
     ) -> Result<T, Failure> {
-        let answer = self.runtime.block_on(what(&mut self.client));
-        answer.map(Response::into_inner).map_err(|status| self.failure(status))
+        let reply = self.runtime.block_on(request(&mut self.client));
+        reply.map(Response::into_inner).map_err(|status| self.failure(status))
     }
 
     /// The coordinator's store.
@@ -65,14 +65,14 @@ impl Remote {
         blocks.collect::<Result<_, _>>().map_err(|error| Failure::Work(format!("the coordinator's answer: {error}")))
     }
 
-    /// Follows a job of so many tasks to its end and tells each piece of news. A coordinator that goes away is waited for: it
-    /// may come back, and says then how things stand. Ctrl-C ends it with `None`; the job goes on.
+    /// Follows a job of this many tasks to its end and passes on each update. If the coordinator is lost, it reconnects and receives the
+    /// state again. Returns `None` after Ctrl-C; the job goes on.
     pub(crate) fn follow(
         &mut self,
         job: u64,
         tasks: u32,
         output: &Output,
-        mut on_news: impl FnMut(&Results, &News),
+        mut on_update: impl FnMut(&Results, &Event),
     ) -> Result<Option<(Outcome, Results)>, Failure> {
         let mut results = Results::new(tasks);
         let mut pause = Duration::from_millis(100);
@@ -81,48 +81,48 @@ impl Remote {
             let ended = self.runtime.block_on(async {
                 tokio::select! {
                     _ = tokio::signal::ctrl_c() => Ok(None),
-                    outcome = watch(client, job, &mut results, &mut on_news, &mut pause) => outcome.map(Some),
+                    outcome = watch(client, job, &mut results, &mut on_update, &mut pause) => outcome.map(Some),
                 }
             });
             match ended {
                 Ok(Some(outcome)) => return Ok(Some((outcome, results))),
                 Ok(None) => return Ok(None),
                 Err(Lost::Job(error)) => return Err(error.into()),
-                Err(Lost::Connection(status)) if is_passing(&status) => {
+                Err(Lost::Connection(status)) if is_transient(&status) => {
                     output.note(format!("waiting for the coordinator {}: {}", self.url, proto::explain(&status)));
-                    // Made inside, where there is a clock to wake it.
+                    // The timer must be created inside the runtime.
                     self.runtime.block_on(async { tokio::time::sleep(pause).await });
-                    // Another one may lead by now.
+                    // The leader may have changed.
                     if let Ok(client) = self.runtime.block_on(find(&self.url, self.leases.as_ref(), &self.access)) {
                         self.client = client;
                     }
-                    pause = PAUSE_LIMIT.min(2 * pause);
+                    pause = MAX_PAUSE.min(2 * pause);
                 }
                 Err(Lost::Connection(status)) => return Err(self.failure(status)),
             }
         }
     }
 
-    /// What a refusal comes to: the input's fault, or the cluster's.
+    /// Maps a status to bad input or failed work.
     fn failure(&self, status: Status) -> Failure {
-        let passing = is_passing(&status);
+        let is_transient = is_transient(&status);
         match of_status(status) {
-            LocalError::Failed(line) if passing => {
-                Failure::Work(format!("the coordinator {} does not answer: {line}; is it running?", self.url))
+            LocalError::Failed(line) if is_transient => {
+                Failure::Work(format!("the coordinator {} does not answer: {line}; check that it is running", self.url))
             }
             other => other.into(),
         }
     }
 }
 
-/// A client of the coordinator that was named, or of the one that leads.
+/// A client of the named coordinator, or of the leader.
 async fn find(url: &str, leases: Option<&Store>, access: &Access) -> Result<Client, Failure> {
     let Some(store) = leases else { return Ok(proto::connect(url, access)?) };
     let lease = worker::leader_of(store).await.map_err(|status| Failure::Work(status.message().into()))?;
     Ok(proto::connect(&lease.address, access)?)
 }
 
-/// Why watching ended before the job.
+/// Why watching ended before the job did.
 enum Lost {
     Connection(Status),
     Job(LocalError),
@@ -133,34 +133,34 @@ async fn watch(
     client: &mut Client,
     job: u64,
     results: &mut Results,
-    on_news: &mut impl FnMut(&Results, &News),
+    on_update: &mut impl FnMut(&Results, &Event),
     pause: &mut Duration,
 ) -> Result<Outcome, Lost> {
-    let mut news = client.watch(proto::WatchRequest { job }).await.map_err(Lost::Connection)?.into_inner();
-    while let Some(event) = news.message().await.map_err(Lost::Connection)? {
-        // News of a kind that came into the wire later are no concern of this program's.
+    let mut updates = client.watch(proto::WatchRequest { job }).await.map_err(Lost::Connection)?.into_inner();
+    while let Some(event) = updates.message().await.map_err(Lost::Connection)? {
+        // Updates of kinds that newer coordinators send are ignored.
         let Some(event) = event.event else { continue };
         *pause = Duration::from_millis(100);
-        if let News::Changed(changed) = &event {
+        if let Event::Changed(changed) = &event {
             results.note(changed.clone()).map_err(Lost::Job)?;
         }
-        on_news(results, &event);
-        if let News::Finished(finished) = event {
+        on_update(results, &event);
+        if let Event::Finished(finished) = event {
             return Ok(finished.outcome());
         }
     }
-    Err(Lost::Connection(Status::unavailable("it stopped telling the news of the job")))
+    Err(Lost::Connection(Status::unavailable("the stream of updates ended")))
 }
 
-fn is_passing(status: &Status) -> bool {
+fn is_transient(status: &Status) -> bool {
     matches!(
         status.code(),
         Code::Unavailable | Code::DeadlineExceeded | Code::Cancelled | Code::Unknown | Code::Internal
     )
 }
 
-/// How a job that is over counts: `Ok` where all is done.
-pub(crate) fn judge(job: u64, outcome: Outcome, results: &Results) -> Result<(), Failure> {
+/// The result of a job that has ended.
+pub(crate) fn result_of(job: u64, outcome: Outcome, results: &Results) -> Result<(), Failure> {
     match outcome {
         Outcome::Done => Ok(()),
         Outcome::Incomplete => Err(results.failure().into()),
@@ -168,49 +168,50 @@ pub(crate) fn judge(job: u64, outcome: Outcome, results: &Results) -> Result<(),
     }
 }
 
-/// Threads for the wire.
+/// The runtime for network calls.
 pub(crate) fn runtime() -> Result<Runtime, Failure> {
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build();
     runtime.map_err(|error| Failure::Work(format!("cannot start threads: {error}")))
 }
 
-/// The store of a coordinator, if it is the same from here.
+/// The store of a coordinator, if its URL names the same store on this machine.
 pub(crate) async fn shared_store(url: &str) -> Result<Store, Failure> {
     let store = Store::open(url)?;
     match store.newest_record(proto::leader::FOLDER).await? {
         Some(_) => Ok(store),
         None => {
-            let advice = "mount it here under the same path, or start the coordinator with a --store that all reach";
-            Err(BadInput::new(url, "is the coordinator's store, and another one on this machine", advice).into())
+            let advice =
+                "mount it here under the same path, or start the coordinator with a --store that all machines reach";
+            Err(BadInput::new(url, "names the coordinator's store, but another one on this machine", advice).into())
         }
     }
 }
 
-/// What the connection's files hold.
+/// Reads the connection's certificates and token.
 pub(crate) fn access(connection: &Connection) -> Result<Access, Failure> {
     let authority = connection.tls_ca.as_deref().map(|path| pem("--tls-ca", path, "CERTIFICATE")).transpose()?;
     let identity = key_pair(&connection.tls_cert, &connection.tls_key)?;
     Ok(Access { authority, identity, token: token(&connection.token_file)? })
 }
 
-/// A certificate and its key, where both are given.
+/// Reads a certificate and its key, if both are given.
 pub(crate) fn key_pair(certificate: &Option<PathBuf>, key: &Option<PathBuf>) -> Result<Option<KeyPair>, Failure> {
     let (Some(certificate), Some(key)) = (certificate, key) else { return Ok(None) };
     let (certificate, key) = (pem("--tls-cert", certificate, "CERTIFICATE")?, pem("--tls-key", key, "PRIVATE KEY")?);
     Ok(Some(KeyPair { certificate, key }))
 }
 
-/// The token of a file.
+/// Reads a token file.
 pub(crate) fn token(path: &Option<PathBuf>) -> Result<Option<Token>, Failure> {
     let Some(path) = path else { return Ok(None) };
     let text = String::from_utf8(small_file("--token-file", path)?).unwrap_or_default();
     let token = Token::new(&text).map_err(|problem| {
-        BadInput::new(path.display().to_string(), problem, "write one there, say of `openssl rand -hex 32`")
+        BadInput::new(path.display().to_string(), problem, "write one there, for example by `openssl rand -hex 32`")
     });
     Ok(Some(token?))
 }
 
-/// A file of PEM with such a part.
+/// Reads a PEM file that has a part of this kind.
 pub(crate) fn pem(flag: &str, path: &Path, part: &str) -> Result<Vec<u8>, Failure> {
     let bytes = small_file(flag, path)?;
     let text = String::from_utf8_lossy(&bytes);
@@ -225,8 +226,8 @@ fn small_file(flag: &str, path: &Path) -> Result<Vec<u8>, Failure> {
     let bad = |problem: String| BadInput::new(path.display().to_string(), problem, format!("give {flag} a file"));
     let unreadable = |error: std::io::Error| bad(format!("cannot be read ({error})"));
     let length = fs::metadata(path).map_err(unreadable)?.len();
-    if length > FILE_LIMIT {
-        return Err(bad(format!("has {length} bytes, which none such needs")).into());
+    if length > MAX_FILE_BYTES {
+        return Err(bad(format!("has {length} bytes, which is too large")).into());
     }
     Ok(fs::read(path).map_err(unreadable)?)
 }

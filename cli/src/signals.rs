@@ -1,19 +1,19 @@
-//! When a program that runs until it is told to stop is told so: Ctrl-C, or SIGTERM as Kubernetes, Slurm and systemd send it.
+//! Waits for the signals that stop a server: Ctrl-C, or SIGTERM as sent by Kubernetes, Slurm and systemd.
 
 use tokio_util::sync::CancellationToken;
 
-/// Cancels the token at the first such signal. The second ends the program at once.
-pub(crate) async fn until_told(stop: CancellationToken) {
-    told().await;
+/// Cancels the token at the first signal and ends the program at the second.
+pub(crate) async fn until_signalled(stop: CancellationToken) {
+    signalled().await;
     stop.cancel();
-    told().await;
+    signalled().await;
     std::process::exit(1);
 }
 
 #[cfg(unix)]
-async fn told() {
+async fn signalled() {
     use tokio::signal::unix::{SignalKind, signal};
-    // Without a handler the signal ends the process, as it would have without this function.
+    // Without a handler, SIGTERM ends the process by default.
     let Ok(mut terminate) = signal(SignalKind::terminate()) else { return std::future::pending().await };
     tokio::select! {
         _ = terminate.recv() => {}
@@ -22,6 +22,6 @@ async fn told() {
 }
 
 #[cfg(not(unix))]
-async fn told() {
+async fn signalled() {
     let _ = tokio::signal::ctrl_c().await;
 }

@@ -255,7 +255,7 @@ fn people_steer_jobs_and_wrong_requests_are_refused_with_a_line() {
     drop(host);
 
     // Nobody is there; no trust; no token; no store that is the coordinator's.
-    common::stopped(&mut common::command(at, &["jobs", "--coordinator", &url]), 1, "is it running?");
+    common::stopped(&mut common::command(at, &["jobs", "--coordinator", &url]), 1, "check that it is running");
     common::refused(at, &["jobs", "--coordinator", "https://127.0.0.1:1"], "--tls-ca");
     common::refused(at, &["jobs"], "--coordinator");
     std::fs::write(at.join("token"), "short\n").unwrap();

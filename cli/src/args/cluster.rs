@@ -1,4 +1,4 @@
-//! The commands of a cluster: who hosts it, who works for it, and who asks it for something.
+//! The command lines of the cluster: coordinator, worker, and the commands that query and control jobs.
 
 use std::fmt;
 use std::net::{Ipv4Addr, SocketAddr};
@@ -8,46 +8,47 @@ use std::str::FromStr;
 use clap::{Args, ValueEnum};
 use scene::BlockId;
 
-use super::{Auto, Backend, PlanOptions, seconds};
+use super::plan::PlanOptions;
+use super::values::{Auto, Backend, seconds};
 
-/// Which coordinator, and how to prove oneself to it.
+/// How to reach a coordinator and authenticate to it.
 #[derive(Debug, Clone, Args)]
 pub(crate) struct Connection {
-    /// The coordinator: http://host:port, https://host:port with --tls-ca, or the URL of its store, which says who leads
+    /// The coordinator: http://host:port, https://host:port with --tls-ca, or the URL of its store, which names the leader
     #[arg(long, value_name = "URL")]
     pub(crate) coordinator: String,
-    /// Certificates to trust the coordinator by, PEM
+    /// CA certificates to verify the coordinator with, PEM
     #[arg(long, value_name = "FILE")]
     pub(crate) tls_ca: Option<PathBuf>,
-    /// Own certificate, PEM, for a coordinator that asks for one
+    /// Client certificate, PEM, for a coordinator that requires one
     #[arg(long, value_name = "FILE", requires = "tls_key")]
     pub(crate) tls_cert: Option<PathBuf>,
-    /// Its private key, PEM
+    /// Private key of the client certificate, PEM
     #[arg(long, value_name = "FILE", requires = "tls_cert")]
     pub(crate) tls_key: Option<PathBuf>,
-    /// File with the coordinator's token
+    /// File with the coordinator's access token
     #[arg(long, value_name = "FILE")]
     pub(crate) token_file: Option<PathBuf>,
 }
 
-/// What a program tells of itself that runs for days.
+/// Metrics and log of a server.
 #[derive(Debug, Clone, Copy, Args)]
-pub(crate) struct Told {
-    /// Answer Prometheus at GET /metrics of this address, or of this port of this machine alone. Whoever reaches it may read; it
-    /// says numbers, and what workers compute with
+pub(crate) struct TelemetryArgs {
+    /// Serve Prometheus metrics at GET /metrics on this address, or on this port of the loopback interface. There is no
+    /// authentication; the metrics contain numbers and the names of backends
     #[arg(long, value_name = "ADDR|PORT", value_parser = metrics_address)]
     pub(crate) metrics: Option<SocketAddr>,
-    /// Lines of the log, on stderr; RUST_LOG chooses which
+    /// Format of the log on stderr; RUST_LOG filters it
     #[arg(long, value_enum, value_name = "FORMAT", default_value = "text")]
     pub(crate) log_format: LogFormat,
 }
 
-/// What a line of the log looks like.
+/// Format of log lines.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub(crate) enum LogFormat {
-    /// For people
+    /// Plain text
     Text,
-    /// An object a line
+    /// One JSON object per line
     Json,
 }
 
@@ -59,35 +60,35 @@ fn metrics_address(text: &str) -> Result<SocketAddr, String> {
 
 #[derive(Debug, Clone, Args)]
 pub(crate) struct CoordinatorArgs {
-    /// Store of plans, photos, results and the jobs' state, which the workers reach under the same URL: a folder, file:// or s3://
+    /// Store of plans, photos, results and job state; workers must reach it under the same URL: a folder, file:// or s3://
     #[arg(long, value_name = "URL")]
     pub(crate) store: String,
-    /// Where to listen. Beyond this machine it takes --tls-cert, --tls-key and --token-file
+    /// Address to listen on. An address that other machines reach needs --tls-cert, --tls-key and --token-file
     #[arg(long, value_name = "ADDR", default_value = "127.0.0.1:7287")]
     pub(crate) listen: SocketAddr,
-    /// How others reach this coordinator, where it is not as it listens: http://host:port or https://host:port
+    /// URL under which others reach this coordinator, if it is not the address it listens on: http://host:port or https://host:port
     #[arg(long, value_name = "URL")]
     pub(crate) advertise: Option<String>,
-    /// Certificate to encrypt with, PEM
+    /// Server certificate, PEM
     #[arg(long, value_name = "FILE", requires = "tls_key")]
     pub(crate) tls_cert: Option<PathBuf>,
-    /// Its private key, PEM
+    /// Private key of the server certificate, PEM
     #[arg(long, value_name = "FILE", requires = "tls_cert")]
     pub(crate) tls_key: Option<PathBuf>,
-    /// Only let in whose certificate these signed, PEM
+    /// Require client certificates signed by these CAs, PEM
     #[arg(long, value_name = "FILE")]
     pub(crate) tls_client_ca: Option<PathBuf>,
-    /// File with the token that whoever calls has to show: 16 to 512 printable characters
+    /// File with the token that clients must send: 16 to 512 printable characters
     #[arg(long, value_name = "FILE")]
     pub(crate) token_file: Option<PathBuf>,
-    /// A worker that is silent for so long has lost its task
+    /// Lease of a task: a worker that sends nothing for this long loses it
     #[arg(long, value_name = "SECONDS", default_value_t = 30.0, value_parser = lease)]
     pub(crate) lease_seconds: f64,
-    /// Write down what the scheduler hears, as its simulator replays it
+    /// Record the scheduler's inputs, for replay in its simulator
     #[arg(long, value_name = "FILE")]
     pub(crate) journal: Option<PathBuf>,
     #[command(flatten)]
-    pub(crate) told: Told,
+    pub(crate) telemetry: TelemetryArgs,
 }
 
 fn lease(text: &str) -> Result<f64, String> {
@@ -99,28 +100,28 @@ fn lease(text: &str) -> Result<f64, String> {
 pub(crate) struct WorkerArgs {
     #[command(flatten)]
     pub(crate) connection: Connection,
-    /// What computes
+    /// Backend to train on
     #[arg(long, value_enum, default_value = "auto")]
     pub(crate) backend: Backend,
     /// Threads; auto takes all cores
     #[arg(long, value_name = "N|auto", default_value_t)]
     pub(crate) threads: Auto<u32>,
-    /// Memory that it may take: it is given no block that is thought to need more, and leaves one that turns out to, which goes to
-    /// a worker that may take more. auto: what this machine has, or the container that it runs in; give each its part where several
-    /// workers share a machine
+    /// Memory budget. The worker gets no block whose estimate exceeds it, and gives up a block that turns out to exceed it; that
+    /// block goes to a worker with a larger budget. auto takes the memory of the machine or container; give each worker its
+    /// share if several run on one machine
     #[arg(long, value_name = "MIB|auto", default_value_t)]
     pub(crate) memory: Auto<u64>,
-    /// The part of it that photos may take, decoded
+    /// Part of the budget for decoded photos
     #[arg(long, value_name = "MIB", default_value_t = 128, value_parser = clap::value_parser!(u32).range(1..=1 << 20))]
     pub(crate) cache: u32,
-    /// Its name, unlike any other worker's; by default the machine's and the process's number
+    /// Unique name of the worker; by default the host name and the process id
     #[arg(long, value_name = "NAME")]
     pub(crate) name: Option<String>,
-    /// Seconds between two checkpoints of a block, from which any worker goes on
+    /// Seconds between two checkpoints of a block; any worker can resume from them
     #[arg(long, value_name = "SECONDS", default_value_t = 60.0, value_parser = seconds)]
     pub(crate) checkpoint_every: f64,
     #[command(flatten)]
-    pub(crate) told: Told,
+    pub(crate) telemetry: TelemetryArgs,
 }
 
 #[derive(Debug, Clone, Args)]
@@ -131,10 +132,10 @@ pub(crate) struct SubmitArgs {
     pub(crate) connection: Connection,
     #[command(flatten)]
     pub(crate) plan: PlanOptions,
-    /// What is to compute; auto takes what most workers have
+    /// Backend of the job; auto takes the one that most workers have
     #[arg(long, value_enum, default_value = "auto")]
     pub(crate) backend: Backend,
-    /// Wait for the end, show what happens, and say by the exit code how it went
+    /// Wait for the job to end, show its progress, and exit with its result
     #[arg(long)]
     pub(crate) wait: bool,
     /// Folder for the model
@@ -162,7 +163,7 @@ pub(crate) struct StatusArgs {
     pub(crate) job: u64,
     #[command(flatten)]
     pub(crate) connection: Connection,
-    /// Stay until the job is over and show its blocks as they are trained; the exit code says how it went
+    /// Follow the job until it ends, show its blocks as they are trained, and exit with its result
     #[arg(long)]
     pub(crate) watch: bool,
 }
@@ -183,12 +184,12 @@ pub(crate) struct LogsArgs {
     pub(crate) job: u64,
     #[command(flatten)]
     pub(crate) connection: Connection,
-    /// Stay until the job is over
+    /// Follow the log until the job ends
     #[arg(long)]
     pub(crate) follow: bool,
 }
 
-/// A task as a person names it.
+/// A task, by number or by block.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum TaskName {
     Number(u32),

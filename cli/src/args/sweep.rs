@@ -1,12 +1,13 @@
-//! The command line of a sweep: that of `plat train`, where some options take a list.
+//! The command line of a sweep: the options of `plat train`, some of which take a list.
 
 use std::path::PathBuf;
 
 use clap::{Arg, ArgAction, ArgMatches, Args, Command, Error, FromArgMatches};
 
-use super::{Auto, Backend, TrainArgs};
+use super::TrainArgs;
+use super::values::{Auto, Backend};
 
-/// `plat train` over several captures and values: every combination is a run.
+/// The runs of a sweep: every combination of captures and option values.
 #[derive(Debug, Clone)]
 pub(crate) struct Sweep {
     pub(crate) captures: Vec<Named>,
@@ -15,20 +16,20 @@ pub(crate) struct Sweep {
     pub(crate) tolerance_db: Vec<f64>,
     pub(crate) backend: Vec<Backend>,
     pub(crate) seed: Vec<u64>,
-    /// With the first capture and the first values.
+    /// Options of `plat train` with the first capture and the first values.
     pub(crate) train: TrainArgs,
 }
 
-/// A capture, and what chart and table call it.
+/// A capture with its name in chart and table.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Named {
-    /// `None`: nobody said.
+    /// `None` if it was not given.
     pub(crate) name: Option<String>,
     pub(crate) path: PathBuf,
 }
 
 impl From<PathBuf> for Named {
-    /// Of `NAME=PATH`, or of a path alone.
+    /// Parses `NAME=PATH` or a path alone.
     fn from(path: PathBuf) -> Self {
         match path.to_str().and_then(|text| text.split_once('=')) {
             Some((name, path)) if !name.is_empty() => Self { name: Some(name.into()), path: path.into() },
@@ -41,24 +42,24 @@ impl Args for Sweep {
     fn augment_args(command: Command) -> Command {
         let list = |arg: Arg| arg.value_delimiter(',');
         let mut command = TrainArgs::augment_args(command).mut_arg("capture", |arg| {
-            let help = "Folders of captures (COLMAP or transforms.json), each with what the chart calls it, or by the name of its folder";
+            let help = "Folders of captures (COLMAP or transforms.json), each with its name in the chart; by default that of its folder";
             arg.action(ArgAction::Append).num_args(1..).value_name("NAME=PATH").help(help)
         });
         for id in ["steps", "budget", "tolerance_db", "backend", "seed"] {
             command = command.mut_arg(id, |arg| {
-                let help = arg.get_help().map(|help| format!("{help} [list: a run for each]"));
+                let help = arg.get_help().map(|help| format!("{help} [list: one run each]"));
                 list(arg).help(help.unwrap_or_default())
             });
         }
         command
             .mut_arg("out", |arg| {
-                arg.help("Folder for the model and all that is said about it; of several runs, for theirs")
+                arg.help("Folder for the model and its reports; with several runs, the parent of their folders")
             })
             .mut_arg("store", |arg| {
-                arg.help("Store of photos and results, of one run only; by default the folder `store` under --out")
+                arg.help("Store of photos and results, for a single run; by default the folder `store` under --out")
             })
             .mut_arg("fresh", |arg| {
-                arg.help("Also run what there is a line of already, of this commit on this machine")
+                arg.help("Also run combinations that already have a line of this commit on this machine")
             })
     }
 

@@ -1,5 +1,6 @@
-//! `plat bench ablate`: the same block trained by each variant of the recipe, seed by seed and variant by variant in turn, so that what else the
-//! machine does hits all alike; and how long each took to reach what.
+//! `plat bench ablate`: trains the same block by each variant of the recipe and reports the time to reach target PSNRs.
+//!
+//! Within a seed the variants are trained in turn, so that other load on the machine affects all of them alike.
 
 use std::sync::Arc;
 
@@ -9,26 +10,26 @@ use serde::Serialize;
 use store::Store;
 use worker::whole::{Look, Whole};
 
+use crate::ablation_variants::{DEFAULT, Variant};
 use crate::args::{AblateArgs, Auto, Blocks, PlanOptions, RESIDUAL};
-use crate::cameras;
-use crate::commands::bench::invoked;
-use crate::commands::plan::plan_of;
-use crate::commands::train::{CACHE_BYTES, check_plan, compute_on, ingest_photos, make_folder};
-use crate::failure::Failure;
+use crate::backend;
+use crate::captures::{self, ingest_photos};
+use crate::commands::train::CACHE_BYTES;
+use crate::failure::{Failure, make_folder, temporary_folder};
 use crate::output::Output;
-use crate::record::commit;
-use crate::variants::{DEFAULT, Variant};
+use crate::planning::{check_plan, plan_of};
+use crate::run_record::{commit, invocation};
 
-/// The file of these measurements.
+/// The file of ablations.
 const LINES: &str = "ablation.jsonl";
 
-/// The means of a variant over its seeds.
+/// Means of a variant over its seeds.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 struct Mean {
     variant: &'static str,
     about: &'static str,
     seeds: usize,
-    /// CPU seconds to each target; null where a seed never reached it.
+    /// CPU seconds to each target; null if a seed never reached it.
     reached: Vec<Reached>,
     psnr: f64,
     splats: f64,
@@ -47,14 +48,82 @@ struct Ablated<'a> {
 pub(crate) fn run(args: &AblateArgs, output: &Output) -> Result<(), Failure> {
     let variants = &args.variants;
     if args.to_gain.is_some() && !variants.iter().any(|variant| variant.name == DEFAULT) {
-        let problem = format!("is a share of what {DEFAULT} gains, which --variants leaves out");
+        let problem = format!("is a share of the gain of {DEFAULT}, which --variants leaves out");
         return Err(scene::BadInput::new("--to-gain", problem, "add it, or give --to").into());
     }
-    let backend = compute_on(args.backend)?;
-    let source = cameras::open(&args.capture, output)?;
-    let folder = tempfile::tempdir().map_err(|e| Failure::Work(format!("no temporary folder: {e}")))?;
+    let backend = backend::open(args.backend)?;
+    let source = captures::open(&args.capture, output)?;
+    let folder = temporary_folder()?;
     let store = Store::open(&folder.path().display().to_string())?.blocking();
-    let options = |seed: u64| PlanOptions {
+    let (planned_for, plan) = plan_of(&source.capture, &plan_options(args, 0))?;
+    check_plan(&plan, &planned_for, output)?;
+    let capture = Arc::new(ingest_photos(&source, &store, args.downscale, output)?.capture);
+    let mut lines: Vec<Ablation> = Vec::new();
+    let runs = args.seeds.len() * variants.len();
+    make_folder(&args.results)?;
+    let file = args.results.join(LINES);
+    let append = |line: &mut Ablation, targets: &[f64]| {
+        line.reached = reached(&line.curve, targets);
+        append_part(&file, &PartLine::Ablation(line.clone()))
+    };
+    // With --to-gain the targets depend on the last run.
+    let targets_are_known = !args.to.is_empty() && args.to_gain.is_none();
+    for &seed in &args.seeds {
+        let (_, plan) = plan_of(&source.capture, &plan_options(args, seed))?;
+        let whole = Whole {
+            plan: &plan,
+            capture: capture.clone(),
+            store: store.clone(),
+            backend: backend.clone(),
+            threads: args.threads as usize,
+            cache_bytes: CACHE_BYTES,
+            looks: args.looks,
+        };
+        for variant in variants {
+            let samples = whole.train(variant.recipe).map_err(|error| match error.kind {
+                worker::FailureKind::Input => Failure::Input(error.message),
+                _ => Failure::Work(error.message),
+            })?;
+            let [.., last] = samples[..] else { return Err(Failure::Work("nothing was measured".into())) };
+            output.note(format!(
+                "{} of {runs}: {}, seed {seed}: {:.2} dB, {:.1} CPU s",
+                lines.len() + 1,
+                variant.name,
+                last.psnr,
+                last.cpu_seconds
+            ));
+            let mut line = Ablation {
+                backend: backend.name(),
+                variant: variant.name.to_owned(),
+                seed,
+                steps: plan.settings.steps,
+                budget: plan.settings.budget,
+                psnr: last.psnr,
+                splats: last.splats,
+                cpu_seconds: last.cpu_seconds,
+                wall_seconds: last.wall_seconds,
+                curve: samples.iter().map(point).collect(),
+                ..blank_line(args)
+            };
+            if targets_are_known {
+                append(&mut line, &args.to)?;
+            }
+            lines.push(line);
+        }
+    }
+    let targets = targets(args, &lines);
+    if !targets_are_known {
+        lines.iter_mut().try_for_each(|line| append(line, &targets))?;
+    }
+    let means: Vec<Mean> = variants.iter().map(|variant| mean(variant, &lines)).collect();
+    let scene = lines.first().map_or("", |line| &line.scene);
+    let ablated = Ablated { command: "bench ablate", scene, targets: &targets, means: &means, lines: &lines };
+    output.result(&ablated, &format!("{}appended to {}", table(&targets, &means), file.display()))
+}
+
+/// A plan of one block, without pruning.
+fn plan_options(args: &AblateArgs, seed: u64) -> PlanOptions {
+    PlanOptions {
         blocks: Blocks::Tree,
         levels: Auto(Some(0)),
         steps: args.steps,
@@ -67,77 +136,20 @@ pub(crate) fn run(args: &AblateArgs, output: &Output) -> Result<(), Failure> {
         antialiased: false,
         exposure: false,
         downscale: args.downscale,
-    };
-    let (planned_for, plan) = plan_of(&source.capture, &options(0))?;
-    check_plan(&plan, &planned_for, output)?;
-    let capture = Arc::new(ingest_photos(&source, &store, args.downscale, output)?.capture);
-    let mut lines: Vec<Ablation> = Vec::new();
-    let runs = args.seeds.len() * variants.len();
-    make_folder(&args.results)?;
-    let file = args.results.join(LINES);
-    let keep = |line: &mut Ablation, targets: &[f64]| {
-        line.reached = reached(&line.curve, targets);
-        append_part(&file, &PartLine::Ablation(line.clone()))
-    };
-    // What is to be reached may depend on the last run.
-    let is_known = !args.to.is_empty() && args.to_gain.is_none();
-    for &seed in &args.seeds {
-        let (_, plan) = plan_of(&source.capture, &options(seed))?;
-        let whole = Whole {
-            plan: &plan,
-            capture: capture.clone(),
-            store: store.clone(),
-            backend: backend.clone(),
-            threads: args.threads as usize,
-            cache_bytes: CACHE_BYTES,
-            looks: args.looks,
-        };
-        for variant in variants {
-            let looks = whole.train(variant.recipe).map_err(|error| match error.kind {
-                worker::FailureKind::Input => Failure::Input(error.message),
-                _ => Failure::Work(error.message),
-            })?;
-            let [.., last] = looks[..] else { return Err(Failure::Work("nothing was measured".into())) };
-            output.note(format!(
-                "{} of {runs}: {}, seed {seed}: {:.2} dB, {:.1} CPU s",
-                lines.len() + 1,
-                variant.name,
-                last.psnr,
-                last.cpu_seconds
-            ));
-            let mut line = Ablation {
-                commit: commit().to_owned(),
-                machine: ::bench::machine(),
-                scene: args.scene.clone().unwrap_or_else(|| cameras::name_of(&args.capture)),
-                downscale: args.downscale,
-                backend: backend.name(),
-                threads: args.threads,
-                variant: variant.name.to_owned(),
-                seed,
-                steps: plan.settings.steps,
-                budget: plan.settings.budget,
-                reached: Vec::new(),
-                psnr: last.psnr,
-                splats: last.splats,
-                cpu_seconds: last.cpu_seconds,
-                wall_seconds: last.wall_seconds,
-                curve: looks.iter().map(point).collect(),
-                command: invoked(),
-            };
-            if is_known {
-                keep(&mut line, &args.to)?;
-            }
-            lines.push(line);
-        }
     }
-    let targets = targets(args, &lines);
-    if !is_known {
-        lines.iter_mut().try_for_each(|line| keep(line, &targets))?;
+}
+
+/// A line with what all runs have in common.
+fn blank_line(args: &AblateArgs) -> Ablation {
+    Ablation {
+        commit: commit().to_owned(),
+        machine: ::bench::machine(),
+        scene: args.scene.clone().unwrap_or_else(|| captures::name_of(&args.capture)),
+        downscale: args.downscale,
+        threads: args.threads,
+        command: invocation(),
+        ..Ablation::default()
     }
-    let means: Vec<Mean> = variants.iter().map(|variant| mean(variant, &lines)).collect();
-    let scene = lines.first().map_or("", |line| &line.scene);
-    let ablated = Ablated { command: "bench ablate", scene, targets: &targets, means: &means, lines: &lines };
-    output.result(&ablated, &format!("{}appended to {}", table(&targets, &means), file.display()))
 }
 
 fn point(look: &Look) -> CurvePoint {
@@ -148,11 +160,10 @@ fn reached(curve: &[CurvePoint], targets: &[f64]) -> Vec<Reached> {
     targets.iter().map(|&psnr| Reached { psnr, cpu_seconds: cpu_seconds_to(curve, psnr) }).collect()
 }
 
-/// What there is to reach: what was asked for, and the share of what the default gains from its first splats to its end, as means over
-/// seeds.
+/// The target PSNRs: those given, and the given share of the default's gain from its initial to its final splats, as means over seeds.
 fn targets(args: &AblateArgs, lines: &[Ablation]) -> Vec<f64> {
     let mut targets = args.to.clone();
-    let gain = if targets.is_empty() { args.to_gain.or(Some(USUAL_GAIN)) } else { args.to_gain };
+    let gain = if targets.is_empty() { args.to_gain.or(Some(DEFAULT_GAIN)) } else { args.to_gain };
     let of_default = || lines.iter().filter(|line| line.variant == DEFAULT);
     let first = average(of_default().filter_map(|line| Some(line.curve.first()?.psnr)));
     let last = average(of_default().map(|line| line.psnr));
@@ -162,8 +173,8 @@ fn targets(args: &AblateArgs, lines: &[Ablation]) -> Vec<f64> {
     targets
 }
 
-/// The share of the gain to reach where nothing is asked for.
-const USUAL_GAIN: f64 = 0.9;
+/// Target share of the gain if no target is given.
+const DEFAULT_GAIN: f64 = 0.9;
 
 fn average(values: impl Iterator<Item = f64>) -> Option<f64> {
     let (sum, count) = values.fold((0.0, 0u32), |(sum, count), value| (sum + value, count + 1));
@@ -189,10 +200,10 @@ fn mean(variant: &Variant, lines: &[Ablation]) -> Mean {
     }
 }
 
-/// The means as text, a row a variant, each time beside its share of the default's.
+/// The means as text, a row per variant; each time with its ratio to the default's.
 fn table(targets: &[f64], means: &[Mean]) -> String {
     let heads: String = targets.iter().map(|target| format!(" {:>18}", format!("s to {target:.2} dB"))).collect();
-    let mut text = format!("{:<14}{heads} {:>9} {:>9} {:>18}\n", "variant", "PSNR, dB", "splats", "CPU s in all");
+    let mut text = format!("{:<14}{heads} {:>9} {:>9} {:>18}\n", "variant", "PSNR, dB", "splats", "CPU s in total");
     let default = means.iter().find(|mean| mean.variant == DEFAULT);
     let beside = |value: Option<f64>, usual: Option<f64>| match (value, usual) {
         (Some(value), Some(usual)) if usual > 0.0 => format!("{value:.2} ({:.2}×)", value / usual),
@@ -216,8 +227,8 @@ mod tests {
     use clap::Parser;
 
     use super::*;
+    use crate::ablation_variants::named;
     use crate::args::{BenchCommand, Cli, Command};
-    use crate::variants::named;
 
     fn args(words: &[&str]) -> Box<AblateArgs> {
         let cli = Cli::try_parse_from(["plat", "bench", "ablate", "c"].iter().chain(words)).unwrap();
@@ -253,7 +264,7 @@ mod tests {
     }
 
     #[test]
-    fn the_gain_is_the_defaults_mean_over_seeds() {
+    fn the_target_gain_is_the_defaults_mean_over_seeds() {
         let lines = [
             line(DEFAULT, 0, &[(0.0, 10.0), (4.0, 20.0)]),
             line("fine", 0, &[(0.0, 1.0), (4.0, 90.0)]),
@@ -269,7 +280,7 @@ mod tests {
     }
 
     #[test]
-    fn a_seed_that_never_gets_there_leaves_no_mean() {
+    fn a_seed_that_never_reaches_the_target_leaves_no_mean() {
         let mut lines = [
             line("fine", 0, &[(0.0, 12.0), (4.0, 20.0)]),
             line("fine", 1, &[(0.0, 12.0), (8.0, 20.0)]),

@@ -1,5 +1,5 @@
-//! `plat coordinator`: hosts jobs for the workers of a cluster, until it is told to stop. Of several on one store one leads, the
-//! others stand by.
+//! `plat coordinator`: schedules the jobs of a cluster until it is stopped. Of several coordinators on one store one is the leader, the
+//! others are on standby.
 
 use std::net::SocketAddr;
 use std::path::Path;
@@ -17,17 +17,17 @@ use crate::args::CoordinatorArgs;
 use crate::failure::{Failure, cannot};
 use crate::output::Output;
 use crate::remote::{key_pair, pem, runtime, token};
-use crate::signals::until_told;
-use crate::told::Metrics;
+use crate::signals::until_signalled;
+use crate::telemetry_setup::MetricsListener;
 
-/// Lines of the journal that may wait for the disk.
-const JOURNAL_LAG: usize = 100_000;
+/// Capacity of the journal's queue, lines.
+const JOURNAL_QUEUE: usize = 100_000;
 
 #[derive(Serialize)]
 struct Hosted {
     command: &'static str,
     listen: String,
-    /// As its lease says it to others.
+    /// The URL in its lease.
     address: String,
     store: String,
 }
@@ -42,44 +42,44 @@ pub(crate) fn run(args: &CoordinatorArgs, output: &Output) -> Result<(), Failure
     let runtime = runtime()?;
     let hosted = runtime.block_on(async {
         let listener = TcpListener::bind(args.listen).await.map_err(|error| {
-            let advice = "choose another address, or stop what has it";
+            let advice = "choose another address, or stop the program that uses it";
             BadInput::new(format!("--listen {}", args.listen), format!("cannot be listened on ({error})"), advice)
         })?;
-        let address = listener.local_addr().map_err(ServeError::Listen).map_err(of_serve)?;
+        let address = listener.local_addr().map_err(ServeError::Listen).map_err(serve_failure)?;
         security.check(address)?;
-        let metrics = Metrics::listen(&args.told).await?;
+        let metrics = MetricsListener::bind(&args.telemetry).await?;
         let store = Store::open(&absolute(&args.store)?)?;
-        let reached = reached_at(args, address, security.identity.is_some())?;
-        let durable = Some(Durable::new(&reached)?);
+        let advertised = advertised_url(args, address, security.identity.is_some())?;
+        let durable = Some(Durable::new(&advertised)?);
         let mut options = Options { durable, security, ..Options::new(store.clone()) };
         options.settings.lease_millis = (args.lease_seconds * 1e3) as u64;
         let journal = match &args.journal {
             None => None,
             Some(path) => {
-                let (sender, lines) = mpsc::channel(JOURNAL_LAG);
+                let (sender, lines) = mpsc::channel(JOURNAL_QUEUE);
                 options.journal = Some(sender);
                 Some(keep_journal(path, lines)?)
             }
         };
-        output.note(format!("listening on {address}, reached at {reached}, store {}", store.url()));
-        let _told = metrics.tell(output, |registry| options.metrics.register(registry));
+        output.note(format!("listening on {address}, advertised as {advertised}, store {}", store.url()));
+        let _served = metrics.serve(output, |registry| options.metrics.register(registry));
         let stop = CancellationToken::new();
-        let told = tokio::spawn(until_told(stop.clone()));
-        let served = serve(listener, options, stop.cancelled_owned()).await.map_err(of_serve);
-        told.abort();
+        let signals = tokio::spawn(until_signalled(stop.clone()));
+        let served = serve(listener, options, stop.cancelled_owned()).await.map_err(serve_failure);
+        signals.abort();
         if let Some(journal) = journal {
-            // Ends with the last line, as whoever wrote is gone.
+            // Ends after the last line, as the sender is dropped.
             journal.await.map_err(|error| Failure::Work(error.to_string()))??;
         }
         let listen = address.to_string();
-        let hosted = Hosted { command: "coordinator", listen, address: reached, store: store.url().into() };
+        let hosted = Hosted { command: "coordinator", listen, address: advertised, store: store.url().into() };
         served.map(|()| hosted)
     })?;
     let text = format!("stopped listening on {}", hosted.listen);
     output.result(&hosted, &text)
 }
 
-fn of_serve(error: ServeError) -> Failure {
+fn serve_failure(error: ServeError) -> Failure {
     match error {
         ServeError::Input(error) => error.into(),
         other => Failure::Work(other.to_string()),
@@ -87,19 +87,19 @@ fn of_serve(error: ServeError) -> Failure {
 }
 
 /// The URL under which workers and other coordinators find this one.
-fn reached_at(args: &CoordinatorArgs, address: SocketAddr, encrypted: bool) -> Result<String, Failure> {
+fn advertised_url(args: &CoordinatorArgs, address: SocketAddr, encrypted: bool) -> Result<String, Failure> {
     match &args.advertise {
         Some(url) => Ok(url.clone()),
         None if address.ip().is_unspecified() => {
-            let problem = "does not say under which name others reach this machine";
-            let advice = "give --advertise https://NAME:PORT, a name that the certificate is for";
+            let problem = "is the address of no machine, so others cannot connect to it";
+            let advice = "give --advertise https://NAME:PORT with a name of the certificate";
             Err(BadInput::new(format!("--listen {}", args.listen), problem, advice).into())
         }
         None => Ok(format!("{}://{address}", if encrypted { "https" } else { "http" })),
     }
 }
 
-/// The store's URL as every process of the machine understands it.
+/// The store's URL with an absolute path, so that it is valid for every process of the machine.
 fn absolute(url: &str) -> Result<String, Failure> {
     if url.contains("://") || url.is_empty() {
         return Ok(url.into());
@@ -108,7 +108,7 @@ fn absolute(url: &str) -> Result<String, Failure> {
     Ok(path.display().to_string())
 }
 
-/// Writes the scheduler's journal, line by line. A disk that refuses one is told, and the jobs go on without.
+/// Writes the scheduler's journal, line by line. After a write error the jobs go on; the error is reported at the end.
 fn keep_journal(
     path: &Path,
     mut lines: mpsc::Receiver<String>,

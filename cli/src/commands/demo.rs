@@ -1,27 +1,28 @@
-//! `plat demo`: a small synthetic city from nothing to pictures.
+//! `plat demo`: builds a small synthetic city, trains it, and renders pictures of it.
 
 use std::path::{Path, PathBuf};
 
-use ::bench::{CurvePoint, birdseye_camera, oblique_camera, write_png};
+use ::bench::CurvePoint;
 use ::render::cpu::Renderer;
 use city::{CitySettings, Traffic};
 use dataset::synth::{self, Settings, Summary};
+use eval::{Photos, birdseye_camera, frame_image, oblique_camera, write_png};
 use glam::DVec3;
+use model::Model;
+use scene::Capture;
 use serde::Serialize;
 use store::Store;
 
 use crate::args::{Auto, Backend, Blocks, DemoArgs, PlanOptions, TrainArgs};
-use crate::commands::eval::evaluate;
-use crate::commands::render::to_image;
+use crate::commands::eval::measure_trained;
 use crate::commands::train::{Report, train};
 use crate::failure::Failure;
-use crate::model::{self, save_json};
 use crate::output::Output;
 
-/// Width of the pictures from above, pixels.
+/// Width of the overview pictures, pixels.
 const PICTURE_WIDTH: u32 = 1200;
 
-/// The demo as it was built.
+/// Results of the demo.
 pub(crate) struct Built {
     pub(crate) shown: Shown,
     pub(crate) text: String,
@@ -43,15 +44,15 @@ pub(crate) fn run(args: &DemoArgs, output: &Output) -> Result<(), Failure> {
     output.result(&built.shown, &built.text)
 }
 
-/// Builds the city, trains it, measures it and draws it.
+/// Builds the city, trains it, renders the overviews and measures the model.
 pub(crate) fn build(args: &DemoArgs, output: &Output) -> Result<Built, Failure> {
     let city_folder = args.out.join("capture");
     let (city, train_args) = settings(args);
     let metres = city.city.extent_metres();
     output.note(format!("building a city of {metres:.0} m and taking {} photos of it", city.views));
-    let built = rehearsed(&city_folder, &city, output)?;
+    let built = synthesise(&city_folder, &city, output)?;
     output.note(format!(
-        "{} things in {} triangles, {} photos, {} sparse points",
+        "{} objects in {} triangles, {} photos, {} sparse points",
         built.actors, built.triangles, built.views, built.points
     ));
 
@@ -60,20 +61,12 @@ pub(crate) fn build(args: &DemoArgs, output: &Output) -> Result<Built, Failure> 
     let store = Store::open(&args.out.join("store").display().to_string())?.blocking();
     let eval_folder = args.out.join("eval");
     let [birdseye, oblique] = ["birdseye.png", "oblique.png"].map(|name| args.out.join(name));
-    let (up, mut renderer) = (DVec3::Z, Renderer::default());
-    for (path, camera) in [
-        (&birdseye, birdseye_camera(&trained.capture, up, PICTURE_WIDTH)),
-        (&oblique, oblique_camera(&trained.capture, up, PICTURE_WIDTH)),
-    ] {
-        let frame = renderer.forward(&model.splats, None, &camera, &model.options());
-        write_png(path, &to_image(frame))?;
-    }
-    let every = train_args.plan.test_every;
-    let evaluated = evaluate(&model, trained.capture, store, every, None, &eval_folder, output)?;
-    save_json(&eval_folder.join("report.json"), &evaluated)?;
+    render_overviews(&model, &trained.capture, &birdseye, &oblique)?;
+    let photos = Photos::ingested(trained.capture, store, train_args.plan.test_every, train_args.plan.downscale);
+    let evaluated = measure_trained(&model, &photos, None, &eval_folder, output)?;
 
     let mut report = trained.report;
-    report.record.measured(&evaluated.record);
+    report.record.set_quality(&evaluated.record);
     report.record.command = "demo";
     let text = format!(
         "a city of {metres:.0} m in {} splats and {} blocks, {:.1} dB PSNR and {:.3} SSIM on {} held-out photos,\n\
@@ -82,7 +75,7 @@ pub(crate) fn build(args: &DemoArgs, output: &Output) -> Result<Built, Failure> 
          from the south      {}\n\
          photo|render|error  {}\n\
          the plan            {}\n\
-         the model           {} (any splat viewer opens it)",
+         the model           {} (opens in any splat viewer)",
         report.record.splats,
         report.tasks,
         report.record.psnr.unwrap_or_default(),
@@ -101,13 +94,24 @@ pub(crate) fn build(args: &DemoArgs, output: &Output) -> Result<Built, Failure> 
     Ok(Built { shown, text, curve: trained.curve })
 }
 
-/// Photographs the city, in the place of an older one.
-pub(crate) fn rehearsed(folder: &Path, settings: &Settings, output: &Output) -> Result<Summary, Failure> {
-    let bars = output.stages();
-    Ok(synth::replace(folder, settings, &|what, done, total| bars.at(what, done, total))?)
+fn render_overviews(model: &Model, capture: &Capture, birdseye: &Path, oblique: &Path) -> Result<(), Failure> {
+    let (up, mut renderer) = (DVec3::Z, Renderer::default());
+    for (path, camera) in
+        [(birdseye, birdseye_camera(capture, up, PICTURE_WIDTH)), (oblique, oblique_camera(capture, up, PICTURE_WIDTH))]
+    {
+        let frame = renderer.forward(&model.splats, None, &camera, &model.options());
+        write_png(path, &frame_image(frame))?;
+    }
+    Ok(())
 }
 
-/// The city and how it is trained.
+/// Writes the synthetic capture of a city; replaces an older one.
+pub(crate) fn synthesise(folder: &Path, settings: &Settings, output: &Output) -> Result<Summary, Failure> {
+    let bars = output.stages();
+    Ok(synth::replace(folder, settings, &|what, done, total| bars.at(what, done as u64, total as u64, ""))?)
+}
+
+/// Settings of the city and of its training.
 pub(crate) fn settings(args: &DemoArgs) -> (Settings, TrainArgs) {
     let city = CitySettings { traffic: Traffic::Light, ..CitySettings::default() };
     let whole = Settings { city, views: 320, width: 240, height: 160, aerial: 0.4, ..Settings::default() };

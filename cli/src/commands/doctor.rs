@@ -1,4 +1,4 @@
-//! `plat doctor`: whether a store does what a cluster relies on, found out by trying.
+//! `plat doctor`: tests whether a store has the guarantees that a cluster needs.
 
 use std::hash::{BuildHasher, RandomState};
 use std::time::{Duration, Instant};
@@ -11,12 +11,12 @@ use crate::args::DoctorArgs;
 use crate::failure::Failure;
 use crate::output::Output;
 
-/// What was found, as `--json` says it.
+/// The findings as JSON.
 #[derive(Debug, Serialize)]
 struct Report<'a> {
     store: &'a str,
     fit: bool,
-    /// Races that many writers ran to create one object, and those with one winner.
+    /// Races of many writers to create one object, and how many of them had exactly one winner.
     races: usize,
     races_held: usize,
     writers: usize,
@@ -37,7 +37,7 @@ pub(crate) fn run(args: &DoctorArgs, output: &Output) -> Result<(), Failure> {
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build();
     let runtime = runtime.map_err(|error| Failure::Work(format!("cannot start threads: {error}")))?;
     let began = Instant::now();
-    // Two doctors may look at one store at the same time, from machines that number their processes alike.
+    // Unique even if two machines test one store at the same time with equal process ids.
     let tag = format!("{:016x}", RandomState::new().hash_one(std::process::id()));
     let found = runtime.block_on(examine(&store, &tag, &|| began.elapsed()))?;
     output.result(&report(&args.store, &found), &text(&args.store, &found))?;
@@ -72,7 +72,8 @@ fn text(store: &str, found: &Findings) -> String {
     let of = |what: &str, latency: Latency| {
         format!("{what:<10} p50 {:8.2} ms   p99 {:8.2} ms\n", millis(latency.p50), millis(latency.p99))
     };
-    let mut text = format!("atomic create of {WRITERS} writers: {} of {RACES} races held\n", found.races_held);
+    let mut text =
+        format!("atomic create by {WRITERS} writers: {} of {RACES} races had exactly one winner\n", found.races_held);
     text += &of("create", found.create);
     text += &of("overwrite", found.overwrite);
     text += &of("read", found.read);

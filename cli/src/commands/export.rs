@@ -1,4 +1,4 @@
-//! `plat export`: a model in a format that other programs read.
+//! `plat export`: writes a model in a format that other programs read.
 
 use std::path::Path;
 
@@ -6,9 +6,7 @@ use serde::Serialize;
 use store::file::save;
 
 use crate::args::{ExportArgs, Format};
-use crate::commands::train::make_folder;
-use crate::failure::Failure;
-use crate::model;
+use crate::failure::{Failure, make_folder};
 use crate::output::Output;
 
 #[derive(Serialize)]

@@ -1,4 +1,4 @@
-//! `plat inspect`: what is in a capture, how it would be divided, and what that would take.
+//! `plat inspect`: what is in a capture, how it would be divided, and what training it would cost.
 
 use std::collections::BTreeMap;
 
@@ -8,10 +8,10 @@ use serde::Serialize;
 use worker::estimate::Estimate;
 
 use crate::args::InspectArgs;
-use crate::commands::plan::{describe, plan_of};
+use crate::captures;
 use crate::failure::Failure;
 use crate::output::Output;
-use crate::{cameras, commands::train::check_plan};
+use crate::planning::{check_plan, describe, plan_of};
 
 #[derive(Serialize)]
 struct Inspected {
@@ -32,12 +32,12 @@ struct Inspected {
     levels: Option<u8>,
     tasks: Option<usize>,
     estimate: Option<Estimate>,
-    /// Why it cannot be trained; null if it can.
+    /// Why the capture cannot be trained; null if it can.
     problem: Option<String>,
 }
 
 pub(crate) fn run(args: &InspectArgs, output: &Output) -> Result<(), Failure> {
-    let source = cameras::open(&args.capture, &Output::new(false, true, false))?;
+    let source = captures::open(&args.capture, &Output::silent())?;
     let planned = plan_of(&source.capture, &args.plan);
     let planned = planned.and_then(|(capture, plan)| {
         check_plan(&plan, &capture, output)?;
@@ -54,7 +54,7 @@ pub(crate) fn run(args: &InspectArgs, output: &Output) -> Result<(), Failure> {
         .then(|| points.seen_by.len() as f64 / points.len() as f64);
     let inspected = Inspected {
         command: "inspect",
-        scene: cameras::name_of(&args.capture),
+        scene: captures::name_of(&args.capture),
         format: source.format,
         views: capture.views.len(),
         sizes,
@@ -89,10 +89,10 @@ fn text(found: &Inspected, plan: Option<&Plan>) -> String {
             "origin at {:.6}° north, {:.6}° east, {:.1} m\n",
             at.latitude_degrees, at.longitude_degrees, at.altitude_metres
         ),
-        None => "no geographic origin: lengths are in the capture's own unit\n".into(),
+        None => "no geographic origin: lengths are in the capture's unit\n".into(),
     };
-    for (name, why) in &found.left_out {
-        text += &format!("left out {name}: {why}\n");
+    for (name, reason) in &found.left_out {
+        text += &format!("left out {name}: {reason}\n");
     }
     match (plan, &found.problem) {
         (Some(plan), _) => text += &describe(plan),
@@ -102,7 +102,7 @@ fn text(found: &Inspected, plan: Option<&Plan>) -> String {
     text
 }
 
-/// Extent of the points along the ground's axes and up, outliers left out.
+/// Extent of the points along the ground's axes and up, without outliers.
 fn extent_metres(capture: &Capture) -> [f64; 3] {
     let ground = blocks::Ground::of(capture);
     let points: Vec<_> =

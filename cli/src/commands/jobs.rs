@@ -1,4 +1,4 @@
-//! What people ask of a cluster: `plat jobs`, `status`, `cancel`, `pause`, `resume`, `retry`, `forget`, `logs`.
+//! `plat jobs`, `status`, `cancel`, `pause`, `resume`, `retry`, `forget`, `logs`: query and control the jobs of a cluster.
 
 use proto::control_request::What;
 use proto::{Client, ControlRequest, LogsRequest, Outcome, StatusReply, StatusRequest};
@@ -6,11 +6,11 @@ use serde::Serialize;
 
 use crate::args::{Connection, JobArgs, JobsArgs, LogsArgs, RetryArgs, StatusArgs, TaskName};
 use crate::failure::Failure;
-use crate::live::{Live, map, name_of};
+use crate::live_status::{LiveStatus, map, name_of};
 use crate::output::{Output, print};
-use crate::remote::{Remote, judge};
+use crate::remote::{Remote, result_of};
 
-/// Pause before the log is asked for news.
+/// Pause between two queries of the log.
 const FOLLOW_PERIOD: std::time::Duration = std::time::Duration::from_millis(500);
 
 /// A job in the JSON of these commands.
@@ -95,7 +95,7 @@ struct Status {
     command: &'static str,
     #[serde(flatten)]
     job: Job,
-    /// The first hundred tasks under way.
+    /// The first hundred running tasks.
     running: Vec<Task>,
     /// The first hundred that failed or are quarantined.
     failures: Vec<Task>,
@@ -104,16 +104,16 @@ struct Status {
 pub(crate) fn status(args: &StatusArgs, output: &Output) -> Result<(), Failure> {
     let mut remote = Remote::open(&args.connection)?;
     let mut reply = status_of(&mut remote, args.job)?;
-    // The plan may be gone from the store, or not to be reached: then there is no map, and all else is the same.
+    // If the plan cannot be read from the store, only the map is missing.
     let blocks = remote.blocks(args.job).unwrap_or_default();
     let mut ended = Ok(());
     let mut drawing = String::new();
     if args.watch {
-        let mut live = Live::new(args.job, blocks.clone(), output);
+        let mut live = LiveStatus::new(args.job, blocks.clone(), output);
         let tasks = Job::of(&reply).tasks;
-        let followed = remote.follow(args.job, tasks, output, |results, news| live.note(results, news))?;
+        let followed = remote.follow(args.job, tasks, output, |results, update| live.update(results, update))?;
         if let Some((outcome, results)) = followed {
-            ended = judge(args.job, outcome, &results);
+            ended = result_of(args.job, outcome, &results);
             drawing = map(&blocks, results.tasks(), false).join("\n") + "\n";
         }
         reply = status_of(&mut remote, args.job)?;
@@ -149,7 +149,7 @@ fn status_of(remote: &mut Remote, job: u64) -> Result<StatusReply, Failure> {
     remote.call(async |client: &mut Client| client.status(StatusRequest { job }).await)
 }
 
-/// What the commands that change a job answer.
+/// Result of the commands that change a job.
 #[derive(Debug, Serialize)]
 struct Changed {
     command: &'static str,
@@ -185,7 +185,7 @@ pub(crate) fn retry(args: &RetryArgs, output: &Output) -> Result<(), Failure> {
             let blocks = Remote::open(&args.connection)?.blocks(args.job)?;
             let found = blocks.iter().position(|of| *of == block);
             let missing =
-                || Failure::Input(format!("{}: job {} has none; plat status lists them", args.task, args.job));
+                || Failure::Input(format!("{}: is not in job {}; plat status lists its tasks", args.task, args.job));
             u32::try_from(found.ok_or_else(missing)?).unwrap_or(u32::MAX)
         }
     };
@@ -210,13 +210,13 @@ pub(crate) fn forget(args: &JobArgs, output: &Output) -> Result<(), Failure> {
     struct Forgotten {
         command: &'static str,
         job: u64,
-        /// Artefacts.
+        /// Number of artefacts.
         deleted: u32,
     }
     let mut remote = Remote::open(&args.connection)?;
     let request = ControlRequest { job: args.job, what: Some(What::Forget(proto::Forget {})) };
     let deleted = remote.call(async |client: &mut Client| client.control(request).await)?.deleted;
-    let text = format!("job {} is forgotten, and {deleted} artefacts with it", args.job);
+    let text = format!("job {} and {deleted} artefacts were deleted", args.job);
     output.result(&Forgotten { command: "forget", job: args.job, deleted }, &text)
 }
 
@@ -243,11 +243,11 @@ pub(crate) fn logs(args: &LogsArgs, output: &Output) -> Result<(), Failure> {
     let blocks = remote.blocks(job).unwrap_or_default();
     let (mut lines, mut after) = (Vec::new(), 0);
     loop {
-        // Asked before the page: what was said until a job was over is read to its end.
-        let over = status_of(&mut remote, job)?.outcome.is_some();
+        // Queried before the page, so that the log of a job that has ended is read to its end.
+        let has_ended = status_of(&mut remote, job)?.outcome.is_some();
         let page = remote.call(async |client: &mut Client| client.logs(LogsRequest { job, after }).await)?.lines;
         let Some(last) = page.last() else {
-            if over || !args.follow {
+            if has_ended || !args.follow {
                 break;
             }
             std::thread::sleep(FOLLOW_PERIOD);
@@ -274,7 +274,7 @@ pub(crate) fn logs(args: &LogsArgs, output: &Output) -> Result<(), Failure> {
     if output.is_json() { output.result(&Logs { command: "logs", job, lines }, "") } else { Ok(()) }
 }
 
-/// A line for a person: how long ago, what, with whom.
+/// A log line as text: age, message, worker.
 fn describe(line: &LogLine, blocks: &[scene::BlockId]) -> String {
     let seconds = line.seconds_ago as u64;
     let mut text = format!("-{:02}:{:02}:{:02}  ", seconds / 3600, seconds / 60 % 60, seconds % 60);

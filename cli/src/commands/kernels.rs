@@ -1,36 +1,21 @@
-//! `plat bench kernels`: the time of the renderer's stages, on the CPU beside what the machine can do; and where the two
-//! backends part.
+//! `plat bench kernels`: times the renderer's stages, on the CPU with the machine's roofline, and compares the stages of both backends.
 
 mod bisect;
 mod compare;
 mod cpu;
 mod gpu;
+mod scene;
 
-use ::render::Options;
-use ::render::cpu::Stage;
 use bench::parts::{Kernels, StageTime};
 use bench::{PartLine, append_part};
-use glam::{DQuat, DVec3, Vec3};
-use scene::{Camera, Pinhole, Rigid, Splat, Splats};
-use train::random;
 
-use crate::args::{Backend, KernelsArgs, Size};
-use crate::commands::train::{make_folder, open_gpu};
-use crate::failure::Failure;
+use crate::args::{Backend, KernelsArgs};
+use crate::backend::open_gpu;
+use crate::failure::{Failure, make_folder};
 use crate::output::Output;
-use crate::{cameras, model};
 
-/// Passes before the clock counts: buffers grow, caches fill.
-const WARM_UP: usize = 2;
-/// The file of these measurements.
+/// The file of kernel timings.
 const LINES: &str = "kernels.jsonl";
-
-/// What is drawn.
-struct Scene {
-    splats: Splats,
-    options: Options,
-    cameras: Vec<Camera>,
-}
 
 pub(crate) fn run(args: &KernelsArgs, output: &Output) -> Result<(), Failure> {
     let gpu = match (args.backend, args.from_stage) {
@@ -38,9 +23,9 @@ pub(crate) fn run(args: &KernelsArgs, output: &Output) -> Result<(), Failure> {
         _ => None,
     };
     if gpu.is_none() && args.views > 1 {
-        return Err(Failure::Input("--views: only a GPU draws views side by side: give --backend gpu".into()));
+        return Err(Failure::Input("--views: needs a GPU; give --backend gpu".into()));
     }
-    let scene = scene(args)?;
+    let scene = scene::scene(args)?;
     let pool = rayon::ThreadPoolBuilder::new().num_threads(args.threads as usize).build();
     let pool = pool.map_err(|error| Failure::Work(format!("cannot start {} threads: {error}", args.threads)))?;
     if let (Some(gpu), Some(from)) = (&gpu, args.from_stage) {
@@ -66,7 +51,7 @@ fn text(timed: &Kernels) -> String {
         timed.splats,
         timed.width,
         timed.height,
-        timed.views.map_or(String::new(), |views| format!("{views} views side by side, each "),),
+        timed.views.map_or(String::new(), |views| format!("{views} views in one pass, each "),),
         timed.pairs,
         timed.backend,
         timed.threads,
@@ -77,10 +62,10 @@ fn text(timed: &Kernels) -> String {
         timed.backward_wall_millis,
     );
     if let (Some(flops), Some(bytes)) = (timed.ceiling_gflops, timed.ceiling_gbytes) {
-        text += &format!("ceilings of one core: {flops:.1} Gflop/s, {bytes:.1} GB/s\n");
+        text += &format!("roofline of one core: {flops:.1} Gflop/s, {bytes:.1} GB/s\n");
     }
     if let Some(clock) = &timed.clock {
-        text += &format!("stages by the clock: {clock}\n");
+        text += &format!("stages timed by: {clock}\n");
     }
     for StageTime { stage, cpu_millis, device_millis, gflops, gbytes, of_ceiling } in &timed.stages {
         let rate = match (gflops, gbytes) {
@@ -89,73 +74,11 @@ fn text(timed: &Kernels) -> String {
             (None, None) => String::new(),
         };
         let share = of_ceiling.map_or(String::new(), |share| format!("{:>4.0} %", 100.0 * share));
-        let (millis, whose) = match (cpu_millis, device_millis) {
+        let (millis, clock) = match (cpu_millis, device_millis) {
             (Some(millis), _) => (*millis, "CPU"),
             (None, millis) => (millis.unwrap_or_default(), "device"),
         };
-        text += &format!("{stage:<19} {millis:>7.2} ms {whose}  {rate} {share}\n");
+        text += &format!("{stage:<19} {millis:>7.2} ms {clock}  {rate} {share}\n");
     }
     text
-}
-
-/// Bytes that a stage has to read and write at least, where that is what it is about.
-fn bytes(stage: Stage, splats: &Splats, pairs: f64) -> Option<f64> {
-    /// A projected splat or a pair's moments: a cache line.
-    const RECORD: f64 = 64.0;
-    const FLOAT: f64 = 4.0;
-    let count = splats.len() as f64;
-    let parameters = FLOAT * splats.columns().len() as f64 * count;
-    match stage {
-        Stage::Project => Some(parameters + RECORD * count),
-        Stage::Bin => Some(RECORD * count + 2.0 * 8.0 * pairs),
-        Stage::Reduce => Some(RECORD * (pairs + count)),
-        Stage::ProjectBackward => Some(2.0 * parameters + RECORD * count),
-        Stage::Sort | Stage::Rasterize | Stage::RasterizeBackward => None,
-    }
-}
-
-fn median(mut values: Vec<f64>) -> f64 {
-    values.sort_by(f64::total_cmp);
-    values[values.len() / 2]
-}
-
-fn scene(args: &KernelsArgs) -> Result<Scene, Failure> {
-    let (Some(path), Some(from)) = (&args.model, &args.cameras) else {
-        let (splats, cameras) = (cloud(args.splats), vec![front(args.size)]);
-        return Ok(Scene { splats, options: Options::default(), cameras });
-    };
-    let model = model::read(path)?;
-    let views = cameras::read(from)?.into_iter();
-    let resized = |(_, camera): (String, Camera)| cameras::resized(&camera, args.size.width, args.size.height);
-    Ok(Scene { splats: model.splats.clone(), options: model.options(), cameras: views.map(resized).collect() })
-}
-
-/// Random splats of SH degree 3 in a box before the camera, of sizes that cover it a few times.
-fn cloud(count: u32) -> Splats {
-    let mut splats = Splats::new(3);
-    let edge = 6.0 / (count as f32).cbrt();
-    for i in 0..u64::from(count) {
-        let unit = |k: u64| (random::bits(i, k) >> 40) as f32 / (1u64 << 24) as f32;
-        let at = Vec3::new(unit(0) - 0.5, unit(1) - 0.5, unit(2) - 0.5) * 6.0;
-        let size = (0.3 * edge * (0.5 + unit(3))).ln();
-        let mut splat = Splat::round(at, size, Vec3::new(unit(4), unit(5), unit(6)), 0.1 + 0.8 * unit(7));
-        splat.log_scale += Vec3::new(unit(8), unit(9), unit(10)) - 0.5;
-        splat.quat = [unit(11) - 0.5, unit(12) - 0.5, unit(13) - 0.5, unit(14) - 0.5];
-        for (k, coefficient) in splat.sh.iter_mut().enumerate().skip(1) {
-            *coefficient = [0.1 * (unit(15 + k as u64) - 0.5); 3];
-        }
-        splats.push(&splat);
-    }
-    splats
-}
-
-/// A camera that sees the box.
-fn front(size: Size) -> Camera {
-    let Size { width, height } = size;
-    let focal = f64::from(width.max(height));
-    let (cx, cy) = (0.5 * f64::from(width), 0.5 * f64::from(height));
-    Camera {
-        pinhole: Pinhole { width, height, fx: focal, fy: focal, cx, cy },
-        camera_from_world: Rigid { rotation: DQuat::IDENTITY, translation: DVec3::new(0.0, 0.0, 8.0) },
-    }
 }

@@ -1,34 +1,31 @@
-//! `plat bench pareto`: trains every combination of captures and values, measures the merged models, and appends a line for each.
+//! `plat bench pareto`: trains every combination of captures and option values, measures the models, and appends a line for each.
 //!
-//! Runs come one after the other in an order that mixes all values, seed by seed, so that what else the machine does hits all alike.
-//! A run whose line is there already is left out: a sweep that was stopped goes on.
+//! Seeds come one after the other; within a seed the runs are shuffled, so that other load on the machine affects all values alike.
+//! Runs whose line exists are skipped, so an interrupted sweep can be resumed.
 
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
-use ::bench::{CurvePoint, ResultLine, append, read};
+use ::bench::{ResultLine, read};
+use eval::{Lpips, Photos};
 use scene::BadInput;
 use serde::Serialize;
 use store::Store;
 use train::random;
 
 use crate::args::{Auto, Backend, Named, ParetoArgs, PlanOptions, TrainArgs};
-use crate::cameras;
+use crate::captures;
 use crate::clock;
-use crate::commands::bench::invoked;
-use crate::commands::eval::{self, evaluate};
-use crate::commands::plan::plan_of;
-use crate::commands::train::{Trained, make_folder, resolved, train};
+use crate::commands::eval::measure_trained;
+use crate::commands::train::{Trained, resolved, store_url, train};
+use crate::eval_report::text;
 use crate::failure::{Failure, cannot};
-use crate::lpips::Lpips;
-use crate::model::{self, save_json};
 use crate::output::Output;
-use crate::record::{Record, commit};
+use crate::planning::plan_of;
+use crate::result_lines::{RUNS, append_run, line_of};
+use crate::run_record::commit;
 
-/// The file of our own runs.
-const RUNS: &str = "plat.jsonl";
-
-/// A combination.
+/// One combination of a sweep.
 #[derive(Debug, Clone)]
 struct Run {
     label: String,
@@ -39,9 +36,9 @@ struct Run {
 #[derive(Serialize)]
 struct Swept<'a> {
     command: &'static str,
-    /// Of all combinations, in the order in which they ran.
+    /// Of all combinations, in the order of the runs.
     lines: &'a [ResultLine],
-    /// Those of them that were there already.
+    /// Number of lines that existed before.
     skipped: usize,
 }
 
@@ -49,29 +46,29 @@ pub(crate) fn run(args: &ParetoArgs, output: &Output) -> Result<(), Failure> {
     let lpips = args.lpips.as_deref().map(Lpips::load).transpose()?;
     let runs = runs(args)?;
     let file = args.results.join(RUNS);
-    let mut there = if file.exists() { read(&file)? } else { Vec::new() };
+    let mut existing = if file.exists() { read(&file)? } else { Vec::new() };
     let (mut lines, mut text, mut skipped) = (Vec::new(), String::new(), 0);
     for (n, run) in runs.iter().enumerate() {
-        let known = if args.sweep.train.fresh { None } else { known(run, &there, output)? };
+        let known = if args.sweep.train.fresh { None } else { known(run, &existing, output)? };
         let line = match known {
             Some(line) => {
                 skipped += 1;
-                output.note(format!("{}: its line is there already", described(&line)));
+                output.note(format!("{}: skipped, its line exists", described(&line)));
                 line
             }
             None => {
                 if runs.len() > 1 {
                     output.note(format!("run {} of {}", n + 1, runs.len()));
                 }
-                let (line, measured) = one(run, lpips.as_ref(), output)?;
-                keep(&args.results, &line)?;
+                let (line, figures) = train_and_measure(run, lpips.as_ref(), output)?;
+                append_run(&args.results, &line)?;
                 if runs.len() > 1 {
-                    // A sweep's photos and checkpoints would be there once for each run.
+                    // Photos and checkpoints would fill the disk once per run.
                     let store = run.train.out.join("store");
                     fs::remove_dir_all(&store).map_err(cannot("removed", &store))?;
                 }
-                text = measured;
-                there.push(line.clone());
+                text = figures;
+                existing.push(line.clone());
                 line
             }
         };
@@ -79,8 +76,8 @@ pub(crate) fn run(args: &ParetoArgs, output: &Output) -> Result<(), Failure> {
     }
     let appended = format!("appended to {}", file.display());
     if let [line] = &lines[..] {
-        let said = if skipped > 0 { described(line) } else { format!("{text}\n{appended}") };
-        return output.result(line, &said);
+        let shown = if skipped > 0 { described(line) } else { format!("{text}\n{appended}") };
+        return output.result(line, &shown);
     }
     let swept = Swept { command: "bench pareto", lines: &lines, skipped };
     let each: Vec<String> = lines.iter().map(described).collect();
@@ -88,11 +85,11 @@ pub(crate) fn run(args: &ParetoArgs, output: &Output) -> Result<(), Failure> {
     output.result(&swept, &format!("{}\n{added}", each.join("\n")))
 }
 
-/// Every combination, mixed.
+/// All combinations, shuffled within each seed.
 fn runs(args: &ParetoArgs) -> Result<Vec<Run>, BadInput> {
     let sweep = &args.sweep;
     if args.scene.is_some() && sweep.captures.len() > 1 {
-        return Err(BadInput::new("--scene", "names one capture, there are several", "give each as NAME=PATH"));
+        return Err(BadInput::new("--scene", "names one capture, but there are several", "give each as NAME=PATH"));
     }
     let mut all = Vec::new();
     for (round, &seed) in sweep.seed.iter().enumerate() {
@@ -119,15 +116,15 @@ fn runs(args: &ParetoArgs) -> Result<Vec<Run>, BadInput> {
     if all.len() == 1 {
         all[0].train.out.clone_from(&sweep.train.out);
     } else if sweep.train.store.is_some() {
-        let advice = "leave --store: a line says what all of the work took, photos included";
-        return Err(BadInput::new("--store", "is one run's, there are several", advice));
+        let advice = "leave --store: a line counts all work, ingest included";
+        return Err(BadInput::new("--store", "is for one run, but there are several", advice));
     }
     Ok(all)
 }
 
-/// A run with a folder of its own. A line says what all of the work took, so nothing of earlier runs is used.
+/// A run with a folder of its own. Its line counts all work, so it reuses nothing of earlier runs.
 fn combination(args: &ParetoArgs, capture: &Named, train: TrainArgs) -> Run {
-    let scene = args.scene.clone().or_else(|| capture.name.clone()).unwrap_or_else(|| cameras::name_of(&capture.path));
+    let scene = args.scene.clone().or_else(|| capture.name.clone()).unwrap_or_else(|| captures::name_of(&capture.path));
     let backend = match train.backend {
         Backend::Auto => "auto",
         Backend::Cpu => "cpu",
@@ -142,55 +139,38 @@ fn combination(args: &ParetoArgs, capture: &Named, train: TrainArgs) -> Run {
     Run { label, scene, train: TrainArgs { out, capture: capture.path.clone(), fresh: true, ..train } }
 }
 
-/// The line of this run, where there is one of this commit and this machine.
-fn known(run: &Run, there: &[ResultLine], output: &Output) -> Result<Option<ResultLine>, Failure> {
+/// The existing line of this run, if it is of this commit and machine.
+fn known(run: &Run, existing: &[ResultLine], output: &Output) -> Result<Option<ResultLine>, Failure> {
     let machine = ::bench::machine();
     let alike = |line: &&ResultLine| {
         line.label == run.label && line.scene == run.scene && line.commit == commit() && line.machine == machine
     };
-    if !there.iter().any(|line| alike(&line)) {
+    if !existing.iter().any(|line| alike(&line)) {
         return Ok(None);
     }
-    let source = cameras::open(&run.train.capture, output)?;
+    let source = captures::open(&run.train.capture, output)?;
     let (_, plan) = plan_of(&source.capture, &run.train.plan)?;
     let hash = Some(resolved(&run.train, &plan).1.to_string());
-    Ok(there.iter().rfind(|line| alike(line) && line.config_hash == hash).cloned())
+    Ok(existing.iter().rfind(|line| alike(line) && line.config_hash == hash).cloned())
 }
 
-/// Trains and measures; the line, and the figures as text.
-fn one(run: &Run, lpips: Option<&Lpips>, output: &Output) -> Result<(ResultLine, String), Failure> {
-    clock::forget_peak_memory();
+/// Trains and measures a run; returns its line and the figures as text.
+fn train_and_measure(run: &Run, lpips: Option<&Lpips>, output: &Output) -> Result<(ResultLine, String), Failure> {
+    clock::reset_peak_memory();
     let Trained { capture, report, curve } = train(&run.train, output)?;
     let model = model::read(&run.train.out)?;
-    let store_url = run.train.store.clone().unwrap_or_else(|| run.train.out.join("store").display().to_string());
-    let store = Store::open(&store_url)?.blocking();
+    let store = Store::open(&store_url(&run.train))?.blocking();
     let out = run.train.out.join("eval");
     let mut record = report.record;
-    let evaluated = evaluate(&model, capture, store, run.train.plan.test_every, lpips, &out, output)?;
-    save_json(&out.join("report.json"), &evaluated)?;
+    let plan = &run.train.plan;
+    let photos = Photos::ingested(capture, store, plan.test_every, plan.downscale);
+    let evaluated = measure_trained(&model, &photos, lpips, &out, output)?;
     record.scene.clone_from(&run.scene);
-    record.measured(&evaluated.record);
-    Ok((line_of(&run.label, &record, curve), eval::text(&evaluated)))
+    record.set_quality(&evaluated.record);
+    Ok((line_of(&run.label, &record, curve), text(&evaluated)))
 }
 
-/// A run's line, whose curve ends with the merged model at the end of all work.
-pub(crate) fn line_of(label: &str, record: &Record, mut curve: Vec<CurvePoint>) -> ResultLine {
-    if let (Some(cpu_seconds), Some(psnr)) = (record.cpu_seconds, record.psnr) {
-        curve.pop();
-        curve.push(CurvePoint { cpu_seconds, psnr, splats: Some(record.splats) });
-    }
-    record.line(label, invoked(), curve)
-}
-
-/// Appends a run's line to those of all.
-pub(crate) fn keep(results: &Path, line: &ResultLine) -> Result<PathBuf, Failure> {
-    let file = results.join(RUNS);
-    make_folder(results)?;
-    append(&file, line)?;
-    Ok(file)
-}
-
-/// A line for a person.
+/// A result line as text.
 fn described(line: &ResultLine) -> String {
     let auto = |value: Option<u32>| Auto(value);
     format!(
@@ -230,20 +210,20 @@ mod tests {
                 && all[12..].iter().all(|run| run.train.plan.seed == 3)
         );
         let mut folders: Vec<_> = all.iter().map(|run| run.train.out.clone()).collect();
-        // Mixed: neither one capture after the other nor one number of steps after the other.
+        // Shuffled: neither captures nor steps come in runs.
         let changes = |key: fn(&Run) -> String| all[..12].windows(2).filter(|w| key(&w[0]) != key(&w[1])).count();
         assert!(changes(|run| run.scene.clone()) > 2 && changes(|run| run.train.plan.steps.to_string()) > 4);
         folders.sort();
         folders.dedup();
-        assert_eq!(folders.len(), all.len(), "two runs in one folder");
+        assert_eq!(folders.len(), all.len(), "two runs share a folder");
         assert!(all.iter().all(|run| (run.scene == "a") == (run.train.capture == Path::new("x"))));
         assert!(all.iter().all(|run| run.label == "l" && run.train.fresh));
         let again = runs_of(&["a=x", "y", "--steps", "10,20,auto", "--budget", "5,6", "--seed", "0,3"]).unwrap();
-        assert!(all.iter().zip(&again).all(|(a, b)| a.train.out == b.train.out), "the order is not the same twice");
+        assert!(all.iter().zip(&again).all(|(a, b)| a.train.out == b.train.out), "the order is not deterministic");
     }
 
     #[test]
-    fn one_run_is_as_of_train() {
+    fn a_single_run_uses_the_options_of_train() {
         let [run] = &runs_of(&["--scene", "s", "x", "--steps", "3", "--steps", "10", "--store", "st"]).unwrap()[..]
         else {
             panic!()
@@ -253,7 +233,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_swept_is_refused() {
+    fn options_of_a_single_run_are_refused_in_a_sweep() {
         let line = |words: &[&str]| runs_of(words).unwrap_err();
         assert!(line(&["a", "b", "--scene", "s"]).contains("--scene"));
         assert!(line(&["a", "--steps", "1,2", "--store", "s"]).contains("--store"));

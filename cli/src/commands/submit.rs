@@ -1,8 +1,11 @@
-//! `plat submit`: photos into the coordinator's store, the plan of them to the coordinator; with `--wait` to its end, with
-//! `--out` the model, byte for byte what `plat train` makes of the same plan.
+//! `plat submit`: ingests photos into the coordinator's store and submits their plan as a job.
+//!
+//! With `--wait` it follows the job to its end. With `--out` it also writes the model, with the bytes that `plat train` gives for the
+//! same plan.
 
 use blocks::Plan;
 use dataset::ingest::Ingested;
+use model::save_json;
 use proto::Client;
 use scene::{ArtefactId, BadInput};
 use serde::Serialize;
@@ -10,15 +13,13 @@ use telemetry::traced;
 use tracing::field::Empty;
 
 use crate::args::{Backend, SubmitArgs};
-use crate::cameras;
+use crate::captures::{self, ingest_photos};
 use crate::clock::Stopwatch;
-use crate::commands::plan::plan_of;
-use crate::commands::train::{check_plan, ingest_photos, make_folder};
-use crate::failure::Failure;
-use crate::live::Live;
-use crate::model::{self, save_json};
+use crate::failure::{Failure, make_folder};
+use crate::live_status::LiveStatus;
 use crate::output::Output;
-use crate::remote::{Remote, judge};
+use crate::planning::{check_plan, plan_of};
+use crate::remote::{Remote, result_of};
 
 #[derive(Serialize)]
 struct Submitted {
@@ -28,20 +29,20 @@ struct Submitted {
     capture: ArtefactId,
     backend: String,
     tasks: u32,
-    /// Of the merged model, where it was waited for and written.
+    /// Of the merged model, with `--out`.
     splats: Option<u64>,
     bytes: Option<u64>,
-    /// Of the job, from when it was accepted to its end, where it was waited for.
+    /// From the job's acceptance to its end, with `--wait`.
     job_seconds: Option<f64>,
-    /// Since the command began, where it was waited for.
+    /// From the start of the command to the end of the job, with `--wait`.
     wall_seconds: Option<f64>,
 }
 
 pub(crate) fn run(args: &SubmitArgs, output: &Output) -> Result<(), Failure> {
     let clock = Stopwatch::start();
     let span = tracing::info_span!("submit", job = Empty, tasks = Empty, otel.kind = "client").entered();
-    let source = cameras::open(&args.capture, output)?;
-    // What the plan or the coordinator refuses is said before any photo is read.
+    let source = captures::open(&args.capture, output)?;
+    // Plan and coordinator are checked before any photo is read.
     let (planned_for, plan) = plan_of(&source.capture, &args.plan)?;
     let mut remote = Remote::open(&args.connection)?;
     let about = remote.call(async |client: &mut Client| client.about(proto::AboutRequest {}).await)?;
@@ -71,18 +72,18 @@ pub(crate) fn run(args: &SubmitArgs, output: &Output) -> Result<(), Failure> {
         job_seconds: None,
         wall_seconds: None,
     };
-    let mut text = format!("job {} of {} tasks; plat status {} says how it stands", job.job, job.tasks, job.job);
+    let mut text = format!("job {} of {} tasks; plat status {} shows its progress", job.job, job.tasks, job.job);
     if args.wait {
         output.note(format!("job {} of {} tasks", job.job, job.tasks));
         let blocks = plan.tasks.iter().map(|task| task.block).collect();
-        let mut live = Live::new(job.job, blocks, output);
-        let followed = remote.follow(job.job, job.tasks, output, |results, news| live.note(results, news))?;
+        let mut live = LiveStatus::new(job.job, blocks, output);
+        let followed = remote.follow(job.job, job.tasks, output, |results, update| live.update(results, update))?;
         let Some((outcome, results)) = followed else {
-            let advice = format!("plat status {0} --watch goes on watching, plat cancel {0} ends it", job.job);
-            return Err(Failure::Work(format!("stopped waiting as asked; job {} goes on: {advice}", job.job)));
+            let advice = format!("plat status {0} --watch follows it, plat cancel {0} ends it", job.job);
+            return Err(Failure::Work(format!("stopped waiting after Ctrl-C; job {} goes on: {advice}", job.job)));
         };
         submitted.job_seconds = Some(accepted.wall_seconds());
-        judge(job.job, outcome, &results)?;
+        result_of(job.job, outcome, &results)?;
         text = format!("job {} is done: {} tasks", job.job, job.tasks);
         if let Some(out) = &args.out {
             let results = results.all()?;
@@ -100,8 +101,8 @@ pub(crate) fn run(args: &SubmitArgs, output: &Output) -> Result<(), Failure> {
     output.result(&submitted, &text)
 }
 
-/// What is to compute: what most workers have, of the kind that was asked for. Without any, this machine's CPU stands for theirs;
-/// what a GPU is called only a worker that has it knows.
+/// The backend for the plan: of those that fit `--backend`, the one that most workers have. Without a worker it is this machine's CPU;
+/// a GPU's name is only known from a worker.
 fn backend_of(args: &SubmitArgs, about: &proto::AboutReply, output: &Output) -> Result<String, Failure> {
     let is_cpu = |name: &str| name.starts_with("cpu-");
     let fits = |name: &str| match args.backend {
@@ -113,12 +114,12 @@ fn backend_of(args: &SubmitArgs, about: &proto::AboutReply, output: &Output) -> 
     let name = match fitting {
         Some(of) => of.backend.clone(),
         None if args.backend == Backend::Gpu => {
-            let problem = "gpu: no worker has one, and the plan has to name it";
+            let problem = "gpu: no worker has a GPU, and the plan must name it";
             return Err(BadInput::new("--backend", problem, "start a worker with --backend gpu first").into());
         }
         None => {
             let name = train::Backend::Cpu.name();
-            output.note(format!("no worker computes on {name} yet: the job waits for one"));
+            output.note(format!("no worker has backend {name} yet; the job waits for one"));
             name
         }
     };

@@ -1,11 +1,11 @@
-//! `plat synth`: a capture of a city that was never built.
+//! `plat synth`: writes a synthetic capture of a generated city.
 
 use std::path::PathBuf;
 
-use ::bench::write_png;
 use city::CitySettings;
 use city::faults::Fault;
 use dataset::synth::{self, Settings, Summary};
+use eval::write_png;
 use serde::Serialize;
 
 use crate::args::SynthArgs;
@@ -28,20 +28,21 @@ pub(crate) fn run(args: &SynthArgs, output: &Output) -> Result<(), Failure> {
     let settings = settings(args);
     settings.check()?;
     let stages = output.stages();
-    let progress = |what, done, total| stages.at(what, done, total);
+    let progress = |what, done, total| stages.at(what, done as u64, total as u64, "");
     if let Some(file) = &args.gallery {
         write_png(file, &synth::gallery(&settings, &progress)?)?;
         drop(stages);
         return output.result(&Drawn { gallery: file.clone() }, &file.display().to_string());
     }
-    let out = args.out.clone().ok_or_else(|| Failure::Input("--out is missing: say where the capture goes".into()))?;
+    let out =
+        args.out.clone().ok_or_else(|| Failure::Input("--out: is missing; give a folder for the capture".into()))?;
     output.note(format!("building a city of {} km² and taking {} photos of it", args.area_km2, args.views));
     let summary = synth::write(&out, &settings, &progress)?;
     drop(stages);
     let text = format!(
-        "{} photos of {} things, {} of them moving, in {} triangles; {} sparse points, each in {:.1} views\n\n\
+        "{} photos of {} objects, {} of them moving, in {} triangles; {} sparse points, each in {:.1} views\n\n\
          the capture         {} (plat train reads it)\n\
-         what is in it       {}",
+         its contents        {}",
         summary.views,
         summary.actors,
         summary.moving,

@@ -1,5 +1,5 @@
-//! `plat worker`: trains blocks for a coordinator, until it is told to stop. Then it leaves a checkpoint of the block in
-//! hand, gives the task back and goes; any worker goes on from there.
+//! `plat worker`: trains blocks for a coordinator until it is stopped. Then it writes a checkpoint of its block and returns the task;
+//! any worker can resume it.
 
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
@@ -12,12 +12,12 @@ use worker::execute::{BlockTrainer, Shared, TrainerOptions};
 use worker::metrics::Measured;
 
 use crate::args::WorkerArgs;
-use crate::commands::train::compute_on;
+use crate::backend;
 use crate::failure::Failure;
 use crate::output::Output;
 use crate::remote::{access, runtime, shared_store};
-use crate::signals::until_told;
-use crate::told::Metrics;
+use crate::signals::until_signalled;
+use crate::telemetry_setup::MetricsListener;
 
 #[derive(Serialize)]
 struct Worked {
@@ -25,28 +25,28 @@ struct Worked {
     name: String,
     backend: String,
     threads: u32,
-    /// What it may take; 0 where nothing bounds it.
+    /// Memory budget; 0 = unlimited.
     memory_bytes: u64,
-    /// Tasks that it finished.
+    /// Finished tasks.
     done: u64,
-    /// Tasks that it found finished, or begun with a checkpoint.
+    /// Tasks that were found finished, or resumed from a checkpoint.
     resumed: u32,
     /// User and system time of this process.
     cpu_seconds: f64,
-    /// What it read from the store.
+    /// Read from the store.
     bytes_read: u64,
-    /// What it wrote to the store.
+    /// Written to the store.
     bytes_written: u64,
-    /// What of the reading was for windows of photos, in tasks that ended.
+    /// Read for photo windows, in tasks that ended.
     window_bytes_read: u64,
-    /// The part of it that the windows' own pixels take of their tiles.
+    /// Share of that for pixels inside the windows; the rest of each tile is outside.
     window_bytes_used: u64,
 }
 
 pub(crate) fn run(args: &WorkerArgs, output: &Output) -> Result<(), Failure> {
     let access = access(&args.connection)?;
     let name = name_of(args)?;
-    let backend = compute_on(args.backend)?;
+    let backend = backend::open(args.backend)?;
     let cores = std::thread::available_parallelism().map_or(1, |n| n.get() as u32);
     let threads = args.threads.0.unwrap_or(cores).max(1);
     let memory_bytes = memory_of(args)?;
@@ -68,11 +68,11 @@ pub(crate) fn run(args: &WorkerArgs, output: &Output) -> Result<(), Failure> {
     let runtime = runtime()?;
     runtime.block_on(async {
         let stop = CancellationToken::new();
-        let told = tokio::spawn(until_told(stop.clone()));
+        let signals = tokio::spawn(until_signalled(stop.clone()));
         let shared = Arc::new(Shared::default());
-        // Told before there is a coordinator: that none is there is worth knowing.
-        let metrics = Metrics::listen(&args.told).await?;
-        let _told = metrics.tell(output, |registry| shared.metrics.register(registry));
+        // Served before the coordinator is found, so that waiting for one is visible.
+        let metrics = MetricsListener::bind(&args.telemetry).await?;
+        let _served = metrics.serve(output, |registry| shared.metrics.register(registry));
         let worker = worker::Options {
             coordinator_url: url.clone(),
             access,
@@ -80,7 +80,7 @@ pub(crate) fn run(args: &WorkerArgs, output: &Output) -> Result<(), Failure> {
             backend: worked.backend.clone(),
             memory_bytes,
         };
-        if let Some(about) = worker::greet(&worker, &stop).await.map_err(of_worker)? {
+        if let Some(about) = worker::greet(&worker, &stop).await.map_err(worker_failure)? {
             let store = shared_store(&about.store_url).await?.metered();
             let options = TrainerOptions {
                 threads: threads as usize,
@@ -93,8 +93,8 @@ pub(crate) fn run(args: &WorkerArgs, output: &Output) -> Result<(), Failure> {
             shared.metrics.moves_from_and_to(store.clone());
             let trainer = BlockTrainer::new(store.blocking(), options, shared.clone(), backend);
             let measured = Measured::new(trainer.map_err(Failure::Work)?, shared.metrics.clone());
-            output.note(format!("{} works for {url}: {} on {threads} threads", worked.name, worked.backend));
-            worker::run(worker, Arc::new(measured), stop).await.map_err(of_worker)?;
+            output.note(format!("worker {} for {url}: {} on {threads} threads", worked.name, worked.backend));
+            worker::run(worker, Arc::new(measured), stop).await.map_err(worker_failure)?;
             worked.done = shared.metrics.done();
             worked.cpu_seconds = worker::clock::cpu_seconds();
             let traffic = store.traffic();
@@ -102,26 +102,27 @@ pub(crate) fn run(args: &WorkerArgs, output: &Output) -> Result<(), Failure> {
             (worked.window_bytes_read, worked.window_bytes_used) = shared.metrics.window_bytes();
             worked.resumed = shared.resumed.load(Ordering::Relaxed);
         }
-        told.abort();
+        signals.abort();
         Ok::<(), Failure>(())
     })?;
-    let text = format!("{} left after {} tasks, {} of them resumed", worked.name, worked.done, worked.resumed);
+    let text =
+        format!("worker {} stopped after {} tasks, {} of them resumed", worked.name, worked.done, worked.resumed);
     output.result(&worked, &text)
 }
 
-/// What the worker may take, bytes; 0 where nothing bounds it.
+/// The memory budget, bytes; 0 = unlimited.
 fn memory_of(args: &WorkerArgs) -> Result<u64, Failure> {
-    /// What the program takes before it has a block.
-    const LEAST_MIB: u64 = 16;
+    /// Memory of the program without a block.
+    const MIN_MIB: u64 = 16;
     let Some(mebibytes) = args.memory.0 else { return Ok(worker::room::bytes().unwrap_or(0)) };
-    if !(LEAST_MIB..1 << 40).contains(&mebibytes) {
-        let what = format!("{mebibytes} MiB are not what a worker can do with");
-        return Err(BadInput::new("--memory", what, format!("give {LEAST_MIB} or more, or auto")).into());
+    if !(MIN_MIB..1 << 40).contains(&mebibytes) {
+        let what = format!("{mebibytes} MiB is out of range");
+        return Err(BadInput::new("--memory", what, format!("give {MIN_MIB} or more, or auto")).into());
     }
     Ok(mebibytes << 20)
 }
 
-/// The worker's name: the one asked for, else the machine's and the process's number.
+/// The worker's name: the given one, else host name and process id.
 fn name_of(args: &WorkerArgs) -> Result<String, Failure> {
     if let Some(name) = &args.name {
         let refused = |status: tonic::Status| {
@@ -136,7 +137,7 @@ fn name_of(args: &WorkerArgs) -> Result<String, Failure> {
     Ok(format!("{machine}-{}", std::process::id()))
 }
 
-fn of_worker(error: WorkerError) -> Failure {
+fn worker_failure(error: WorkerError) -> Failure {
     match error {
         WorkerError::Input(error) => error.into(),
         WorkerError::Refused(_) => Failure::Input(error.to_string()),

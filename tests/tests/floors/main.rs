@@ -1,6 +1,7 @@
 //! Imports run one way. Between crates: a crate may depend only on crates of lower floors, read from cargo's metadata. Inside a
 //! crate: the files' imports form no ring, read from the sources.
 
+mod drawing;
 mod modules;
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -11,7 +12,7 @@ use cargo_metadata::{DependencyKind, Metadata, MetadataCommand, PackageId};
 
 /// Each crate's floor in tenths, lowest first. A normal or build dependency must be strictly lower than its user, a
 /// dev-dependency not higher.
-const FLOORS: [(&str, u32); 18] = [
+const FLOORS: [(&str, u32); 20] = [
     ("scene", 0),
     ("shaders", 0),
     ("blocks", 10),
@@ -23,6 +24,8 @@ const FLOORS: [(&str, u32); 18] = [
     ("store", 30),
     ("proto", 30),
     ("dataset", 31),
+    ("model", 31),
+    ("eval", 32),
     ("telemetry", 40),
     ("bench", 40),
     ("coordinator", 41),
@@ -33,13 +36,15 @@ const FLOORS: [(&str, u32); 18] = [
 ];
 
 /// What must not be reachable through normal dependencies, however indirectly.
-const ABSENT: [(&str, &[&str]); 8] = [
+const ABSENT: [(&str, &[&str]); 10] = [
     ("scene", &["tokio", "object_store", "tonic", "rayon", "wgpu", "image"]),
     ("blocks", &["tokio", "object_store", "tonic", "rayon", "wgpu", "image"]),
     ("cluster", &["tokio", "object_store", "tonic", "rayon", "wgpu", "image"]),
     ("city", &["tokio", "object_store", "tonic"]),
     ("render", &["tokio", "object_store", "tonic"]),
     ("train", &["tokio", "object_store", "tonic"]),
+    ("model", &["dataset", "train", "wgpu", "clap", "indicatif"]),
+    ("eval", &["clap", "indicatif"]),
     ("telemetry", &["cluster", "proto", "store", "train"]),
     ("coordinator", &["render", "train", "dataset", "worker", "wgpu"]),
 ];
@@ -179,4 +184,22 @@ fn imports_inside_a_crate_form_no_ring() {
     }
     assert!(files > 100, "only {files} files were read");
     assert!(lines.is_empty(), "{}", lines.join("\n"));
+}
+
+/// `docs/src/imports.svg` shows the imports between crates as they are. `PLAT_BLESS=1` redraws it.
+#[test]
+fn the_drawing_of_imports_is_up_to_date() {
+    let metadata = metadata();
+    let floors: BTreeMap<&str, u32> = FLOORS.into();
+    let edges = edges_of(&metadata).into_iter().filter(|edge| edge.kind == DependencyKind::Normal && edge.from != "tests");
+    let edges: BTreeSet<(String, String)> = edges.map(|edge| (edge.from, edge.to)).collect();
+    let members = metadata.workspace_packages().into_iter().map(|package| package.name.to_string());
+    let heights = members.filter(|name| name != "tests").map(|name| (name.clone(), floors[name.as_str()])).collect();
+    let drawn = drawing::draw(&heights, &edges);
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../docs/src/imports.svg");
+    if std::env::var_os("PLAT_BLESS").is_some() {
+        std::fs::write(&path, &drawn).expect("the drawing is written");
+    }
+    let kept = std::fs::read_to_string(&path).unwrap_or_default();
+    assert!(kept == drawn, "docs/src/imports.svg is out of date: run PLAT_BLESS=1 cargo test -p tests --test floors");
 }

@@ -1,5 +1,6 @@
-//! `plat bench kernels --from-stage STAGE`: both backends draw the same views, and what their stages came to is compared in order. The
-//! first stage that differs by more than it may is where to look: what follows it differs because of it.
+//! `plat bench kernels --from-stage STAGE`: renders the same views on both backends and compares their stages in order.
+//!
+//! The first stage beyond its tolerance is the faulty one; later stages differ because of it.
 
 use std::sync::Arc;
 
@@ -10,9 +11,9 @@ use scene::Camera;
 use serde::Serialize;
 use train::random;
 
-use super::Scene;
 use super::compare::{Compared, Drawn};
 use super::gpu::failed;
+use super::scene::Scene;
 use crate::failure::Failure;
 use crate::output::Output;
 
@@ -23,7 +24,7 @@ struct Bisected<'a> {
     adapter_class: &'static str,
     views: usize,
     splats: usize,
-    /// Of those compared, the first that differs.
+    /// The first compared stage beyond its tolerance.
     first_mismatch: Option<&'static str>,
     stages: &'a [Compared],
 }
@@ -52,9 +53,9 @@ pub(super) fn run(gpu: &Arc<Gpu>, scene: &Scene, from: Stage, output: &Output) -
         first_mismatch: first.map(|compared| compared.stage),
         stages: &compared,
     };
-    let said = first.map_or("no stage differs".to_owned(), |of| {
+    let verdict = first.map_or("no stage differs".to_owned(), |of| {
         format!(
-            "{} differs: {:.3e} at {} (relative {:.3e} at {}, {:.0e} allowed), {} of {} alone",
+            "{} differs: {:.3e} at {} (relative {:.3e} at {}, tolerance {:.0e}), {} of {} on one backend only",
             of.stage,
             of.largest_absolute,
             of.absolute_at,
@@ -66,8 +67,8 @@ pub(super) fn run(gpu: &Arc<Gpu>, scene: &Scene, from: Stage, output: &Output) -
         )
     });
     let lines: Vec<String> = compared.iter().map(Compared::text).collect();
-    output.result(&bisected, &format!("{} against {}\n{}\n{said}", gpu.name(), cpu.name(), lines.join("\n")))?;
-    first.map_or(Ok(()), |_| Err(Failure::Work(said)))
+    output.result(&bisected, &format!("{} against {}\n{}\n{verdict}", gpu.name(), cpu.name(), lines.join("\n")))?;
+    first.map_or(Ok(()), |_| Err(Failure::Work(verdict)))
 }
 
 impl Drawn {
@@ -91,11 +92,16 @@ impl Drawn {
         renderer.backward(&mut encoder, splats, UpstreamPlanes::default())?;
         gpu.submit(encoder)?;
         let gradients = renderer.read_gradients(splats)?;
-        Ok(Self { stages: renderer.read_forward_intermediates()?, frame, moments: renderer.read_backward_intermediates()?, gradients })
+        Ok(Self {
+            stages: renderer.read_forward_intermediates()?,
+            frame,
+            moments: renderer.read_backward_intermediates()?,
+            gradients,
+        })
     }
 }
 
-/// Gradient of colours to send back: of both signs, as a loss's.
+/// Random upstream gradients of both signs.
 fn noise(camera: &Camera) -> Vec<f32> {
     let area = u64::from(camera.pinhole.width) * u64::from(camera.pinhole.height);
     (0..3 * area).map(|i| random::uniform(0, i) - 0.5).collect()

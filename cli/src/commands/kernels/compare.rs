@@ -1,31 +1,31 @@
-//! What two backends made of the same view, stage by stage.
+//! Compares the results of two backends for the same view, stage by stage.
 
 use std::collections::{BTreeMap, BTreeSet};
 
 use ::render::cpu::Stage;
-use ::render::{Frame, Gradients, MOMENTS, BackwardIntermediates, ForwardIntermediates};
+use ::render::{BackwardIntermediates, ForwardIntermediates, Frame, Gradients, MOMENTS};
 use serde::Serialize;
 
-/// The share of pixels, and one more, that may be off by more than [`error_allowed`], and that of the splats or pairs which one backend
-/// alone may have: decisions (an ellipse that just reaches a tile, α = 1/255) fall otherwise where rounding does.
+/// Share of pixels, plus one, that may exceed [`tolerance_of`], and of splats or pairs that only one backend may have. Rounding may
+/// flip decisions: whether an ellipse reaches a tile, whether α reaches 1/255.
 const SHARE_ALLOWED: f64 = 1e-3;
 
-/// What a value may be off by, relative to what its stage's comparison says.
-fn error_allowed(stage: Stage) -> f64 {
+/// Largest relative error of a value; each comparison defines what it is relative to.
+fn tolerance_of(stage: Stage) -> f64 {
     match stage {
-        // Found on llvmpipe by render/tests/gpu.rs: 1.2e-4.
+        // 1.2e-4 was measured on llvmpipe by render/tests/gpu.rs.
         Stage::Project => 1e-3,
-        // Likewise, of depths: 7.5e-6.
+        // 7.5e-6 was measured, of depths.
         Stage::Sort => 3e-5,
         Stage::Bin => 0.0,
-        // A pixel may have a splat more, at α = 1/255.
+        // A pixel may have one splat more, at α = 1/255.
         Stage::Rasterize => 5e-3,
-        // Likewise, of a column's length: 9.4e-4.
+        // 9.4e-4 was measured, of a column's length.
         Stage::RasterizeBackward | Stage::Reduce | Stage::ProjectBackward => 3e-3,
     }
 }
 
-/// All that a view came to.
+/// All results of one view.
 pub(super) struct Drawn {
     pub(super) stages: ForwardIntermediates,
     pub(super) frame: Frame,
@@ -33,25 +33,25 @@ pub(super) struct Drawn {
     pub(super) gradients: Gradients,
 }
 
-/// How far a stage of the GPU is from that of the CPU, over all views.
+/// Differences between the GPU's and the CPU's results of a stage, over all views.
 #[derive(Debug, Clone, Default, Serialize)]
 pub(super) struct Compared {
     pub(super) stage: &'static str,
     /// Values compared.
     pub(super) values: u64,
-    /// Of them, those that are off by more than the tolerance.
+    /// Values beyond the tolerance.
     pub(super) off: u64,
-    /// Splats or pairs that one backend alone has.
+    /// Splats or pairs that only one backend has.
     pub(super) alone: u64,
-    /// Of all splats or pairs.
+    /// All splats or pairs.
     pub(super) of: u64,
-    /// Largest difference.
+    /// Largest absolute difference.
     pub(super) largest_absolute: f64,
-    /// Where.
+    /// Its location.
     pub(super) absolute_at: String,
-    /// Largest of differences in the measure that the tolerance is in.
+    /// Largest relative difference.
     pub(super) largest_relative: f64,
-    /// Where.
+    /// Its location.
     pub(super) relative_at: String,
     pub(super) tolerance: f64,
     pub(super) within: bool,
@@ -59,7 +59,7 @@ pub(super) struct Compared {
 
 impl Compared {
     pub(super) fn of(stage: Stage) -> Self {
-        Self { stage: stage.name(), tolerance: error_allowed(stage), ..Self::default() }
+        Self { stage: stage.name(), tolerance: tolerance_of(stage), ..Self::default() }
     }
 
     pub(super) fn add(&mut self, stage: Stage, view: usize, ours: &Drawn, theirs: &Drawn) {
@@ -76,7 +76,8 @@ impl Compared {
                 self.moments(view, &keyed(&ours.moments), &keyed(&theirs.moments), place);
             }
             Stage::Reduce => {
-                let keyed = |moments: &BackwardIntermediates| moments.splats.iter().copied().collect::<BTreeMap<_, _>>();
+                let keyed =
+                    |moments: &BackwardIntermediates| moments.splats.iter().copied().collect::<BTreeMap<_, _>>();
                 let place = |splat: &u32| format!("splat {splat}");
                 self.moments(view, &keyed(&ours.moments), &keyed(&theirs.moments), place);
             }
@@ -84,7 +85,7 @@ impl Compared {
         }
     }
 
-    /// Records by splat: x, y and so on, relative to one more than their size.
+    /// Projected splats. Errors are relative to 1 + |value|.
     fn records(&mut self, view: usize, ours: &ForwardIntermediates, theirs: &ForwardIntermediates) {
         const NAMES: [&str; 12] = [
             "mean x",
@@ -113,7 +114,7 @@ impl Compared {
         }
     }
 
-    /// The n-th depth of one and of the other, of the splats that both have: places may change where depths are alike.
+    /// Depths by rank, of the splats that both have: splats of nearly equal depth may be swapped.
     fn order(&mut self, view: usize, ours: &ForwardIntermediates, theirs: &ForwardIntermediates) {
         let splats = |stages: &ForwardIntermediates| -> BTreeSet<u32> { stages.order.iter().copied().collect() };
         let (of_ours, of_theirs) = (splats(ours), splats(theirs));
@@ -128,7 +129,7 @@ impl Compared {
         }
     }
 
-    /// Which splats each tile has, front to back.
+    /// The splats of each tile, front to back.
     fn tiles(&mut self, view: usize, ours: &ForwardIntermediates, theirs: &ForwardIntermediates) {
         let of_tile = |stages: &ForwardIntermediates, tile: usize| -> BTreeMap<u32, u32> {
             let pairs = &stages.pairs[stages.start[tile] as usize..stages.start[tile + 1] as usize];
@@ -155,7 +156,7 @@ impl Compared {
         self.alone += ours.start.len().abs_diff(theirs.start.len()) as u64 * theirs.pairs.len().max(1) as u64;
     }
 
-    /// Pixels; depth relative to one more than its size.
+    /// Pixels. Errors of depth are relative to 1 + depth.
     fn planes(&mut self, view: usize, ours: &Frame, theirs: &Frame) {
         let (area, width) = (theirs.transmittance.len().max(1), theirs.width.max(1));
         let colours =
@@ -174,7 +175,7 @@ impl Compared {
         }
     }
 
-    /// Sums by what they are of, each moment relative to the length of all of its kind.
+    /// BackwardIntermediates by key. Each moment's error is relative to the length of its column.
     fn moments<K: Ord>(
         &mut self,
         view: usize,
@@ -201,7 +202,7 @@ impl Compared {
         }
     }
 
-    /// A column as a whole: the length of the difference over its length.
+    /// A column as a whole: length of the difference over length of the column.
     fn column(&mut self, ours: &[f32], theirs: &[f32], place: &dyn Fn(usize) -> String) {
         let difference = |i: usize| f64::from(ours[i]) - f64::from(theirs[i]);
         let all = 0..ours.len().min(theirs.len());
@@ -214,17 +215,17 @@ impl Compared {
         self.note(difference(worst).abs(), relative, &|| place(worst));
     }
 
-    /// A value against another, relative to a size.
+    /// One value; its error is relative to `size`.
     fn value(&mut self, ours: f32, theirs: f32, size: f64, place: &dyn Fn() -> String) {
         let apart = (f64::from(ours) - f64::from(theirs)).abs();
         self.values += 1;
-        // Bits that are the same are, whatever they mean.
+        // Equal bits are equal, NaN included.
         let (apart, relative) = if ours.to_bits() == theirs.to_bits() { (0.0, 0.0) } else { (apart, apart / size) };
         self.note(apart, relative, place);
     }
 
     fn note(&mut self, absolute: f64, relative: f64, place: &dyn Fn() -> String) {
-        // What is no number is off by more than any.
+        // NaN counts as the largest error.
         let [absolute, relative] = [absolute, relative].map(|v| if v.is_finite() { v } else { f64::MAX });
         self.off += u64::from(relative > self.tolerance);
         if absolute > self.largest_absolute {
@@ -243,16 +244,16 @@ impl Compared {
 
     pub(super) fn judged(self) -> Self {
         let few = |some: u64, of: u64| some as f64 <= 1.0 + SHARE_ALLOWED * of as f64;
-        // Of pixels a few may differ, of sums and sorted lists none.
+        // A few pixels may differ, but no sum and no rank.
         let off = if self.stage == Stage::Rasterize.name() { few(self.off, self.values) } else { self.off == 0 };
         Self { within: off && few(self.alone, self.of), ..self }
     }
 
     pub(super) fn text(&self) -> String {
         format!(
-            "{:<19} {}  off by {:.1e} at most, relative {:.1e} of {:.0e} allowed; {} of {} values off, {} of {} alone",
+            "{:<19} {}  largest error {:.1e}, relative {:.1e} (tolerance {:.0e}); {} of {} values beyond it, {} of {} on one backend only",
             self.stage,
-            if self.within { "as on the CPU" } else { "DIFFERS" },
+            if self.within { "matches" } else { "DIFFERS" },
             self.largest_absolute,
             self.largest_relative,
             self.tolerance,
@@ -271,7 +272,7 @@ mod tests {
 
     use super::*;
     use crate::args::Size;
-    use crate::commands::kernels::{Scene, cloud, front};
+    use crate::commands::kernels::scene::{Scene, cloud, front};
 
     fn scene() -> Scene {
         let size = Size { width: 96, height: 64 };
@@ -295,7 +296,7 @@ mod tests {
     }
 
     #[test]
-    fn a_damaged_stage_is_the_one_that_differs() {
+    fn the_damaged_stage_is_found() {
         let scene = scene();
         let sound = drawn(&scene);
         assert!(within(&sound, &sound).iter().all(|&within| within));
@@ -324,7 +325,7 @@ mod tests {
                 .filter(|(_, within)| !within)
                 .map(|(s, _)| s)
                 .collect();
-            // What is sorted wrongly is, by splat, projected rightly; tiles name splats by their order.
+            // Records are compared by splat, so wrong sorting does not show in the projection.
             let first = found.first();
             assert_eq!(first, Some(&stage), "{found:?}");
         }

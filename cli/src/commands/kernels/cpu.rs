@@ -1,18 +1,17 @@
-//! CPU time of the stages, and how near they come to what a core can do.
+//! Times the stages on the CPU and compares them with the roofline of one core (Williams et al. 2009).
 //!
-//! Ceilings are measured in the same run (roofline, Williams et al. 2009): arithmetic by chains of fused multiply-adds in registers,
-//! memory by adding two arrays that no cache holds. The rasterizers are held against the first, by the operations of
-//! their inner loops ([`ceiling`]); the others against the second, by the bytes that they have to read and write once.
+//! The ceilings are measured in the same run: arithmetic by chains of fused multiply-adds in registers, memory bandwidth by adding two
+//! arrays that are larger than the caches. The rasterizers are compared with the first, by the operations of their inner loops
+//! ([`ceiling`]); the other stages with the second, by the bytes that they must read and write.
 
 use ::render::Upstream;
 use ::render::cpu::{Isa, Renderer, Stage, ceiling};
 use bench::parts::{Kernels, StageTime};
 
-use super::{Scene, WARM_UP, bytes, median};
+use super::scene::{Scene, WARM_UP, bytes, median};
 use crate::args::KernelsArgs;
 use crate::clock::Stopwatch;
-use crate::commands::bench::invoked;
-use crate::record::commit;
+use crate::run_record::{commit, invocation};
 
 pub(super) fn time(args: &KernelsArgs, Scene { splats, options, cameras }: &Scene) -> Kernels {
     let mut renderer = Renderer::default();
@@ -44,7 +43,7 @@ pub(super) fn time(args: &KernelsArgs, Scene { splats, options, cameras }: &Scen
         if counts {
             let taken = [forward[0], backward[0], forward[1], backward[1]];
             millis.iter_mut().zip(taken).for_each(|(all, seconds)| all.push(1e3 * seconds));
-            // Beside the passes, as the machine's clock and its other users change.
+            // Measured with every pass, as clock frequency and other load vary.
             ceilings[0].push(gflops());
             ceilings[1].push(gbytes(&mut arrays));
         }
@@ -80,13 +79,13 @@ pub(super) fn time(args: &KernelsArgs, Scene { splats, options, cameras }: &Scen
         backward_cpu_millis,
         forward_wall_millis,
         backward_wall_millis,
-        command: invoked(),
+        command: invocation(),
     }
 }
 
-/// Operations of a rasterizer that visits so many blocks of 4×4 pixels.
+/// Floating-point operations of a rasterizer that visits this many blocks of 4×4 pixels.
 fn flops(stage: Stage, visits: u64) -> Option<f64> {
-    /// A lane is a pixel.
+    /// One lane per pixel.
     const LANES: f64 = 16.0;
     let each = match stage {
         Stage::Rasterize => ceiling::RASTERIZE_FLOPS,
@@ -105,7 +104,7 @@ fn gflops() -> f64 {
     1e-9 * flops as f64 / clock.cpu_seconds()
 }
 
-/// Three arrays that together no cache holds: 96 MiB.
+/// Three arrays of together 96 MiB, larger than the caches.
 fn arrays() -> [Vec<f32>; 3] {
     const LENGTH: usize = 8 << 20;
     [vec![1.0; LENGTH], vec![2.0; LENGTH], vec![0.0; LENGTH]]

@@ -1,7 +1,7 @@
-//! Time of the stages on a GPU: by the device's own clock where it can be read within a pass; else by the wall, as a pass that ends
-//! with the stage less one that ends before it, each submitted and waited for.
+//! Times the stages on a GPU: by timestamps of the device where it supports them within a pass; else by wall time, as the difference
+//! between a pass that ends with the stage and one that ends before it.
 //!
-//! What whole passes take is measured beside that, with nobody watching.
+//! Whole passes are timed separately, without timestamps.
 
 use std::sync::Arc;
 
@@ -10,12 +10,11 @@ use ::render::gpu::{Gpu, GpuError, GpuRenderer, GpuSplats, UpstreamPlanes};
 use bench::parts::{Kernels, StageTime};
 use scene::Camera;
 
-use super::{Scene, WARM_UP, bytes, median};
+use super::scene::{Scene, WARM_UP, bytes, median};
 use crate::args::KernelsArgs;
 use crate::clock::Stopwatch;
-use crate::commands::bench::invoked;
 use crate::failure::Failure;
-use crate::record::commit;
+use crate::run_record::{commit, invocation};
 
 pub(super) fn time(gpu: &Arc<Gpu>, args: &KernelsArgs, scene: &Scene) -> Result<Kernels, Failure> {
     let mut bench = Bench::new(gpu, scene).map_err(failed)?;
@@ -71,26 +70,26 @@ pub(super) fn time(gpu: &Arc<Gpu>, args: &KernelsArgs, scene: &Scene) -> Result<
         backward_cpu_millis,
         forward_wall_millis,
         backward_wall_millis,
-        command: invoked(),
+        command: invocation(),
     })
 }
 
-/// Forward and backward of a scene.
+/// Forward and backward pass of a scene.
 struct Bench<'a> {
     gpu: &'a Arc<Gpu>,
     renderer: GpuRenderer,
     splats: GpuSplats,
     scene: &'a Scene,
-    /// Whether the device's clock is read.
+    /// Whether stages are timed by timestamps.
     has_clock: bool,
 }
 
-/// Milliseconds of each stage, in their order.
+/// Milliseconds of each stage, in order.
 type Stages = Vec<(Stage, f64)>;
 
-/// What a view took, one of several at once or alone, milliseconds.
+/// Times of one view; of several in one pass, their mean.
 struct Pass {
-    /// Forward and backward: CPU, then wall.
+    /// CPU forward, CPU backward, wall forward, wall backward.
     millis: [f64; 4],
     stages: Stages,
 }
@@ -109,7 +108,7 @@ impl<'a> Bench<'a> {
     }
 
     fn pass(&mut self, cameras: &[Camera]) -> Result<Pass, GpuError> {
-        // Makes room, so that what is timed is drawn.
+        // Grows buffers first, so that the timed passes do not overflow.
         loop {
             self.once(Direction::Forward, cameras)?;
             if !self.renderer.grow_after_overflow()? {
@@ -130,13 +129,13 @@ impl<'a> Bench<'a> {
         Ok(Pass { millis: [forward[0], backward[0], forward[1], backward[1]].map(of_view), stages })
     }
 
-    /// CPU and wall milliseconds of all of it, and those of each stage.
+    /// CPU and wall milliseconds of the whole pass, and milliseconds of each stage.
     fn timed(&mut self, direction: Direction, cameras: &[Camera]) -> Result<([f64; 2], Stages), GpuError> {
         let all = self.once(direction, cameras)?;
         self.gpu.start_timing(usize::MAX);
         self.once(direction, cameras)?;
         let dispatched = self.gpu.finish_timing()?;
-        // The place of each stage's last dispatch.
+        // Index of each stage's last dispatch.
         let mut ends: Vec<(Stage, usize)> = Vec::new();
         for (n, dispatch) in dispatched.iter().enumerate() {
             match ends.last_mut().filter(|(stage, _)| *stage == dispatch.stage) {
@@ -153,25 +152,25 @@ impl<'a> Bench<'a> {
                 Some(nanos) => 1e-6 * nanos,
                 None => self.up_to(direction, cameras, last + 1)?,
             };
-            // By the wall, noise may be more than a short stage takes.
+            // By wall time, noise may exceed a short stage.
             stages.push((stage, (ended - before).max(0.0)));
             before = ended;
         }
         if !self.has_clock {
-            // The backward pass goes on from a whole view.
+            // The backward pass needs a complete forward pass.
             self.once(Direction::Forward, cameras)?;
         }
         Ok((all, stages))
     }
 
-    /// Wall milliseconds of so many dispatches.
+    /// Wall milliseconds of the first `most` dispatches.
     fn up_to(&mut self, direction: Direction, cameras: &[Camera], most: usize) -> Result<f64, GpuError> {
         self.gpu.start_timing(most);
         let [_, wall] = self.once(direction, cameras)?;
         self.gpu.finish_timing().map(|_| wall)
     }
 
-    /// CPU and wall milliseconds, from the first command to the end.
+    /// CPU and wall milliseconds, from recording to completion.
     fn once(&mut self, direction: Direction, cameras: &[Camera]) -> Result<[f64; 2], GpuError> {
         let clock = Stopwatch::start();
         let mut encoder = self.gpu.encoder();
@@ -197,10 +196,10 @@ mod tests {
 
     use super::*;
     use crate::args::Size;
-    use crate::commands::kernels::{cloud, front};
+    use crate::commands::kernels::scene::{cloud, front};
 
     #[test]
-    fn the_wall_clock_knows_the_same_stages_and_changes_no_picture() {
+    fn wall_timing_has_the_same_stages_and_changes_no_frame() {
         let gpu = match Gpu::open() {
             Ok(gpu) => gpu,
             Err(error) if std::env::var("PLAT_GPU").is_ok_and(|value| value == "required") => panic!("{error}"),
@@ -217,7 +216,7 @@ mod tests {
             assert_eq!(stages, Stage::ALL);
             assert!(pass.stages.iter().map(|(_, millis)| millis).sum::<f64>() > 0.0, "{:?}", pass.stages);
             assert!(pass.millis.iter().all(|&millis| millis > 0.0));
-            assert!((0..3).all(|n| bench.renderer.read_frame(n).unwrap() == usual), "timing leaves half a picture");
+            assert!((0..3).all(|n| bench.renderer.read_frame(n).unwrap() == usual), "timing changes the frame");
         }
     }
 }

@@ -1,60 +1,58 @@
-//! The variants of training that `plat bench ablate` compares: each takes away one of the recipe's
-//! accelerations, or adds what is off by default.
-//!
-//! To add one: a row here.
+//! The variants of the training recipe that `plat bench ablate` compares. Each removes one acceleration, or adds one that is off by
+//! default.
 
 use train::Recipe;
 use train::growth::Growth;
 
-/// A variant.
+/// A variant of the recipe.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Variant {
-    /// What the lines call it.
+    /// Its name in result lines.
     pub(crate) name: &'static str,
-    /// What it is, and where what it takes away or adds comes from.
+    /// What it changes, with the source of the technique.
     pub(crate) about: &'static str,
-    /// The usual recipe made into this one.
+    /// Changes the default recipe into this variant.
     pub(crate) recipe: fn(Recipe) -> Recipe,
 }
 
-/// What the others are compared with.
+/// The variant that the others are compared with.
 pub(crate) const DEFAULT: &str = "default";
 
-/// All of them.
+/// All variants.
 pub(crate) const VARIANTS: [Variant; 7] = [
-    Variant { name: DEFAULT, about: "the recipe as it is", recipe: |recipe| recipe },
+    Variant { name: DEFAULT, about: "the default recipe", recipe: |recipe| recipe },
     Variant {
         name: "fine",
-        about: "full resolution from the first step; without coarse-to-fine resolution (DashGaussian, Chen et al. 2025)",
+        about: "full resolution from the first step: without coarse-to-fine resolution (DashGaussian, Chen et al. 2025)",
         recipe: |recipe| Recipe { coarse: Vec::new(), ..recipe },
     },
     Variant {
         name: "by-the-clock",
-        about: "finer pixels after fixed shares of the steps, not once the error has come down to what they show (train/src/coarse_to_fine.rs)",
+        about: "finer resolution after fixed shares of the steps instead of by the error (train/src/coarse_to_fine.rs)",
         recipe: |recipe| Recipe { detail_factor: 0.0, ..recipe },
     },
     Variant {
         name: "all-at-once",
-        about: "all splats within a tenth of the steps, as fast as doubling goes; without a growth schedule (Taming 3DGS, Mallick et al. 2024)",
+        about: "densification within a tenth of the steps, doubling each time: without a growth schedule (Taming 3DGS, Mallick et al. 2024)",
         recipe: |recipe| {
-            // Worth is judged over a long growth: here it would only cut the short one off.
+            // The early end is tuned for a long growth and would only cut this one short.
             let growth = Growth { from: 0.0, until: 0.1, max_growth_share: 1.0, worth_db: 0.0, ..recipe.growth };
             Recipe { growth, ..recipe }
         },
     },
     Variant {
         name: "all-colours",
-        about: "SH degree 3 from the first step; without degrees that join later (3DGS, Kerbl et al. 2023)",
+        about: "SH degree 3 from the first step: without raising the degree during training (3DGS, Kerbl et al. 2023)",
         recipe: |recipe| Recipe { sh_from: [0.0; 3], ..recipe },
     },
     Variant {
         name: "all-growth",
-        about: "growth to the budget, whatever it brings; without its early end (train/src/coarse_to_fine.rs)",
+        about: "growth to the whole budget: without its early end (train/src/coarse_to_fine.rs)",
         recipe: |recipe| Recipe { growth: Growth { worth_db: 0.0, ..recipe.growth }, ..recipe },
     },
     Variant {
         name: "four-views",
-        about: "four windows a step of the optimiser, which fill a large GPU (--views-per-step; gsplat, Ye et al. 2025)",
+        about: "four windows per optimiser step, which fill a large GPU (--views-per-step; gsplat, Ye et al. 2025)",
         recipe: |recipe| Recipe { views_per_step: 4, ..recipe },
     },
 ];

@@ -1,23 +1,23 @@
-//! Figures pixel by pixel, so that parts of a picture can be told apart: SSIM as [`train::metrics::ssim`] sums it, and
-//! ꟻLIP, which says how visible a difference is.
+//! Per-pixel maps of SSIM and ꟻLIP, for measuring parts of a picture.
 //!
-//! ꟻLIP is of Andersson et al., "ꟻLIP: A Difference Evaluator for Alternating Images" (HPG 2020), for displays of ordinary
-//! range at the paper's viewing conditions. Images are planes of sRGB values in 0..1.
+//! The mean of the SSIM map is [`train::metrics::ssim`]. ꟻLIP estimates how visible a difference is (Andersson et al., "ꟻLIP: A
+//! Difference Evaluator for Alternating Images", HPG 2020), here for displays of ordinary range at the paper's viewing
+//! conditions. Images are three planes of sRGB values in 0..1.
 
 use std::f64::consts::PI;
 
-/// Pixels per degree of the eye: 0.7 m before a display of 3840 pixels on 0.7 m.
+/// Pixels per degree of visual angle, 0.7 m from a display of 3840 pixels on 0.7 m.
 const PIXELS_PER_DEGREE: f64 = 0.7 * 3840.0 / 0.7 * PI / 180.0;
-/// What the contrast sensitivity of each opponent channel is made of: weight and width of Gaussians (table 1).
+/// Contrast sensitivity of each opponent channel as a sum of Gaussians: weight and width (table 1).
 const SENSITIVITY: [&[(f64, f64)]; 3] = [&[(1.0, 0.0047)], &[(1.0, 0.0053)], &[(34.1, 0.04), (13.5, 0.025)]];
 /// Exponents of colour and feature differences.
 const COLOUR_POWER: f64 = 0.7;
 const FEATURE_POWER: f64 = 0.5;
-/// Colour differences below this share of the largest take up this share of the scale.
+/// Colour differences below the first share of the largest difference are mapped to the second share of the scale.
 const KNEE: (f64, f64) = (0.4, 0.95);
 /// Width of the feature detectors, degrees.
 const FEATURE_DEGREES: f64 = 0.082;
-/// Linear RGB of the sRGB primaries to XYZ, to ten digits as the authors' code has it.
+/// Linear RGB with sRGB primaries to XYZ, as in the authors' code.
 const XYZ_FROM_RGB: [[f64; 3]; 3] = [
     [10_135_552.0 / 24_577_794.0, 8_788_810.0 / 24_577_794.0, 4_435_075.0 / 24_577_794.0],
     [2_613_072.0 / 12_288_897.0, 8_788_810.0 / 12_288_897.0, 887_015.0 / 12_288_897.0],
@@ -38,7 +38,7 @@ pub(crate) fn ssim(a: &[f32], b: &[f32], width: usize, height: usize) -> Vec<f64
     const C2: f64 = 0.03 * 0.03;
     let area = width * height;
     assert!(a.len() == 3 * area && b.len() == 3 * area, "three planes each");
-    let weights = scaled(&taps(5, |x| (-x * x / (2.0 * 1.5 * 1.5)).exp()), None);
+    let weights = normalised(&taps(5, |x| (-x * x / (2.0 * 1.5 * 1.5)).exp()), Sum::All);
     let mut map = vec![0.0; area];
     for channel in 0..3 {
         let plane = |image: &[f32]| Vec::from_iter(image[channel * area..][..area].iter().map(|&v| f64::from(v)));
@@ -59,7 +59,7 @@ pub(crate) fn ssim(a: &[f32], b: &[f32], width: usize, height: usize) -> Vec<f64
     map
 }
 
-/// ꟻLIP of each pixel: 0 where nobody sees a difference, 1 at most.
+/// ꟻLIP of each pixel: 0 = no visible difference, 1 = the largest.
 ///
 /// # Panics
 /// If a length is not `3 · width · height`.
@@ -67,7 +67,7 @@ pub(crate) fn flip(photo: &[f32], render: &[f32], width: usize, height: usize) -
     let area = width * height;
     assert!(photo.len() == 3 * area && render.len() == 3 * area, "three planes each");
     let (photo, render) = (opponent(photo), opponent(render));
-    let colour = [&photo, &render].map(|image| seen_colour(image, width));
+    let colour = [&photo, &render].map(|image| filtered_colour(image, width));
     let features = [&photo, &render].map(|image| features(&image[0], width));
     let extreme = {
         let of = |rgb| hunt_lab(linear_to_xyz(rgb));
@@ -105,8 +105,8 @@ fn opponent(image: &[f32]) -> [Vec<f64>; 3] {
     planes
 }
 
-/// What the eye's contrast sensitivity leaves of the colours, as Hunt-adjusted L*a*b*.
-fn seen_colour(image: &[Vec<f64>; 3], width: usize) -> Vec<[f64; 3]> {
+/// Colours filtered by the eye's contrast sensitivity, as Hunt-adjusted L*a*b*.
+fn filtered_colour(image: &[Vec<f64>; 3], width: usize) -> Vec<[f64; 3]> {
     let radius = (3.0 * (0.04 / (2.0 * PI * PI)).sqrt() * PIXELS_PER_DEGREE).ceil() as usize;
     let filtered = [0, 1, 2].map(|channel| {
         let (mut sum, mut total) = (vec![0.0; image[channel].len()], 0.0);
@@ -131,17 +131,17 @@ fn seen_colour(image: &[Vec<f64>; 3], width: usize) -> Vec<[f64; 3]> {
     (0..filtered[0].len()).map(colour).collect()
 }
 
-/// Edges and points of the luminance, each as a length.
+/// Magnitudes of the edge and the point detector on the luminance.
 fn features(luminance: &[f64], width: usize) -> Vec<(f64, f64)> {
     let deviation = 0.5 * FEATURE_DEGREES * PIXELS_PER_DEGREE;
     let radius = (3.0 * deviation).ceil() as usize;
     let bell = |x: f64| (-x * x / (2.0 * deviation * deviation)).exp();
-    let plain = scaled(&taps(radius, bell), None);
+    let plain = normalised(&taps(radius, bell), Sum::All);
     let edge = taps(radius, |x| -x * bell(x));
     let point = taps(radius, |x| (x * x / (deviation * deviation) - 1.0) * bell(x));
     let luminance: Vec<f64> = luminance.iter().map(|y| (y + 16.0) / 116.0).collect();
     let length = |taps: &[f64]| -> Vec<f64> {
-        let taps = scaled(taps, Some(()));
+        let taps = normalised(taps, Sum::PerSign);
         let across = convolve(&luminance, width, [&taps, &plain], Border::Nearest);
         let down = convolve(&luminance, width, [&plain, &taps], Border::Nearest);
         across.into_iter().zip(down).map(|(x, y)| x.hypot(y)).collect()
@@ -157,7 +157,7 @@ fn dot(a: [f64; 3], b: [f64; 3]) -> f64 {
     a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 }
 
-/// L*a*b* with chroma shrunk in the dark.
+/// L*a*b* with chroma scaled by lightness (Hunt effect).
 fn hunt_lab(xyz: [f64; 3]) -> [f64; 3] {
     let white = linear_to_xyz([1.0; 3]);
     let delta = 6.0f64 / 29.0;
@@ -167,30 +167,38 @@ fn hunt_lab(xyz: [f64; 3]) -> [f64; 3] {
     [lightness, 0.01 * lightness * 500.0 * (x - y), 0.01 * lightness * 200.0 * (y - z)]
 }
 
+/// The HyAB distance: lightness by absolute value, chroma by Euclidean length.
 fn hyab(a: [f64; 3], b: [f64; 3]) -> f64 {
     (a[0] - b[0]).abs() + (a[1] - b[1]).hypot(a[2] - b[2])
 }
 
-/// A function at whole numbers from -radius to radius.
+/// Samples of a function at the integers from -radius to radius.
 fn taps(radius: usize, of: impl Fn(f64) -> f64) -> Vec<f64> {
     (0..=2 * radius).map(|i| of(i as f64 - radius as f64)).collect()
 }
 
-/// Taps that sum to one, or (`signed`) whose positive ones sum to one and negative ones to minus one.
-fn scaled(taps: &[f64], signed: Option<()>) -> Vec<f64> {
+/// Taps normalised to a sum of one; or, for `Sum::PerSign`, positive taps to a sum of one and negative taps to minus one.
+fn normalised(taps: &[f64], how: Sum) -> Vec<f64> {
     let sum = |of: fn(f64) -> f64| taps.iter().map(|&t| of(t)).sum::<f64>();
-    let (positive, negative) = match signed {
-        None => (sum(|t| t), 1.0),
-        Some(()) => (sum(|t| t.max(0.0)), sum(|t| (-t).max(0.0))),
+    let (positive, negative) = match how {
+        Sum::All => (sum(|t| t), 1.0),
+        Sum::PerSign => (sum(|t| t.max(0.0)), sum(|t| (-t).max(0.0))),
     };
     taps.iter().map(|&t| if t > 0.0 { t / positive } else { t / negative }).collect()
 }
 
-/// What lies beyond the picture.
+/// How taps are normalised.
+#[derive(Clone, Copy)]
+enum Sum {
+    All,
+    PerSign,
+}
+
+/// Values beyond the edges of the picture.
 #[derive(Clone, Copy, PartialEq)]
 enum Border {
     Zero,
-    /// The nearest pixel.
+    /// The value of the nearest pixel.
     Nearest,
 }
 
@@ -231,7 +239,7 @@ mod tests {
     const WIDTH: usize = 48;
     const HEIGHT: usize = 32;
 
-    /// Waves and squares of whole numbers, so that other programs can make the same.
+    /// Integer arithmetic only, so that other programs can make the same picture.
     fn picture(phase: usize) -> Vec<f32> {
         let value = |c: usize, x: usize, y: usize| {
             let sum = x * (3 + c) + y * (5 - c) + (x * y) % 7 * 9 + phase * (11 + c * 5) + (x / 8 + y / 8) % 2 * 60;
@@ -251,8 +259,8 @@ mod tests {
     }
 
     #[test]
-    fn flip_is_its_authors() {
-        // The Python package flip-evaluator 1.7 on the same pictures.
+    fn flip_matches_its_authors_implementation() {
+        // Values of the Python package flip-evaluator 1.7 on the same pictures.
         let map = flip(&picture(0), &damaged(), WIDTH, HEIGHT);
         let mean = map.iter().sum::<f64>() / map.len() as f64;
         assert!((mean - 0.416_304).abs() < 1e-4, "{mean}");
@@ -264,7 +272,7 @@ mod tests {
     }
 
     #[test]
-    fn the_mean_of_the_map_is_ssim() {
+    fn the_mean_of_the_ssim_map_is_ssim() {
         let (a, b) = (picture(0), damaged());
         let map = ssim(&a, &b, WIDTH, HEIGHT);
         let mean = map.iter().sum::<f64>() / map.len() as f64;

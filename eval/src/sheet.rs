@@ -1,26 +1,22 @@
-//! Contact sheets: photo, render and error side by side, with figures, for eyes.
-
-use std::io::Cursor;
-use std::path::Path;
+//! Draws contact sheets: photo, render and error map side by side, with figures.
 
 use font8x8::legacy::BASIC_LEGACY;
 use image::imageops::{self, FilterType};
 use image::{Rgb, RgbImage};
-use store::file::{SaveError, save};
 
 /// Width of each of a row's three pictures, pixels.
 const COLUMN: u32 = 480;
 const GAP: u32 = 8;
-/// Letters are 8×8 dots of this size.
+/// Size of one of a letter's 8×8 dots, pixels.
 const DOT: u32 = 2;
 const LINE: u32 = 8 * DOT + 8;
 const HEADER: u32 = 8 + LINE;
-const INK: Rgb<u8> = Rgb([232, 232, 232]);
+pub(crate) const INK: Rgb<u8> = Rgb([232, 232, 232]);
 const DIM: Rgb<u8> = Rgb([150, 150, 150]);
-const PAPER: Rgb<u8> = Rgb([24, 26, 30]);
-/// The error that the heat map shows in its last colour: mean absolute difference over channels, of 1.
-const HOTTEST: f32 = 0.25;
-/// From no error to [`HOTTEST`]: evenly spaced, brightness grows all along.
+pub(crate) const PAPER: Rgb<u8> = Rgb([24, 26, 30]);
+/// Mean absolute difference over channels, 0..1, at which the heat map is saturated.
+const MAX_ERROR: f32 = 0.25;
+/// Colours of the heat map, evenly spaced from no error to [`MAX_ERROR`]; brightness increases monotonically.
 const HEAT: [[f32; 3]; 6] = [
     [0.0, 0.0, 4.0],
     [66.0, 10.0, 104.0],
@@ -32,24 +28,24 @@ const HEAT: [[f32; 3]; 6] = [
 
 /// One view of a contact sheet.
 #[derive(Debug, Clone)]
-pub struct SheetRow {
+pub(crate) struct SheetRow {
     /// The view's name.
-    pub label: String,
-    /// What the camera saw.
-    pub photo: RgbImage,
-    /// What the model shows; as large as the photo.
-    pub render: RgbImage,
+    pub(crate) label: String,
+    /// The photo.
+    pub(crate) photo: RgbImage,
+    /// The render; normally as large as the photo.
+    pub(crate) render: RgbImage,
     /// dB.
-    pub psnr: Option<f64>,
+    pub(crate) psnr: Option<f64>,
     /// 0..1.
-    pub ssim: Option<f64>,
+    pub(crate) ssim: Option<f64>,
     /// SSIMULACRA2, up to 100.
-    pub perceptual: Option<f64>,
+    pub(crate) perceptual: Option<f64>,
 }
 
-/// Draws photo | render | error, a row per view, under a header with the error's legend. Photos are scaled to one width;
-/// where a render differs in size from its photo, the row says so and shows no error.
-pub fn contact_sheet(rows: &[SheetRow]) -> RgbImage {
+/// Draws photo | render | error, a row per view, under a header with the error's legend. Pictures are scaled to one width.
+/// If a render differs in size from its photo, the row shows no error map and says so.
+pub(crate) fn contact_sheet(rows: &[SheetRow]) -> RgbImage {
     let width = 3 * COLUMN + 4 * GAP;
     let heights: Vec<u32> = rows.iter().map(|row| scaled_height(&row.photo)).collect();
     let height = HEADER + heights.iter().map(|h| h + LINE + GAP).sum::<u32>();
@@ -57,40 +53,40 @@ pub fn contact_sheet(rows: &[SheetRow]) -> RgbImage {
     let column = |i: u32| GAP + i * (COLUMN + GAP);
 
     for (i, title) in ["photo", "render", "error"].iter().enumerate() {
-        text(&mut sheet, column(i as u32), 8, title, INK);
+        draw_text(&mut sheet, column(i as u32), 8, title, INK);
     }
     legend(&mut sheet, column(2) + 6 * 8 * DOT, 8);
 
     let mut y = HEADER;
     for (row, height) in rows.iter().zip(heights) {
-        text(&mut sheet, column(0), y + 4, &caption(row), INK);
+        draw_text(&mut sheet, column(0), y + 4, &caption(row), INK);
         y += LINE;
         place(&mut sheet, &row.photo, column(0), y, height);
         place(&mut sheet, &row.render, column(1), y, height);
         match error_map(&row.photo, &row.render) {
             Some(error) => place(&mut sheet, &error, column(2), y, height),
-            None => text(&mut sheet, column(2), y + 4, "sizes differ", DIM),
+            None => draw_text(&mut sheet, column(2), y + 4, "sizes differ", DIM),
         }
         y += height + GAP;
     }
     sheet
 }
 
-/// Mean absolute difference over channels as a heat map, [`None`] where the sizes differ.
-pub fn error_map(photo: &RgbImage, render: &RgbImage) -> Option<RgbImage> {
+/// Mean absolute difference over channels as a heat map; `None` if the sizes differ.
+pub(crate) fn error_map(photo: &RgbImage, render: &RgbImage) -> Option<RgbImage> {
     if photo.dimensions() != render.dimensions() {
         return None;
     }
     let mut map = RgbImage::new(photo.width(), photo.height());
     for ((out, a), b) in map.pixels_mut().zip(photo.pixels()).zip(render.pixels()) {
         let sum: u32 = a.0.iter().zip(b.0).map(|(&a, b)| u32::from(a.abs_diff(b))).sum();
-        *out = heat(sum as f32 / (3.0 * 255.0) / HOTTEST);
+        *out = heat(sum as f32 / (3.0 * 255.0) / MAX_ERROR);
     }
     Some(map)
 }
 
-/// Writes text in a fixed 8×8 font at twice its size; what does not fit the image is left out, other than ASCII is `?`.
-pub fn text(image: &mut RgbImage, x: u32, y: u32, text: &str, colour: Rgb<u8>) {
+/// Draws text in an 8×8 font at twice its size. Text beyond the image is cut off; characters outside ASCII become `?`.
+pub(crate) fn draw_text(image: &mut RgbImage, x: u32, y: u32, text: &str, colour: Rgb<u8>) {
     for (i, letter) in text.chars().enumerate() {
         let glyph = BASIC_LEGACY[if letter.is_ascii() { letter as usize } else { '?' as usize }];
         let left = x + i as u32 * 8 * DOT;
@@ -100,16 +96,6 @@ pub fn text(image: &mut RgbImage, x: u32, y: u32, text: &str, colour: Rgb<u8>) {
             }
         }
     }
-}
-
-/// Writes an 8-bit PNG.
-///
-/// # Errors
-/// A file that cannot be written.
-pub fn write_png(path: &Path, image: &RgbImage) -> Result<(), SaveError> {
-    let mut png = Cursor::new(Vec::new());
-    image.write_to(&mut png, image::ImageFormat::Png).map_err(|error| SaveError::new(path, &error))?;
-    save(path, png.get_ref())
 }
 
 fn caption(row: &SheetRow) -> String {
@@ -133,7 +119,7 @@ fn place(sheet: &mut RgbImage, image: &RgbImage, x: u32, y: u32, height: u32) {
     if image.width() == 0 || image.height() == 0 {
         return;
     }
-    // enlarged pixels stay pixels: the sheet shows what there is
+    // Enlarged pictures keep hard pixel edges, so that no detail is invented.
     let filter = if image.width() < COLUMN { FilterType::Nearest } else { FilterType::Triangle };
     let scaled = imageops::resize(image, COLUMN, height, filter);
     imageops::replace(sheet, &scaled, i64::from(x), i64::from(y));
@@ -141,14 +127,14 @@ fn place(sheet: &mut RgbImage, image: &RgbImage, x: u32, y: u32, height: u32) {
 
 fn legend(sheet: &mut RgbImage, x: u32, y: u32) {
     let bar = 200;
-    text(sheet, x, y, "0", DIM);
+    draw_text(sheet, x, y, "0", DIM);
     for i in 0..bar {
         fill(sheet, x + 24 + i, y, 1, 8 * DOT, heat(i as f32 / (bar - 1) as f32));
     }
-    text(sheet, x + 24 + bar + 8, y, &format!("{HOTTEST} mean"), DIM);
+    draw_text(sheet, x + 24 + bar + 8, y, &format!("{MAX_ERROR} mean"), DIM);
 }
 
-/// The heat map's colour of a share of [`HOTTEST`].
+/// The heat map's colour at a share of [`MAX_ERROR`].
 fn heat(share: f32) -> Rgb<u8> {
     let at = share.clamp(0.0, 1.0) * (HEAT.len() - 1) as f32;
     let below = (at as usize).min(HEAT.len() - 2);
@@ -183,7 +169,7 @@ mod tests {
     }
 
     #[test]
-    fn pictures_stand_in_their_columns() {
+    fn pictures_are_placed_in_their_columns() {
         let (red, blue) =
             (RgbImage::from_pixel(60, 40, Rgb([200, 0, 0])), RgbImage::from_pixel(60, 40, Rgb([0, 0, 200])));
         let sheet = contact_sheet(&[row(red.clone(), blue.clone()), row(red, blue)]);
@@ -196,7 +182,7 @@ mod tests {
     }
 
     #[test]
-    fn odd_sizes_draw() {
+    fn degenerate_sizes_do_not_panic() {
         let sheet = contact_sheet(&[
             row(RgbImage::new(1, 3000), RgbImage::new(2, 2)),
             row(RgbImage::new(4000, 1), RgbImage::new(4000, 1)),
@@ -204,15 +190,5 @@ mod tests {
         ]);
         assert!(sheet.height() > 4 * COLUMN);
         assert_eq!(contact_sheet(&[]).height(), HEADER);
-    }
-
-    #[test]
-    fn a_png_can_be_read_back() {
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("sheet.png");
-        let sheet = contact_sheet(&[]);
-        write_png(&path, &sheet).unwrap();
-        assert_eq!(image::open(&path).unwrap().to_rgb8(), sheet);
-        assert!(write_png(&folder.path().join("no/such.png"), &sheet).is_err());
     }
 }

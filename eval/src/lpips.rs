@@ -1,7 +1,7 @@
-//! LPIPS (Zhang et al. 2018): the distance of two pictures to a network. Its weights are not plat's to ship; whoever has
-//! them exports the network once, as `plat eval --help` says, and names the file.
+//! LPIPS (Zhang et al. 2018): the perceptual distance of two pictures by a network.
 //!
-//! The file is any ONNX graph with two float inputs (1, 3, height, width) of sRGB values in -1..1 and one output, a number.
+//! plat does not ship the weights. `plat eval --help` says how to export the network. The file is any ONNX
+//! graph with two float inputs (1, 3, height, width) of sRGB values in -1..1 and one scalar output.
 
 use std::fs::File;
 use std::io::Read;
@@ -11,12 +11,12 @@ use std::path::Path;
 use rten::{Model, NodeId, Value};
 use scene::BadInput;
 
-/// The networks of LPIPS have 10 MB (AlexNet) to 60 MB (VGG).
+/// LPIPS networks have 10 MB (AlexNet) to 60 MB (VGG).
 const FILE_LIMIT: u64 = 1 << 30;
 const ADVICE: &str = "export the network as plat eval --help says";
 
-/// A network that tells how far two pictures are apart.
-pub(crate) struct Lpips {
+/// A network that computes the distance of two pictures.
+pub struct Lpips {
     file: String,
     model: Model,
     inputs: [NodeId; 2],
@@ -24,9 +24,11 @@ pub(crate) struct Lpips {
 }
 
 impl Lpips {
+    /// Loads the network.
+    ///
     /// # Errors
-    /// A file that cannot be read, is no ONNX graph, or has other inputs and outputs.
-    pub(crate) fn load(path: &Path) -> Result<Self, BadInput> {
+    /// A file that cannot be read, is not an ONNX graph, or has other inputs and outputs.
+    pub fn load(path: &Path) -> Result<Self, BadInput> {
         let file = path.display().to_string();
         let bad = |problem: String| BadInput::new(file.clone(), problem, ADVICE);
         let mut bytes = Vec::new();
@@ -37,8 +39,8 @@ impl Lpips {
         if bytes.len() as u64 > FILE_LIMIT {
             return Err(bad(format!("is larger than {} MB", FILE_LIMIT >> 20)));
         }
-        let model = calmly(|| Model::load(bytes).map_err(|error| error.to_string()));
-        let model = model.map_err(|error| bad(format!("is no ONNX graph that can be run ({error})")))?;
+        let model = without_panic(|| Model::load(bytes).map_err(|error| error.to_string()));
+        let model = model.map_err(|error| bad(format!("is not an ONNX graph that can be run ({error})")))?;
         let (&[a, b], &[output]) = (model.input_ids(), model.output_ids()) else {
             let (inputs, outputs) = (model.input_ids().len(), model.output_ids().len());
             return Err(bad(format!("has {inputs} inputs and {outputs} outputs, LPIPS has 2 and 1")));
@@ -46,10 +48,10 @@ impl Lpips {
         Ok(Self { file, model, inputs: [a, b], output })
     }
 
-    /// How far two pictures are apart: planes of sRGB values in 0..1, as in [`train::metrics`].
+    /// The distance of two pictures: three planes of sRGB values in 0..1 each, as in [`train::metrics`].
     ///
     /// # Errors
-    /// The network refuses pictures of this size, or says something else than a number.
+    /// A network that refuses pictures of this size, or whose output is not one finite number.
     pub(crate) fn distance(&self, a: &[f32], b: &[f32], width: usize, height: usize) -> Result<f64, BadInput> {
         let tensor = |image: &[f32]| {
             Value::from_shape(&[1, 3, height, width], image.iter().map(|v| 2.0 * v - 1.0).collect::<Vec<f32>>())
@@ -67,15 +69,15 @@ impl Lpips {
             }
         };
         let bad = |error| format!("does not compare two pictures of {width}×{height} ({error})");
-        calmly(run).map_err(|error| BadInput::new(self.file.clone(), bad(error), ADVICE))
+        without_panic(run).map_err(|error| BadInput::new(self.file.clone(), bad(error), ADVICE))
     }
 }
 
-/// What the runtime says of a graph, also where it panics over it.
-fn calmly<T>(work: impl FnOnce() -> Result<T, String>) -> Result<T, String> {
+/// Runs the inference runtime; its panics on unusual graphs become errors.
+fn without_panic<T>(work: impl FnOnce() -> Result<T, String>) -> Result<T, String> {
     let hook = std::panic::take_hook();
     std::panic::set_hook(Box::new(|_| {}));
     let done = catch_unwind(AssertUnwindSafe(work));
     std::panic::set_hook(hook);
-    done.unwrap_or_else(|_| Err("the runtime gave up on it".to_owned()))
+    done.unwrap_or_else(|_| Err("the runtime panicked".to_owned()))
 }

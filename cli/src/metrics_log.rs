@@ -1,4 +1,4 @@
-//! The news of a job as `metrics.jsonl`, progress and clocks.
+//! Writes the updates of a job to `metrics.jsonl`, shows progress, and adds up times.
 
 use std::fs::File;
 use std::path::{Path, PathBuf};
@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use bench::CurvePoint;
 use blocks::Plan;
 use proto::TaskState;
-use proto::watch_event::Event as News;
+use proto::watch_event::Event;
 use scene::BlockId;
 use serde::Serialize;
 use store::file::{SaveError, append};
@@ -26,55 +26,54 @@ struct Line {
     wall_seconds: f64,
     splats: u64,
     loss: Option<f64>,
-    /// dB of the merged model so far over the job's test views, where it was measured.
+    /// PSNR of the merged model so far over the held-out views, dB; null if it was not measured.
     psnr: Option<f64>,
-    /// Splats of what was measured.
+    /// Splats of that model.
     merged_splats: Option<u64>,
 }
 
-/// What a task has taken so far.
+/// Progress and time of a task's current attempt.
 #[derive(Debug, Clone, Default)]
 struct Spent {
     attempt: u32,
-    /// Of the planned steps; a cap in time may leave fewer to take.
+    /// Scaled to the planned steps; a time limit may leave fewer.
     step: u64,
     cpu_seconds: f64,
     wall_seconds: f64,
 }
 
-/// What a job took, and what it was worth on the way.
+/// Times of a job, and its held-out PSNR during training.
 #[derive(Debug, Default)]
-pub(crate) struct Total {
+pub(crate) struct Totals {
     pub(crate) cpu_seconds: f64,
     pub(crate) wall_seconds: f64,
     pub(crate) last_psnr: Option<f64>,
     pub(crate) curve: Vec<CurvePoint>,
 }
 
-/// Writes the news of a job down.
+/// Logs the updates of a job.
 ///
-/// Clocks run from the start of the program's work: what came before the job, what tasks took before, and the task so
-/// far, evaluation left out. With several workers tasks overlap and a task cannot tell its CPU time from others';
-/// then they are the process's clocks at the arrival of the news, evaluation included.
-pub(crate) struct Journal<'a> {
+/// Logged times run from the start of the command: work before the job, finished tasks, and the current task, without evaluation. With
+/// several workers tasks overlap and share one CPU clock; then the times are those of the process at the update, with evaluation.
+pub(crate) struct MetricsLog<'a> {
     path: PathBuf,
     file: File,
-    /// Each task's block and steps as planned.
+    /// Block and planned steps of each task.
     planned: Vec<(BlockId, u32)>,
     tasks: Vec<Spent>,
     workers: u32,
-    /// Since the start of the program's work.
+    /// Since the start of the command.
     clock: Stopwatch,
-    /// What came before the job and attempts that failed.
+    /// CPU and wall seconds before the job and of failed attempts.
     before: (f64, f64),
     progress: &'a Progress,
-    total: Total,
+    totals: Totals,
     done: usize,
     failed: Option<Failure>,
 }
 
-impl<'a> Journal<'a> {
-    /// A new file for the news of this plan's job; `clock` has run since the start.
+impl<'a> MetricsLog<'a> {
+    /// Creates the file for the job of this plan. `clock` has run since the start of the command.
     pub(crate) fn create(
         path: &Path,
         plan: &Plan,
@@ -91,16 +90,16 @@ impl<'a> Journal<'a> {
             before: (clock.cpu_seconds(), clock.wall_seconds()),
             clock,
             progress,
-            total: Total::default(),
+            totals: Totals::default(),
             done: 0,
             failed: None,
         })
     }
 
-    /// Notes a piece of news. A disk that refuses a line is told at the end: the work goes on.
-    pub(crate) fn note(&mut self, news: &News) {
-        match news {
-            News::Changed(changed) => {
+    /// Logs an update. A line that cannot be written fails [`close`](Self::close), not the job.
+    pub(crate) fn update(&mut self, update: &Event) {
+        match update {
+            Event::Changed(changed) => {
                 let Some((block, _)) = self.planned.get(changed.task as usize) else { return };
                 match changed.state() {
                     TaskState::Done => {
@@ -115,12 +114,12 @@ impl<'a> Journal<'a> {
                     TaskState::Waiting | TaskState::Ready | TaskState::Leased => {}
                 }
             }
-            News::Reported(reported) => {
+            Event::Reported(reported) => {
                 if let Some(report) = &reported.report {
                     self.report(reported.task as usize, reported.attempt, report);
                 }
             }
-            News::Finished(_) => {}
+            Event::Finished(_) => {}
         }
     }
 
@@ -148,20 +147,20 @@ impl<'a> Journal<'a> {
             merged_splats: report.merged_splats,
         };
         if let Some(psnr) = report.psnr {
-            self.total.last_psnr = Some(psnr);
-            self.total.curve.push(CurvePoint { cpu_seconds, psnr, splats: report.merged_splats });
+            self.totals.last_psnr = Some(psnr);
+            self.totals.curve.push(CurvePoint { cpu_seconds, psnr, splats: report.merged_splats });
         }
         if self.failed.is_none() {
             let written = serde_json::to_string(&line).map_err(std::io::Error::from);
             let written = written.and_then(|text| append(&mut self.file, (text + "\n").as_bytes()));
             self.failed = written.err().map(|error| SaveError::new(&self.path, &error).into());
         }
-        let psnr = self.total.last_psnr.map_or(String::new(), |psnr| format!(", {psnr:.2} dB"));
+        let psnr = self.totals.last_psnr.map_or(String::new(), |psnr| format!(", {psnr:.2} dB"));
         let message = format!("block {}, {} splats{psnr}", line.task, report.splats);
         self.progress.at(self.tasks.iter().map(|spent| spent.step).sum(), message);
     }
 
-    /// CPU and wall seconds since the start.
+    /// CPU and wall seconds since the start of the command.
     fn clocks(&self) -> (f64, f64) {
         if self.workers > 1 {
             return (self.clock.cpu_seconds(), self.clock.wall_seconds());
@@ -170,15 +169,15 @@ impl<'a> Journal<'a> {
         (self.before.0 + sum(|spent| spent.cpu_seconds), self.before.1 + sum(|spent| spent.wall_seconds))
     }
 
-    /// What the job took.
+    /// The job's totals.
     ///
     /// # Errors
     /// The first line that could not be written.
-    pub(crate) fn close(self) -> Result<Total, Failure> {
+    pub(crate) fn close(self) -> Result<Totals, Failure> {
         let (cpu_seconds, wall_seconds) = self.clocks();
         match self.failed {
             Some(failure) => Err(failure),
-            None => Ok(Total { cpu_seconds, wall_seconds, ..self.total }),
+            None => Ok(Totals { cpu_seconds, wall_seconds, ..self.totals }),
         }
     }
 }

@@ -1,9 +1,9 @@
-//! What a run says about itself: `report.json`, the object of `--json`, and the source of bench's result lines.
+//! The figures of a run: the base of `report.json`, of the object of `--json`, and of bench's result lines.
 
 use bench::{CurvePoint, ResultLine};
 use serde::Serialize;
 
-/// The figures of DESIGN section 8 under their names; what was not measured is null.
+/// The figures of a run under the names of DESIGN section 8; those that were not measured are null.
 #[derive(Debug, Clone, Default, Serialize)]
 pub(crate) struct Record {
     pub(crate) command: &'static str,
@@ -13,19 +13,19 @@ pub(crate) struct Record {
     pub(crate) scene: String,
     pub(crate) downscale: u32,
     pub(crate) config_hash: Option<String>,
-    /// As planned.
+    /// Planned optimiser steps.
     pub(crate) steps: Option<u32>,
     pub(crate) budget: Option<u32>,
     pub(crate) tolerance_db: Option<f64>,
     pub(crate) backend: String,
     pub(crate) workers: u32,
     pub(crate) threads: u32,
-    /// Ingest, training and merging, evaluation left out.
+    /// Of ingest, training and merging; evaluation is left out.
     pub(crate) wall_seconds: Option<f64>,
     pub(crate) cpu_seconds: Option<f64>,
     /// dB over the held-out views.
     pub(crate) psnr: Option<f64>,
-    /// dB over the held-out views, colours corrected.
+    /// dB over the held-out views, after the affine colour correction of each.
     pub(crate) cc_psnr: Option<f64>,
     pub(crate) ssim: Option<f64>,
     pub(crate) lpips: Option<f64>,
@@ -49,13 +49,13 @@ impl Record {
         Self { command, commit: commit(), machine: bench::machine(), ..Self::default() }
     }
 
-    /// Takes over what an evaluation of the model measured.
-    pub(crate) fn measured(&mut self, by: &Self) {
+    /// Copies the quality figures from an evaluation of the model.
+    pub(crate) fn set_quality(&mut self, by: &Self) {
         (self.psnr, self.ssim, self.perceptual) = (by.psnr, by.ssim, by.perceptual);
         (self.lpips, self.fps, self.cc_psnr) = (by.lpips, by.fps, by.cc_psnr);
     }
 
-    /// As a line of bench/results.
+    /// A line of bench/results; `invoked` is the command line.
     pub(crate) fn line(&self, label: &str, invoked: String, curve: Vec<CurvePoint>) -> ResultLine {
         ResultLine {
             label: label.to_owned(),
@@ -91,7 +91,12 @@ impl Record {
     }
 }
 
-/// The commit that the program was built from, `-dirty` where files differed; `unknown` outside a git checkout.
+/// The commit that the program was built from, with `-dirty` if files differed; `unknown` outside a git checkout.
 pub(crate) fn commit() -> &'static str {
     option_env!("PLAT_COMMIT").unwrap_or("unknown")
+}
+
+/// The command line, with the program by its plain name.
+pub(crate) fn invocation() -> String {
+    std::iter::once("plat".to_owned()).chain(std::env::args().skip(1)).collect::<Vec<_>>().join(" ")
 }

@@ -1,28 +1,28 @@
-//! Cameras over a whole scene, for the picture that shows a merged city at a glance.
+//! Places cameras above a scene so that nearly all of it is in view.
 
 use glam::{DMat3, DQuat, DVec3};
 use scene::{Camera, Capture, Pinhole, Rigid};
 
-/// Horizontal field of view: narrow, so that houses lean little.
+/// Horizontal field of view. Narrow, so that houses lean little.
 const FIELD_OF_VIEW_DEGREES: f64 = 30.0;
-/// Share of points beyond each side of the box that the picture shows; structure from motion has outliers.
-const OUTLIERS: f64 = 0.01;
+/// Share of points that may lie outside each side of the framed box: structure from motion has outliers.
+const OUTLIER_SHARE: f64 = 0.01;
 
-/// Straight down over everything the capture's sparse points (or, without points, its cameras) cover, y up in the picture;
-/// `up` points away from the ground. The picture is `width` pixels wide and as high as the scene asks for, between
-/// half and double its width.
+/// A camera that looks straight down on the extent of the capture's sparse points, or of its cameras if it has no points. World y
+/// points up in the picture. `up` points away from the ground. The picture is `width` pixels wide; its height follows from
+/// the extent, between half and double the width.
 pub fn birdseye_camera(capture: &Capture, up: DVec3, width: u32) -> Camera {
-    over(capture, up, 90.0, width)
+    camera_above(capture, up, 90.0, width)
 }
 
-/// As [`birdseye_camera`], 55° below the horizon, looking along +y.
+/// As [`birdseye_camera`], but looking along +y, 55° below the horizon.
 pub fn oblique_camera(capture: &Capture, up: DVec3, width: u32) -> Camera {
-    over(capture, up, 55.0, width)
+    camera_above(capture, up, 55.0, width)
 }
 
-fn over(capture: &Capture, up: DVec3, below_horizon_degrees: f64, width: u32) -> Camera {
+fn camera_above(capture: &Capture, up: DVec3, below_horizon_degrees: f64, width: u32) -> Camera {
     let up = up.try_normalize().unwrap_or(DVec3::Z);
-    // east and north on the ground: x and y themselves where z is up
+    // Axes on the ground; x and y themselves if z is up.
     let east = (DVec3::X - up * up.x).try_normalize().unwrap_or(DVec3::Y);
     let north = up.cross(east);
     let corners = corners(capture, [east, north, up]);
@@ -35,7 +35,7 @@ fn over(capture: &Capture, up: DVec3, below_horizon_degrees: f64, width: u32) ->
     let height = f64::from(width) * (half_extent(down) / half_extent(right)).clamp(0.5, 2.0);
     let height = (height.round() as u32).max(1);
     let focal = 0.5 * f64::from(width) / (0.5 * FIELD_OF_VIEW_DEGREES).to_radians().tan();
-    // every corner within the picture: focal · |offset| / depth ≤ half a side
+    // Every corner is inside the picture: focal · |offset| / depth ≤ half a side.
     let distance = corners.iter().fold(0.1, |distance: f64, &corner| {
         let offset = corner - centre;
         let across = (offset.dot(right).abs() / f64::from(width)).max(offset.dot(down).abs() / f64::from(height));
@@ -50,19 +50,21 @@ fn over(capture: &Capture, up: DVec3, below_horizon_degrees: f64, width: u32) ->
     }
 }
 
-/// The corners of the scene's box along these axes, outliers left out; the first and the last are opposite.
+/// The corners of the scene's box along these axes, without outliers. The first and the last are opposite.
 fn corners(capture: &Capture, axes: [DVec3; 3]) -> [DVec3; 8] {
-    let mut places = capture.points.positions.clone();
-    if places.is_empty() {
-        places = capture.views.iter().map(|view| view.camera.centre()).collect();
+    let mut points = capture.points.positions.clone();
+    if points.is_empty() {
+        points = capture.views.iter().map(|view| view.camera.centre()).collect();
     }
-    places.retain(|p| p.is_finite());
+    points.retain(|p| p.is_finite());
     let range = axes.map(|axis| {
-        let mut along: Vec<f64> = places.iter().map(|p| p.dot(axis)).collect();
+        let mut along: Vec<f64> = points.iter().map(|p| p.dot(axis)).collect();
         along.sort_by(f64::total_cmp);
         match along.len().checked_sub(1) {
             None => [-1.0, 1.0],
-            Some(last) => [OUTLIERS, 1.0 - OUTLIERS].map(|share| along[(share * last as f64).round() as usize]),
+            Some(last) => {
+                [OUTLIER_SHARE, 1.0 - OUTLIER_SHARE].map(|share| along[(share * last as f64).round() as usize])
+            }
         }
     });
     std::array::from_fn(|i| (0..3).map(|k| axes[k] * range[k][i >> k & 1]).sum())
@@ -74,16 +76,16 @@ mod tests {
     use scene::SparsePoints;
 
     fn capture(up_is_z: bool) -> Capture {
-        let places = (0..2000).map(|i| {
+        let points = (0..2000).map(|i| {
             let (x, y, z) = (f64::from(i % 50) * 4.0, f64::from(i / 50) * 2.5, f64::from(i % 7));
             if up_is_z { DVec3::new(x, y, z) } else { DVec3::new(x, -z, y) }
         });
-        let positions: Vec<DVec3> = places.chain([DVec3::splat(1e6)]).collect();
+        let positions: Vec<DVec3> = points.chain([DVec3::splat(1e6)]).collect();
         Capture { points: SparsePoints { positions, ..Default::default() }, ..Default::default() }
     }
 
     #[test]
-    fn nearly_all_points_lie_in_the_picture_and_fill_it() {
+    fn nearly_all_points_are_in_the_picture_and_fill_it() {
         for (up_is_z, up) in [(true, DVec3::Z), (false, DVec3::NEG_Y)] {
             let capture = capture(up_is_z);
             for camera in [birdseye_camera(&capture, up, 640), oblique_camera(&capture, up, 640)] {
@@ -110,7 +112,7 @@ mod tests {
     }
 
     #[test]
-    fn a_capture_without_anything_still_has_a_camera() {
+    fn an_empty_capture_still_gets_a_camera() {
         let camera = birdseye_camera(&Capture::default(), DVec3::ZERO, 64);
         assert!(camera.camera_from_world.is_sane());
     }

@@ -1,33 +1,33 @@
-//! A job while it runs: on a terminal a map of its blocks that is drawn again and again, elsewhere a line for what happens.
+//! Shows the state of a running job: on a terminal as a redrawn map of its blocks, elsewhere as a line per change.
 //!
 //! ```text
-//! 1100##..    digits: trained to that level    #: being trained    x: failed    .: waits
+//! 1100##..    digits: trained to that level    #: being trained    x: failed    .: waiting
 //! 11000000
 //! ```
-//! A cell shows the deepest block over it that has begun, north is up.
+//! North is up. A cell shows the deepest block there whose training has begun.
 
 use std::collections::BTreeMap;
 
 use coordinator::Results;
-use proto::watch_event::Event as News;
+use proto::watch_event::Event;
 use proto::{TaskChanged, TaskState};
 use scene::BlockId;
 
 use crate::clock::Stopwatch;
 use crate::output::{Output, Screen};
 
-/// Levels of the tree that cells are small enough for: 32 cells a side.
-const LEVELS_SHOWN: u8 = 5;
-/// Tasks under way that are listed beside the map.
-const TASKS_SHOWN: usize = 8;
-/// Seconds between two drawings.
-const PERIOD: f64 = 0.25;
+/// Deepest level with cells of its own: 32 cells a side.
+const MAX_LEVEL_SHOWN: u8 = 5;
+/// Running tasks listed below the map.
+const MAX_TASKS_SHOWN: usize = 8;
+/// Least seconds between two redraws.
+const REDRAW_PERIOD: f64 = 0.25;
 
-/// A job as it is shown.
-pub(crate) struct Live<'a> {
+/// The display of one job.
+pub(crate) struct LiveStatus<'a> {
     job: u64,
     blocks: Vec<BlockId>,
-    /// Of tasks under way, in thousandths.
+    /// Of running tasks, in thousandths.
     progress: BTreeMap<u32, u64>,
     states: Vec<TaskState>,
     output: &'a Output,
@@ -36,33 +36,33 @@ pub(crate) struct Live<'a> {
     drawn: f64,
 }
 
-impl<'a> Live<'a> {
-    /// A job with these blocks; none if they are not known, then there is no map.
+impl<'a> LiveStatus<'a> {
+    /// A job with these blocks. Without blocks there is no map.
     pub(crate) fn new(job: u64, blocks: Vec<BlockId>, output: &'a Output) -> Self {
         let (progress, screen, clock) = (BTreeMap::new(), output.screen(), Stopwatch::start());
         Self { job, blocks, progress, states: Vec::new(), output, screen, clock, drawn: f64::NEG_INFINITY }
     }
 
-    /// Shows a piece of news, which the results have taken in.
-    pub(crate) fn note(&mut self, results: &Results, news: &News) {
-        match news {
-            News::Reported(reported) => {
+    /// Shows an update that `results` already contains.
+    pub(crate) fn update(&mut self, results: &Results, update: &Event) {
+        match update {
+            Event::Reported(reported) => {
                 let permille = |report: &proto::Report| report.step.saturating_mul(1000).checked_div(report.steps);
                 if let Some(permille) = reported.report.as_ref().and_then(permille) {
                     self.progress.insert(reported.task, permille.min(1000));
                 }
             }
-            News::Changed(changed) => {
+            Event::Changed(changed) => {
                 if changed.state() != TaskState::Leased {
                     self.progress.remove(&changed.task);
                 }
                 if self.screen.is_none() {
-                    self.tell(results, changed);
+                    self.print_change(results, changed);
                 }
             }
-            News::Finished(_) => self.drawn = f64::NEG_INFINITY,
+            Event::Finished(_) => self.drawn = f64::NEG_INFINITY,
         }
-        if self.screen.is_some() && self.clock.wall_seconds() - self.drawn >= PERIOD {
+        if self.screen.is_some() && self.clock.wall_seconds() - self.drawn >= REDRAW_PERIOD {
             self.drawn = self.clock.wall_seconds();
             let mut lines = map(&self.blocks, results.tasks(), true);
             lines.extend(self.summary(results));
@@ -70,8 +70,8 @@ impl<'a> Live<'a> {
         }
     }
 
-    /// A line for a change that is one.
-    fn tell(&mut self, results: &Results, changed: &TaskChanged) {
+    /// Prints a line if the task's state changed.
+    fn print_change(&mut self, results: &Results, changed: &TaskChanged) {
         self.states.resize(results.tasks().len(), TaskState::Waiting);
         let Some(before) = self.states.get_mut(changed.task as usize) else { return };
         if std::mem::replace(before, changed.state()) == changed.state() {
@@ -81,7 +81,7 @@ impl<'a> Live<'a> {
         let (done, all) = (count(results, TaskState::Done), results.tasks().len());
         match changed.state() {
             TaskState::Done => self.output.note(format!("{name} done, {done} of {all}")),
-            TaskState::Leased => self.output.note(format!("{name} goes to {}", changed.worker)),
+            TaskState::Leased => self.output.note(format!("{name} is trained by {}", changed.worker)),
             TaskState::Failed | TaskState::Quarantined => {
                 self.output.note(format!("{name} failed: {}", proto::one_line(&changed.message)));
             }
@@ -99,7 +99,7 @@ impl<'a> Live<'a> {
             self.job
         )];
         let running = results.tasks().iter().filter(|task| task.state() == TaskState::Leased);
-        lines.extend(running.take(TASKS_SHOWN).map(|task| {
+        lines.extend(running.take(MAX_TASKS_SHOWN).map(|task| {
             let percent = self.progress.get(&task.task).copied().unwrap_or(0) / 10;
             format!("  {:<14} {percent:>3} %  {}", name_of(&self.blocks, task.task), task.worker)
         }));
@@ -107,7 +107,7 @@ impl<'a> Live<'a> {
     }
 }
 
-/// A task's block where it is known, else its number.
+/// A task's block, or its number if the block is not known.
 pub(crate) fn name_of(blocks: &[BlockId], task: u32) -> String {
     blocks.get(task as usize).map_or(format!("task {task}"), |block| format!("block {block}"))
 }
@@ -116,26 +116,26 @@ fn count(results: &Results, wanted: TaskState) -> usize {
     results.tasks().iter().filter(|task| task.state() == wanted).count()
 }
 
-/// The blocks from above, a line a row and the legend beneath; nothing where there are no blocks.
+/// The map of the blocks, a line per row, and its legend; empty without blocks.
 pub(crate) fn map(blocks: &[BlockId], tasks: &[TaskChanged], colours: bool) -> Vec<String> {
     let Some(deepest) = blocks.iter().map(|block| block.level).max() else { return Vec::new() };
-    let shown = deepest.min(LEVELS_SHOWN);
+    let shown = deepest.min(MAX_LEVEL_SHOWN);
     let side = 1u32 << shown;
     let mut cells = vec![b' '; (side * side) as usize];
-    // Deeper blocks lie over those above them, and of those that share a cell what is under way over what is done.
+    // Deeper blocks cover coarser ones. Of blocks that share a cell, failed ones cover running ones, and those finished ones.
     let mut order: Vec<(&BlockId, u8)> =
         blocks.iter().zip(tasks).map(|(block, task)| (block, mark(block, task))).collect();
     order.sort_by_key(|(block, mark)| (block.level, rank(*mark), block.y, block.x));
     for (block, mark) in order {
-        let (low, cells_wide) = match shown.checked_sub(block.level) {
+        let (low, width) = match shown.checked_sub(block.level) {
             Some(up) => ((block.x << up, block.y << up), 1u32 << up),
             None => {
                 let of = block.ancestor(shown);
                 ((of.x, of.y), 1)
             }
         };
-        for y in low.1..low.1 + cells_wide {
-            for cell in &mut cells[(y * side + low.0) as usize..][..cells_wide as usize] {
+        for y in low.1..low.1 + width {
+            for cell in &mut cells[(y * side + low.0) as usize..][..width as usize] {
                 *cell = if mark == b'.' && *cell != b' ' { *cell } else { mark };
             }
         }
@@ -145,7 +145,7 @@ pub(crate) fn map(blocks: &[BlockId], tasks: &[TaskChanged], colours: bool) -> V
         row.iter().map(|&cell| painted(cell, colours)).collect::<String>()
     };
     let mut lines: Vec<String> = (0..side).rev().map(row).collect();
-    lines.push("digits: trained to that level    #: being trained    x: failed    .: waits".into());
+    lines.push("digits: trained to that level    #: being trained    x: failed    .: waiting".into());
     lines
 }
 
@@ -167,7 +167,7 @@ fn rank(mark: u8) -> u8 {
     }
 }
 
-/// Two characters, so that cells are about square.
+/// A cell of two characters, so that it is about square.
 fn painted(cell: u8, colours: bool) -> String {
     let text = char::from(cell).to_string().repeat(2);
     let colour = match cell {
@@ -184,7 +184,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_map_shows_the_deepest_block_that_has_begun() {
+    fn the_map_shows_the_deepest_block_whose_training_has_begun() {
         let blocks: Vec<BlockId> = ["0/0/0", "1/0/0", "1/1/0", "1/0/1", "1/1/1", "2/0/0", "2/1/0"]
             .iter()
             .map(|id| id.parse().unwrap())
@@ -201,7 +201,7 @@ mod tests {
         assert_eq!(lines[..4], ["xxxx0000", "xxxx0000", "1111####", "##11####"]);
         assert!(map(&blocks, &tasks, true)[0].starts_with("\u{1b}[31mxx\u{1b}[0m"));
         assert!(map(&[], &tasks, false).is_empty());
-        // Blocks too small for a cell of their own share one.
+        // Blocks too small for a cell share one.
         let deep: Vec<BlockId> = ["0/0/0", "9/0/0", "9/1/0"].iter().map(|id| id.parse().unwrap()).collect();
         let tasks: Vec<TaskChanged> = (0..).zip([Done, Leased, Done]).map(task).collect();
         let lines = map(&deep, &tasks, false);

@@ -1,0 +1,143 @@
+//! The command lines of `plat eval`, `render`, `prune` and `export`.
+
+use std::path::PathBuf;
+
+use clap::{Args, ValueEnum};
+use eval::Levels;
+
+use super::values::{Backend, Size, decibels, levels, metres, share};
+
+#[derive(Debug, Clone, Default, Args)]
+pub(crate) struct EvalArgs {
+    /// Folder that `plat train` wrote, a .ply or a .spz
+    pub(crate) model: PathBuf,
+    /// Folder of the capture
+    pub(crate) capture: PathBuf,
+    /// Hold out every K-th view; by default as in the model's training, else 8
+    #[arg(long, value_name = "K", value_parser = clap::value_parser!(u32).range(1..))]
+    pub(crate) test_every: Option<u32>,
+    /// Use photos at one N-th of their size; by default as in the model's training, else 1
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    pub(crate) downscale: Option<u32>,
+    /// Backend to render the views on
+    #[arg(long, value_enum, default_value = "auto")]
+    pub(crate) backend: Backend,
+    /// Folder for the contact sheet and the figures; by default `eval` beside the model
+    #[arg(long, value_name = "DIR")]
+    pub(crate) out: Option<PathBuf>,
+    /// Store of the photos; by default the model's own if it exists, else a temporary one
+    #[arg(long, value_name = "URL")]
+    pub(crate) store: Option<String>,
+    /// Also measure LPIPS with this network (ONNX)
+    #[arg(long, value_name = "FILE", long_help = LPIPS_HELP)]
+    pub(crate) lpips: Option<PathBuf>,
+    /// Also measure the tree cut at level L, or at every level, against the finest model
+    #[arg(long, value_name = "L|all", value_parser = levels)]
+    pub(crate) level: Option<Levels>,
+    /// Also measure for each view the sharpest cut of the tree with at most N splats
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    pub(crate) budget: Option<u32>,
+    /// Also measure pixels near the faces between blocks against the other pixels of the same views, and the jump across each face
+    #[arg(long)]
+    pub(crate) seams: bool,
+    /// As --seams, but at the faces of this model; for comparing a model of one block with a tree of the same capture
+    #[arg(long, value_name = "MODEL")]
+    pub(crate) seams_of: Option<PathBuf>,
+    /// Distance within which a pixel is near a face; implies --seams. By default 2 metres if the capture has a geographic
+    /// origin, but at most 1/8 of the edge of the smallest block; else 1/32 of that edge
+    #[arg(long, value_name = "M", value_parser = metres)]
+    pub(crate) seam_metres: Option<f64>,
+}
+
+const LPIPS_HELP: &str = "\
+Also measure LPIPS with this network, an ONNX file with the weights inside: two inputs (1, 3, height, width) of sRGB
+values in -1..1, one output, a number. The Python package lpips exports one (net='alex', as most papers):
+
+    import lpips, torch
+    x = torch.zeros(1, 3, 64, 64)
+    free = {2: 'height', 3: 'width'}
+    torch.onnx.export(lpips.LPIPS(net='alex').eval(), (x, x), 'lpips.onnx', input_names=['a', 'b'],
+                      output_names=['distance'], dynamic_axes={'a': free, 'b': free}, dynamo=False)
+";
+
+#[derive(Debug, Clone, Args)]
+pub(crate) struct RenderArgs {
+    /// Folder that `plat train` wrote, a .ply or a .spz
+    pub(crate) model: PathBuf,
+    /// Cameras to render from: the folder of a capture, whose photos need not exist, or a transforms.json
+    #[arg(long, value_name = "CAPTURE|FILE")]
+    pub(crate) cameras: PathBuf,
+    /// Folder for the pictures
+    #[arg(long, value_name = "DIR")]
+    pub(crate) out: PathBuf,
+    /// Backend to render on
+    #[arg(long, value_enum, default_value = "auto")]
+    pub(crate) backend: Backend,
+    /// Size of the pictures; by default that of each camera
+    #[arg(long, value_name = "WxH")]
+    pub(crate) size: Option<Size>,
+    /// Also write depth as <view>.depth.npy: float32, metres, 0 = no surface
+    #[arg(long)]
+    pub(crate) depth: bool,
+    /// Compensate opacity for the screen-space dilation; by default as the model says
+    #[arg(long, overrides_with = "classic")]
+    pub(crate) antialiased: bool,
+    /// Render like the original 3DGS rasterizer; by default as the model says
+    #[arg(long, overrides_with = "antialiased")]
+    pub(crate) classic: bool,
+}
+
+#[derive(Debug, Clone, Args)]
+pub(crate) struct PruneArgs {
+    /// Folder that `plat train` wrote, a .ply or a .spz
+    pub(crate) model: PathBuf,
+    /// Path of the pruned model: a folder if the model is one, else a file of the same format
+    #[arg(long, value_name = "MODEL2")]
+    pub(crate) out: PathBuf,
+    /// Keep this share of the splats, in 0..1
+    #[arg(long, value_name = "F", value_parser = share, conflicts_with = "tolerance_db")]
+    pub(crate) keep: Option<f64>,
+    /// Lose at most this much PSNR on the views that are not held out, dB; 0.1 if --keep is not given either [needs --capture]
+    #[arg(long, value_name = "X", value_parser = decibels)]
+    pub(crate) tolerance_db: Option<f64>,
+    /// Capture whose photos splats are ranked and recovered by; without it only --keep, ranked by opacity and size
+    #[arg(long)]
+    pub(crate) capture: Option<PathBuf>,
+    #[command(flatten)]
+    pub(crate) photos: PruneCapture,
+}
+
+/// How the photos of the capture are read.
+#[derive(Debug, Clone, Args)]
+pub(crate) struct PruneCapture {
+    /// Hold out every K-th view; by default as in the model's training, else 8
+    #[arg(long, value_name = "K")]
+    pub(crate) test_every: Option<u32>,
+    /// Use photos at one N-th of their size; by default as in the model's training, else 1
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    pub(crate) downscale: Option<u32>,
+    /// Store of the photos; by default the model's own if it exists, else a temporary one
+    #[arg(long, value_name = "URL")]
+    pub(crate) store: Option<String>,
+}
+
+/// A format that other programs read.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum Format {
+    /// INRIA's PLY, which most viewers and trainers read
+    Ply,
+    /// Niantic's SPZ, version 3: a tenth of the size, quantised
+    Spz,
+}
+
+#[derive(Debug, Clone, Args)]
+pub(crate) struct ExportArgs {
+    /// Folder that `plat train` wrote, a .ply or a .spz
+    pub(crate) model: PathBuf,
+    /// Format
+    #[arg(long, value_enum)]
+    pub(crate) to: Format,
+    /// File to write
+    #[arg(long, value_name = "PATH")]
+    pub(crate) out: PathBuf,
+}

@@ -1,0 +1,100 @@
+//! Options that decide the plan of a capture.
+
+use blocks::{Mode, PlanSettings};
+use clap::{Args, ValueEnum};
+use scene::Capture;
+use serde::Serialize;
+
+use super::values::{Auto, decibels, residual, views_per_step};
+
+/// How the scene is divided.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub(crate) enum Blocks {
+    /// Level-of-detail tree: blocks start from their parent's splats and train beside their neighbours'
+    Tree,
+    /// Only the leaves, each independently from the sparse points
+    Flat,
+    /// One block
+    Whole,
+}
+
+/// Default of `--residual`.
+pub(crate) const RESIDUAL: f64 = 0.4;
+
+/// Options of the plan.
+#[derive(Debug, Clone, Args, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub(crate) struct PlanOptions {
+    /// How the scene is divided
+    #[arg(long, value_enum, default_value = "tree")]
+    pub(crate) blocks: Blocks,
+    /// Levels below the root; auto chooses by extent, resolution, views and points
+    #[arg(long, value_name = "N|auto", default_value_t)]
+    pub(crate) levels: Auto<u8>,
+    /// Optimiser steps, counted in full images of the whole scene, so that every division costs about the same; auto takes 60
+    /// per view, at least 500
+    #[arg(long, value_name = "N|auto", default_value_t)]
+    pub(crate) steps: Auto<u32>,
+    /// Render N windows, at most 16, per optimiser step, with learning rates √N times as high. --steps still counts windows.
+    /// This fills a large GPU with small photos; on a CPU it saves nothing
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = views_per_step())]
+    pub(crate) views_per_step: u32,
+    /// Splats of the merged model before pruning; auto takes three per sparse point, from 5,000 to 2,000,000
+    #[arg(long, value_name = "N|auto", default_value_t)]
+    pub(crate) budget: Auto<u32>,
+    /// Prune the finest blocks within this loss of PSNR on their training views, dB; 0 prunes nothing
+    #[arg(long, value_name = "X", value_parser = decibels, default_value_t = 0.1)]
+    pub(crate) tolerance_db: f64,
+    /// Refine a block only if the error of its parent's splats in the block's photos exceeds R times the root's error over all photos
+    /// (both root mean square), and use fine pixels and densify only while that reduces the error; 0 turns adaptation off
+    #[arg(long, value_name = "R", value_parser = residual, default_value_t = RESIDUAL)]
+    pub(crate) residual: f64,
+    /// Seed of all random choices
+    #[arg(long, value_name = "S", default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=i64::MAX as u64))]
+    pub(crate) seed: u64,
+    /// Hold out every K-th view by name, starting with the first; 0 holds out none
+    #[arg(long, value_name = "K", default_value_t = 8)]
+    pub(crate) test_every: u32,
+    /// Compensate opacity for the screen-space dilation (Mip-Splatting): the model can be rendered at any resolution by viewers that
+    /// do the same, at a cost of 0.2 to 0.6 dB at its own resolution
+    #[arg(long)]
+    pub(crate) antialiased: bool,
+    /// Train an exposure per view in the root block and use it in all other blocks. For photos of varying exposure or white
+    /// balance; not with --blocks flat
+    #[arg(long)]
+    pub(crate) exposure: bool,
+    /// Use photos at one N-th of their size
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
+    pub(crate) downscale: u32,
+}
+
+impl PlanOptions {
+    /// The planner's settings for a capture.
+    ///
+    /// Budget and steps grow with points and views, as more would overfit: at a quarter of its size `street_lund` (25 views,
+    /// 1,540 points) reaches 16.1 dB held out with 6,000 splats and 1,500 steps, 15.3 dB with 20,000 and 3,000.
+    pub(crate) fn settings(&self, capture: &Capture) -> PlanSettings {
+        let times = |count: usize, each: u32| u32::try_from(count).unwrap_or(u32::MAX).saturating_mul(each);
+        let budget = || times(capture.points.len(), 3).clamp(5000, 2_000_000);
+        let steps = || times(capture.views.len(), 60).max(500);
+        PlanSettings {
+            mode: match self.blocks {
+                Blocks::Tree => Mode::Tree,
+                Blocks::Flat => Mode::Flat,
+                Blocks::Whole => Mode::Whole,
+            },
+            levels: self.levels.0,
+            seed: self.seed,
+            steps: self.steps.0.unwrap_or_else(steps),
+            views_per_step: self.views_per_step,
+            budget: self.budget.0.unwrap_or_else(budget),
+            tolerance_db: self.tolerance_db,
+            residual: self.residual,
+            test_every: self.test_every,
+            antialiased: self.antialiased,
+            exposure: self.exposure,
+            ..PlanSettings::default()
+        }
+    }
+}

@@ -1,0 +1,169 @@
+//! Renders the held-out views of a capture and measures them.
+
+use std::borrow::Cow;
+use std::path::{Path, PathBuf};
+
+use model::{Model, Tree};
+use render::{Frame, Options};
+use scene::{BadInput, Camera, Splats};
+use train::Backend;
+
+use crate::cuts::{CutFigures, CutMeter};
+use crate::details::Details;
+use crate::figures::{Comparison, ViewFigures, clamped, mean};
+use crate::images::{colour_image, photo_image, write_png};
+use crate::seams::{SeamFrames, SeamMeter, SeamReport};
+use crate::sheet::{SheetRow, contact_sheet};
+use crate::surface::without_backdrop;
+use crate::{EvalError, Lpips, Observer, Photos, Renderer, Seconds};
+
+/// Rows of a contact sheet at most; of more views an even selection is shown.
+const MAX_SHEET_ROWS: usize = 24;
+/// Bytes of decoded photos that are kept.
+const CACHE_BYTES: usize = 16 << 20;
+
+/// What to evaluate.
+pub struct Request<'a> {
+    /// The model.
+    pub model: &'a Model,
+    /// Cuts and seams to measure as well.
+    pub details: &'a Details,
+    /// The photos.
+    pub photos: &'a Photos,
+    /// What renders.
+    pub backend: &'a Backend,
+    /// The network for LPIPS.
+    pub lpips: Option<&'a Lpips>,
+    /// Folder for contact sheets and pictures; created if need be.
+    pub out: &'a Path,
+}
+
+/// Results of an evaluation.
+#[derive(Debug)]
+pub struct Evaluation {
+    /// Name of the renderer's backend.
+    pub backend: String,
+    /// Time of rendering the model's held-out views.
+    pub render_seconds: Seconds,
+    /// By held-out view.
+    pub views: Vec<ViewFigures>,
+    /// The contact sheet.
+    pub sheet: PathBuf,
+    /// In the order of the request.
+    pub cuts: Vec<CutFigures>,
+    /// Figures near the seams.
+    pub seams: Option<SeamReport>,
+}
+
+impl Evaluation {
+    /// Mean of one figure over the views that have it.
+    pub fn mean(&self, figure: impl Fn(&ViewFigures) -> Option<f64>) -> Option<f64> {
+        mean(self.views.iter().map(figure))
+    }
+}
+
+/// Renders every held-out view once and measures it; writes the contact sheet `sheet.png` and, with seams, their pictures.
+/// Views are rendered without exposures.
+///
+/// # Errors
+/// A capture without held-out views, photos that cannot be read, a renderer that fails, pictures that cannot be written.
+pub fn evaluate(request: &Request, observer: &dyn Observer) -> Result<Evaluation, EvalError> {
+    let Request { model, details, photos, backend, lpips, out } = *request;
+    let held_out = photos.views(true);
+    if held_out.is_empty() {
+        let advice = "give a number from 1 to that of the views";
+        return Err(BadInput::new("--test-every", "holds out no view", advice).into());
+    }
+    std::fs::create_dir_all(out).map_err(|error| EvalError::Folder { path: out.to_path_buf(), error })?;
+    let reader = photos.reader(CACHE_BYTES);
+    let mut renderer = Renderer::new(backend)?;
+    let splats = renderer.upload(&model.splats)?;
+
+    // The finest cut of the model's own tree is the model itself.
+    let own = details.own.as_ref().map(|tree| Scene::new(tree, Cow::Borrowed(&model.splats)));
+    let other = details.other.as_ref().map(|tree| Scene::new(tree, Cow::Owned(tree.merged(&tree.plan.leaves()))));
+    let has_cuts = !details.cuts.is_empty();
+    let mut cuts =
+        own.as_ref().filter(|_| has_cuts).map(|own| CutMeter::new(own.tree, &own.finest, &details.cuts, &reader));
+    let seam_scene = other.as_ref().or(own.as_ref().filter(|_| details.own_seams));
+    let mut seams = seam_scene
+        .map(|scene| SeamMeter::new(scene.tree, &scene.finest, other.is_some(), details.seam_metres, &photos.capture));
+
+    let shown_every = held_out.len().div_ceil(MAX_SHEET_ROWS);
+    let (mut views, mut rows, mut render_seconds) = (Vec::new(), Vec::new(), Seconds::default());
+    for (i, &index) in held_out.iter().enumerate() {
+        let view = &photos.capture.views[index as usize];
+        let photo = reader.window(index, 0, view.camera.full())?;
+        let began = observer.now();
+        let frame = renderer.render(&splats, &view.camera, &model.options())?;
+        render_seconds.add(began, observer.now());
+        let compared = Comparison::new(&view.name, &frame.colour, &photo);
+        let figures = compared.figures(lpips)?;
+        if i.is_multiple_of(shown_every) {
+            rows.push(SheetRow {
+                label: view.name.clone(),
+                photo: photo_image(&photo),
+                render: colour_image(&compared.render, compared.width, compared.height),
+                psnr: figures.psnr,
+                ssim: Some(figures.ssim),
+                perceptual: figures.perceptual,
+            });
+        }
+        let own_frame = own.as_ref().map(|own| own.foreground(&mut renderer, &view.camera)).transpose()?;
+        if let (Some(cuts), Some(foreground)) = (&mut cuts, &own_frame) {
+            cuts.add_view(index, &figures, foreground, &mut renderer)?;
+        }
+        if let Some(seams) = &mut seams {
+            let other = other.as_ref().map(|other| other.frames(&mut renderer, &view.camera)).transpose()?;
+            let frames = match (&other, &own_frame) {
+                (Some((colour, foreground)), _) => SeamFrames { colour, control: Some(&compared.render), foreground },
+                (None, Some(foreground)) => SeamFrames { colour: &compared.render, control: None, foreground },
+                (None, None) => unreachable!("seams are measured on a tree"),
+            };
+            seams.add_view(view, &photo, &compared.truth, &frames, &mut renderer)?;
+        }
+        views.push(figures);
+        observer.progress("evaluating", i as u64 + 1, held_out.len() as u64, "");
+    }
+
+    let sheet = out.join("sheet.png");
+    write_png(&sheet, &contact_sheet(&rows))?;
+    Ok(Evaluation {
+        backend: renderer.name(),
+        render_seconds,
+        views,
+        sheet,
+        cuts: cuts.map_or(Vec::new(), CutMeter::figures),
+        seams: seams.map(|seams| seams.finish(&photos.capture, out, &mut renderer)).transpose()?,
+    })
+}
+
+/// A tree's finest cut, with and without its backdrop.
+struct Scene<'a> {
+    tree: &'a Tree,
+    finest: Cow<'a, Splats>,
+    foreground: Splats,
+}
+
+impl<'a> Scene<'a> {
+    fn new(tree: &'a Tree, finest: Cow<'a, Splats>) -> Self {
+        let foreground = without_backdrop(&finest, &tree.plan.ground);
+        Self { tree, finest, foreground }
+    }
+
+    fn options(&self) -> Options {
+        Options { antialiased: self.tree.antialiased, sh_degree: self.finest.sh_degree(), ..Options::default() }
+    }
+
+    /// The foreground alone, with depth.
+    fn foreground(&self, renderer: &mut Renderer, camera: &Camera) -> Result<Frame, EvalError> {
+        let options = Options { extras: true, ..self.options() };
+        Ok(renderer.render_once(&self.foreground, camera, &options)?.clone())
+    }
+
+    /// Colours of the finest cut, clamped to 0..1, and the foreground with depth.
+    fn frames(&self, renderer: &mut Renderer, camera: &Camera) -> Result<(Vec<f32>, Frame), EvalError> {
+        let colour = clamped(&renderer.render_once(&self.finest, camera, &self.options())?.colour);
+        Ok((colour, self.foreground(renderer, camera)?))
+    }
+}

@@ -1,0 +1,37 @@
+//! Measures a model against the held-out photos of a capture.
+//!
+//! [`evaluate`] renders every held-out view once and compares it with its photo: PSNR, SSIM, SSIMULACRA2, LPIPS. On request it also
+//! measures the cuts of a level-of-detail tree ([`cuts`]) and the seams between blocks ([`seams`]) on the same views.
+//! [`Pruner`] prunes a model by a capture's photos. Contact sheets, error maps and bird's-eye cameras are here too.
+//!
+//! Architecture invariant: no command line, no terminal, no clock. Progress and time come from the caller's [`Observer`].
+
+mod birdseye;
+mod details;
+mod error;
+mod evaluate;
+mod figures;
+mod images;
+mod lpips;
+mod metric_maps;
+mod observer;
+mod photos;
+mod pruning;
+mod renderer;
+mod sheet;
+mod surface;
+
+pub mod cuts;
+pub mod seams;
+
+pub use birdseye::{birdseye_camera, oblique_camera};
+pub use details::{DetailOptions, Details, Levels};
+pub use error::EvalError;
+pub use evaluate::{Evaluation, Request, evaluate};
+pub use figures::{Means, ViewFigures, mean};
+pub use images::{frame_image, write_png};
+pub use lpips::Lpips;
+pub use observer::{Observer, Seconds};
+pub use photos::{PhotoOptions, Photos};
+pub use pruning::Pruner;
+pub use renderer::{Renderer, Uploaded};

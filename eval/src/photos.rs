@@ -1,0 +1,97 @@
+//! The photos that a model is measured on.
+
+use std::sync::Arc;
+
+use dataset::ingest::{IngestOptions, ingest};
+use dataset::open::Source;
+use dataset::windows::WindowReader;
+use model::Model;
+use scene::{ArtefactId, Capture};
+use store::{BlockingStore, Store};
+use tempfile::TempDir;
+
+use crate::{EvalError, Observer};
+
+/// How to read a capture's photos; what is not given is taken from the model's training.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct PhotoOptions<'a> {
+    /// URL of the store for ingested photos; by default the model's own if it still exists, else a temporary one.
+    pub store: Option<&'a str>,
+    /// Divisor of the photos' size.
+    pub downscale: Option<u32>,
+    /// Every how many views one is held out.
+    pub test_every: Option<u32>,
+}
+
+/// An ingested capture.
+#[derive(Debug)]
+pub struct Photos {
+    /// The capture; its views have mips.
+    pub capture: Arc<Capture>,
+    /// The store that holds its photos.
+    pub store: BlockingStore,
+    /// Id of the ingested capture; `None` where the caller does not know it.
+    pub id: Option<ArtefactId>,
+    /// Every how many views one is held out.
+    pub test_every: u32,
+    /// Divisor of the photos' size.
+    pub downscale: u32,
+    /// A temporary store, deleted with this value.
+    _temporary: Option<TempDir>,
+}
+
+impl Photos {
+    /// Photos that were ingested before.
+    pub fn ingested(capture: Capture, store: BlockingStore, test_every: u32, downscale: u32) -> Self {
+        Self { capture: Arc::new(capture), store, id: None, test_every, downscale, _temporary: None }
+    }
+
+    /// Ingests the photos of a capture.
+    ///
+    /// # Errors
+    /// A store that fails, or photos that cannot be used.
+    pub fn ingest(
+        model: &Model,
+        source: &Source,
+        options: &PhotoOptions,
+        observer: &dyn Observer,
+    ) -> Result<Self, EvalError> {
+        let (store, temporary) = open_store(model, options.store)?;
+        let store = store.blocking();
+        let downscale = options.downscale.unwrap_or(model.downscale());
+        let threads = std::thread::available_parallelism().map_or(1, usize::from);
+        let report = |done: usize, total: usize| observer.progress("photos", done as u64, total as u64, "");
+        let ingested = ingest(source, &store, &IngestOptions { downscale, threads }, &report)?;
+        Ok(Self {
+            capture: Arc::new(ingested.capture),
+            store,
+            id: Some(ingested.id),
+            test_every: options.test_every.unwrap_or(model.test_every()),
+            downscale,
+            _temporary: temporary,
+        })
+    }
+
+    /// A reader of the photos that keeps this many bytes of them decoded.
+    pub(crate) fn reader(&self, cache_bytes: usize) -> WindowReader {
+        WindowReader::new(self.capture.clone(), self.store.clone(), cache_bytes)
+    }
+
+    /// Indices of the views that are held out, or of those that are not.
+    pub(crate) fn views(&self, held_out: bool) -> Vec<u32> {
+        let views = 0..self.capture.views.len();
+        views.filter(|&i| Capture::is_test(i, self.test_every) == held_out).map(|i| i as u32).collect()
+    }
+}
+
+fn open_store(model: &Model, url: Option<&str>) -> Result<(Store, Option<TempDir>), EvalError> {
+    let own = model.trained.as_ref().map(|(_, out)| out.join("store")).filter(|store| store.is_dir());
+    match (url, own) {
+        (Some(url), _) => Ok((Store::open(url)?, None)),
+        (None, Some(own)) => Ok((Store::open(&own.display().to_string())?, None)),
+        (None, None) => {
+            let folder = tempfile::tempdir().map_err(EvalError::NoTemporaryFolder)?;
+            Ok((Store::open(&folder.path().display().to_string())?, Some(folder)))
+        }
+    }
+}

@@ -1,0 +1,148 @@
+//! Prunes a model by the photos of a capture, and measures it before and after.
+
+use dataset::windows::WindowReader;
+use glam::Vec3;
+use model::{Model, read_tree};
+use scene::{BadInput, Exposures, Splats, column};
+use train::importance::{EvaluationViews, Order, OwnershipWeights};
+use train::prune::{self, PruneProgress, Pruned, Pruning};
+use train::{Backend, Flow, Job, Recipe, TrainError, TrainView};
+
+use crate::{EvalError, Observer, Photos};
+
+/// Bytes of decoded photos that are kept.
+const CACHE_BYTES: usize = 256 << 20;
+/// Training steps assumed for a model whose training is unknown.
+const DEFAULT_STEPS: u32 = 3000;
+/// Parts that progress is reported in.
+const PROGRESS_PARTS: u64 = 1000;
+
+/// A model and the photos that it is pruned by: the views that are not held out.
+pub struct Pruner<'a> {
+    model: &'a Model,
+    reader: WindowReader,
+    held_in: Vec<TrainView>,
+    held_out: Vec<TrainView>,
+    /// Of the model, if these are the photos that it was trained on.
+    exposures: Option<&'a Exposures>,
+}
+
+impl<'a> Pruner<'a> {
+    /// Reads nothing yet but the plan of a trained model, whose exposures count only if it was trained on these photos.
+    ///
+    /// # Errors
+    /// A trained model whose plan cannot be read.
+    pub fn new(model: &'a Model, photos: &Photos, observer: &dyn Observer) -> Result<Self, EvalError> {
+        let has_own_photos = match (&model.exposures, &model.trained) {
+            (Some(_), Some((_, out))) => Some(read_tree(out)?.plan.capture) == photos.id,
+            _ => false,
+        };
+        if model.exposures.is_some() && !has_own_photos {
+            observer.note("the model was trained on other photos: its exposures are left out");
+        }
+        let views = |held_out: bool| {
+            let window = |i: u32| {
+                let camera = photos.capture.views[i as usize].camera;
+                TrainView { view: i, mip: 0, rect: camera.full(), camera }
+            };
+            photos.views(held_out).into_iter().map(window).collect()
+        };
+        let (held_in, held_out) = (views(false), views(true));
+        let exposures = model.exposures.as_ref().filter(|_| has_own_photos);
+        Ok(Self { model, reader: photos.reader(CACHE_BYTES), held_in, held_out, exposures })
+    }
+
+    /// Mean PSNR of these splats over the views that are not held out, dB.
+    ///
+    /// # Errors
+    /// Without such views, or with photos that cannot be read.
+    pub fn held_in_psnr(&self, splats: &Splats) -> Result<f64, EvalError> {
+        self.measured(&self.held_in).psnr(splats, &OwnershipWeights::default()).map_err(no_views)
+    }
+
+    /// Mean PSNR of these splats over the held-out views, as `plat eval` measures it, dB. `None` if there are none.
+    ///
+    /// # Errors
+    /// Photos that cannot be read.
+    pub fn held_out_psnr(&self, splats: &Splats) -> Result<Option<f64>, EvalError> {
+        if self.held_out.is_empty() {
+            return Ok(None);
+        }
+        self.measured(&self.held_out).psnr(splats, &OwnershipWeights::default()).map(Some).map_err(no_views)
+    }
+
+    /// Importance of each of the model's splats by this order.
+    ///
+    /// # Errors
+    /// As [`held_in_psnr`](Self::held_in_psnr).
+    pub fn importance(&self, order: Order) -> Result<Vec<f64>, EvalError> {
+        self.measured(&self.held_in).importance(order, &self.model.splats).map_err(no_views)
+    }
+
+    fn measured<'v>(&'v self, views: &'v [TrainView]) -> EvaluationViews<'v> {
+        let (antialiased, exposures) = (self.model.antialiased, self.exposures);
+        EvaluationViews { views, context: None, antialiased, exposures, source: &self.reader }
+    }
+
+    /// Prunes to a share of the splats, or without one within the tolerance.
+    ///
+    /// # Errors
+    /// As [`held_in_psnr`](Self::held_in_psnr).
+    pub fn prune(
+        &self,
+        pruning: &Pruning,
+        share: Option<f64>,
+        observer: &dyn Observer,
+    ) -> Result<(Splats, Pruned), EvalError> {
+        let model = self.model;
+        let settings = match &model.trained {
+            Some((_, out)) => Some(read_tree(out)?.plan.settings),
+            None => None,
+        };
+        let recipe = Recipe::refinement();
+        let all: &(dyn Fn(Vec3) -> bool + Sync) = &|_| true;
+        let job = Job {
+            initial: model.splats.clone(),
+            context: None,
+            views: &self.held_in,
+            counts: all,
+            keeps: all,
+            budget: model.splats.len(),
+            steps: settings.as_ref().map_or(DEFAULT_STEPS, |settings| settings.steps),
+            antialiased: model.antialiased,
+            seed: settings.as_ref().map_or(0, |settings| settings.seed),
+            size_bounds_metres: size_bounds(&model.splats),
+            exposures: self.exposures,
+            trains_exposures: false,
+            recipe: &recipe,
+            source: &self.reader,
+            backend: &Backend::Cpu,
+        };
+        let mut report = |now: PruneProgress| {
+            let done = PROGRESS_PARTS * u64::from(now.step) / u64::from(now.steps);
+            observer.progress("pruning", done, PROGRESS_PARTS, &format!("{} splats", now.recovery.count()));
+            Flow::Continue
+        };
+        let pruned = match share {
+            Some(share) => prune::to_share(job, pruning, share, &mut report),
+            None => prune::within_tolerance(job, pruning, &mut report),
+        };
+        pruned.map_err(no_views)
+    }
+}
+
+/// Smallest and largest standard deviation of the splats, metres.
+fn size_bounds(splats: &Splats) -> [f32; 2] {
+    let sizes = (0..3).flat_map(|axis| splats.col(column::LOG_SCALE + axis)).filter(|size| size.is_finite());
+    let (low, high) = sizes.fold((f32::MAX, f32::MIN), |(low, high), &size| (low.min(size), high.max(size)));
+    if low <= high { [low.exp(), high.exp()] } else { [1e-6, 1e6] }
+}
+
+fn no_views(error: TrainError) -> EvalError {
+    match error {
+        TrainError::NoViews => {
+            BadInput::new("--capture", "has no view that is not held out", "hold out fewer with --test-every").into()
+        }
+        other => other.into(),
+    }
+}

@@ -1,0 +1,132 @@
+//! Renders views on the CPU or on a GPU behind one interface.
+
+use render::{Frame, Options, cpu};
+use scene::{Camera, Splats};
+use train::Backend;
+
+use crate::EvalError;
+
+/// A renderer of one backend. Keeps its buffers between views.
+pub struct Renderer(Inner);
+
+enum Inner {
+    Cpu(Box<cpu::Renderer>),
+    #[cfg(feature = "gpu")]
+    Gpu(Box<gpu::Renderer>),
+}
+
+/// Splats where their renderer reads them: in place on the CPU, a copy in device memory on a GPU.
+pub struct Uploaded<'a>(Place<'a>);
+
+enum Place<'a> {
+    Cpu(&'a Splats),
+    #[cfg(feature = "gpu")]
+    Gpu(render::gpu::GpuSplats),
+}
+
+impl Renderer {
+    /// A renderer of this backend.
+    ///
+    /// # Errors
+    /// A GPU on which the kernels cannot be created.
+    pub fn new(backend: &Backend) -> Result<Self, EvalError> {
+        Ok(Self(match backend {
+            Backend::Cpu => Inner::Cpu(Box::default()),
+            #[cfg(feature = "gpu")]
+            Backend::Gpu(gpu) => Inner::Gpu(Box::new(gpu::Renderer::new(gpu)?)),
+        }))
+    }
+
+    /// The backend's name with its instruction set or adapter, as in a plan.
+    pub fn name(&self) -> String {
+        match &self.0 {
+            Inner::Cpu(renderer) => renderer.name(),
+            #[cfg(feature = "gpu")]
+            Inner::Gpu(gpu) => gpu.name(),
+        }
+    }
+
+    /// Prepares splats for any number of views.
+    ///
+    /// # Errors
+    /// Splats that do not fit the device's memory.
+    pub fn upload<'a>(&self, splats: &'a Splats) -> Result<Uploaded<'a>, EvalError> {
+        Ok(Uploaded(match &self.0 {
+            Inner::Cpu(_) => Place::Cpu(splats),
+            #[cfg(feature = "gpu")]
+            Inner::Gpu(gpu) => Place::Gpu(gpu.upload(splats)?),
+        }))
+    }
+
+    /// Renders a view. Both backends give all planes of [`Frame`].
+    ///
+    /// # Errors
+    /// A device that fails or has too little memory.
+    ///
+    /// # Panics
+    /// If the splats were uploaded to a renderer of another backend.
+    pub fn render(&mut self, splats: &Uploaded, camera: &Camera, options: &Options) -> Result<&Frame, EvalError> {
+        match (&mut self.0, &splats.0) {
+            (Inner::Cpu(renderer), Place::Cpu(splats)) => Ok(renderer.forward(splats, None, camera, options)),
+            #[cfg(feature = "gpu")]
+            (Inner::Gpu(gpu), Place::Gpu(splats)) => gpu.render(splats, camera, options),
+            #[cfg(feature = "gpu")]
+            _ => panic!("splats were uploaded to another backend"),
+        }
+    }
+
+    /// Renders one view of splats that are not kept on the device.
+    ///
+    /// # Errors
+    /// As [`upload`](Self::upload) and [`render`](Self::render).
+    pub fn render_once(&mut self, splats: &Splats, camera: &Camera, options: &Options) -> Result<&Frame, EvalError> {
+        let uploaded = self.upload(splats)?;
+        self.render(&uploaded, camera, options)
+    }
+}
+
+#[cfg(feature = "gpu")]
+mod gpu {
+    use std::sync::Arc;
+
+    use render::gpu::{Gpu, GpuError, GpuRenderer, GpuSplats};
+    use render::{Frame, Options};
+    use scene::{Camera, Splats};
+
+    use crate::EvalError;
+
+    pub(super) struct Renderer {
+        gpu: Arc<Gpu>,
+        renderer: GpuRenderer,
+        frame: Frame,
+    }
+
+    impl Renderer {
+        pub(super) fn new(gpu: &Arc<Gpu>) -> Result<Self, EvalError> {
+            let renderer = GpuRenderer::new(gpu.clone()).map_err(failed)?;
+            Ok(Self { gpu: gpu.clone(), renderer, frame: Frame::default() })
+        }
+
+        pub(super) fn name(&self) -> String {
+            self.renderer.name()
+        }
+
+        pub(super) fn upload(&self, splats: &Splats) -> Result<GpuSplats, EvalError> {
+            GpuSplats::upload(&self.gpu, splats, 0).map_err(failed)
+        }
+
+        pub(super) fn render(
+            &mut self,
+            splats: &GpuSplats,
+            camera: &Camera,
+            options: &Options,
+        ) -> Result<&Frame, EvalError> {
+            self.frame = self.renderer.draw(splats, None, camera, options).map_err(failed)?;
+            Ok(&self.frame)
+        }
+    }
+
+    fn failed(error: GpuError) -> EvalError {
+        EvalError::Renderer(error.to_string())
+    }
+}

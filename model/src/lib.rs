@@ -1,0 +1,93 @@
+//! Reads and writes models: the folder that `plat train` writes, a `.ply` (INRIA's or PlayCanvas' compressed), a `.spz`.
+//!
+//! ```text
+//! OUT/model/model.json          the manifest; written last, so a folder without it holds no model
+//! OUT/model/plan.plat           the plan as a frame: ground, tree, tasks
+//! OUT/model/exposures.plat      exposures of the training views, where they were trained
+//! OUT/model/blocks/L-x-y.plat   splats of one block with its halo, as a frame
+//! OUT/merged.ply                the finest cut, merged
+//! ```
+//!
+//! Architecture invariant: no terminal and no exit codes. Errors are [`BadInput`](scene::BadInput) where a file cannot be read
+//! as a model, and [`ModelError`] where writing fails.
+
+mod error;
+mod files;
+mod manifest;
+mod read;
+mod rewrite;
+mod write;
+
+use std::path::{Path, PathBuf};
+
+use scene::{BadInput, Exposures, Splats, ply, spz};
+
+pub use error::ModelError;
+pub use files::save_json;
+pub use manifest::{BlockEntry, Manifest};
+pub use read::{Tree, read, read_tree};
+pub use rewrite::{check_out, rewrite};
+pub use write::{Written, write};
+
+/// Comment in a model's PLY that says: draw it with opacity compensation.
+const ANTIALIASED: &str = "antialiased";
+/// `--test-every` of a model whose training is unknown.
+const DEFAULT_TEST_EVERY: u32 = 8;
+
+/// A model in memory.
+#[derive(Debug)]
+pub struct Model {
+    /// The finest cut.
+    pub splats: Splats,
+    /// Whether opacity is compensated for the screen-space dilation (Mip-Splatting's 2D filter).
+    pub antialiased: bool,
+    /// Exposures of the training views, by view of the plan's capture. Views are rendered without them.
+    pub exposures: Option<Exposures>,
+    /// Of a trained model: its manifest and the folder that `plat train` wrote.
+    pub trained: Option<(Manifest, PathBuf)>,
+}
+
+impl Model {
+    /// The options to render it with.
+    pub fn options(&self) -> render::Options {
+        render::Options { antialiased: self.antialiased, sh_degree: self.splats.sh_degree(), ..Default::default() }
+    }
+
+    /// The bytes of an INRIA PLY.
+    pub fn to_ply(&self) -> Vec<u8> {
+        ply::write(&self.splats, ply_comments(self.antialiased))
+    }
+
+    /// The bytes of an SPZ of version 3.
+    ///
+    /// # Errors
+    /// Splats that the format cannot hold.
+    pub fn to_spz(&self) -> Result<Vec<u8>, BadInput> {
+        spz::write(&self.splats, self.antialiased, spz::Version::V3).map_err(|error| {
+            BadInput::new("the model", format!("cannot be written as SPZ: {error}"), "use PLY or repair the model")
+        })
+    }
+
+    /// Every how many views one was held out of training; 0 = none. 8 where the training is unknown.
+    pub fn test_every(&self) -> u32 {
+        self.trained.as_ref().map_or(DEFAULT_TEST_EVERY, |(manifest, _)| manifest.test_every)
+    }
+
+    /// The divisor of the photos' size in training. 1 where the training is unknown.
+    pub fn downscale(&self) -> u32 {
+        self.trained.as_ref().map_or(1, |(manifest, _)| manifest.downscale)
+    }
+
+    /// Where reports on the model at `path` go: the folder `name` in the folder of a trained model, else `STEM-name` beside
+    /// the file.
+    pub fn report_folder(&self, path: &Path, name: &str) -> PathBuf {
+        match &self.trained {
+            Some((_, out)) => out.join(name),
+            None => path.with_file_name(format!("{}-{name}", path.file_stem().unwrap_or_default().to_string_lossy())),
+        }
+    }
+}
+
+fn ply_comments(antialiased: bool) -> &'static [&'static str] {
+    if antialiased { &[ANTIALIASED] } else { &[] }
+}

@@ -1,0 +1,114 @@
+//! Reads a model as one set of splats, or block by block.
+
+use std::collections::BTreeMap;
+use std::convert::Infallible;
+use std::path::{Path, PathBuf};
+
+use blocks::{Cut, Plan};
+use scene::{BadInput, BlockId, CodecError, Exposures, Splats, frame, ply, spz};
+
+use crate::files::{EXPOSURES_FILE, MANIFEST_FILE, PLAN_FILE, block_file, damaged, load};
+use crate::manifest::{Manifest, VERSION};
+use crate::{ANTIALIASED, Model};
+
+/// Reads a model: a folder that `plat train` wrote, its `model` folder, a `.ply` or a `.spz`.
+///
+/// # Errors
+/// A path that does not exist, cannot be read, or holds no model.
+pub fn read(path: &Path) -> Result<Model, BadInput> {
+    let advice = "give a folder that plat train wrote, a .ply or a .spz";
+    if path.is_dir() {
+        let Some(folder) = trained_folder(path) else {
+            return Err(BadInput::new(path.display().to_string(), "holds no model/model.json", advice));
+        };
+        return read_trained(&folder);
+    }
+    let is = |extension: &str| path.extension().is_some_and(|e| e.eq_ignore_ascii_case(extension));
+    if !path.exists() || !(is("ply") || is("spz")) {
+        let problem = if path.exists() { "is neither a folder nor a .ply or .spz" } else { "does not exist" };
+        return Err(BadInput::new(path.display().to_string(), problem, advice));
+    }
+    let bytes = load(path)?;
+    if is("spz") {
+        let (splats, antialiased) = spz::read(&bytes).map_err(|error| damaged(path, &error))?;
+        return Ok(Model { splats, antialiased, exposures: None, trained: None });
+    }
+    let splats = ply::read(&bytes).map_err(|error| damaged(path, &error))?;
+    let antialiased = ply::comments(&bytes).iter().any(|comment| comment.trim() == ANTIALIASED);
+    Ok(Model { splats, antialiased, exposures: None, trained: None })
+}
+
+fn read_trained(folder: &Path) -> Result<Model, BadInput> {
+    let (manifest, plan) = read_plan(folder)?;
+    let parts = plan.tasks.iter().map(|task| Ok((task.block, read_block(folder, task.block)?)));
+    let splats = blocks::merge_cut(&plan.leaves(), &plan.ground, parts)?;
+    let out = folder.parent().filter(|_| folder.ends_with("model")).unwrap_or(folder);
+    let exposures = match manifest.exposures {
+        Some(_) => {
+            let path = folder.join(EXPOSURES_FILE);
+            Some(Exposures::from_frame(&load(&path)?).map_err(|error| damaged(&path, &error))?)
+        }
+        None => None,
+    };
+    let antialiased = manifest.antialiased;
+    Ok(Model { splats, antialiased, exposures, trained: Some((manifest, out.to_path_buf())) })
+}
+
+/// A trained model block by block.
+#[derive(Debug)]
+pub struct Tree {
+    /// The plan that it was trained by.
+    pub plan: Plan,
+    /// Splats of every task's block, halo included.
+    pub results: BTreeMap<BlockId, Splats>,
+    /// Whether opacity is compensated for the screen-space dilation.
+    pub antialiased: bool,
+}
+
+impl Tree {
+    /// The splats of a cut, merged.
+    pub fn merged(&self, cut: &Cut) -> Splats {
+        let parts = self.results.iter().map(|(&block, splats)| Ok((block, splats)));
+        blocks::merge_cut(cut, &self.plan.ground, parts).unwrap_or_else(|never: Infallible| match never {})
+    }
+}
+
+/// Reads the blocks of a folder that `plat train` wrote, or of its `model` folder.
+///
+/// # Errors
+/// A path that cannot be read or holds no model of blocks.
+pub fn read_tree(path: &Path) -> Result<Tree, BadInput> {
+    let Some(folder) = trained_folder(path) else {
+        let problem = "holds no model/model.json, and the blocks of a model are needed";
+        return Err(BadInput::new(path.display().to_string(), problem, "give a folder that plat train wrote"));
+    };
+    let (manifest, plan) = read_plan(&folder)?;
+    let results = (plan.tasks.iter().map(|task| task.block))
+        .map(|block| Ok((block, read_block(&folder, block)?)))
+        .collect::<Result<_, BadInput>>()?;
+    Ok(Tree { plan, results, antialiased: manifest.antialiased })
+}
+
+/// The folder with `model.json`.
+fn trained_folder(path: &Path) -> Option<PathBuf> {
+    [path.join("model"), path.to_path_buf()].into_iter().find(|folder| folder.join(MANIFEST_FILE).is_file())
+}
+
+fn read_plan(folder: &Path) -> Result<(Manifest, Plan), BadInput> {
+    let path = folder.join(MANIFEST_FILE);
+    let manifest: Manifest =
+        serde_json::from_slice(&load(&path)?).map_err(|error| damaged(&path, &CodecError::new(error.to_string())))?;
+    if manifest.version != VERSION {
+        let problem = format!("is of version {}, this program reads {VERSION}", manifest.version);
+        return Err(BadInput::new(path.display().to_string(), problem, "train the model again"));
+    }
+    let path = folder.join(PLAN_FILE);
+    let plan = Plan::from_frame(&load(&path)?).map_err(|error| damaged(&path, &error))?;
+    Ok((manifest, plan))
+}
+
+/// The splats of one block of a model folder.
+pub(crate) fn read_block(folder: &Path, block: BlockId) -> Result<Splats, BadInput> {
+    let path = folder.join("blocks").join(block_file(block));
+    frame::decode_splats(&load(&path)?).map_err(|error| damaged(&path, &error))
+}

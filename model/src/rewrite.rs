@@ -1,0 +1,87 @@
+//! Writes a model that was read before with other splats, in the same format.
+
+use std::fs;
+use std::path::Path;
+
+use scene::{ArtefactId, BadInput, Splats, frame};
+use store::file::save;
+
+use crate::error::{ModelError, cannot};
+use crate::files::{EXPOSURES_FILE, MANIFEST_FILE, MERGED_FILE, block_file, save_json};
+use crate::read::{Tree, read_tree};
+use crate::write::begin;
+use crate::{BlockEntry, Manifest, Model};
+
+/// Checks where a rewritten model shall go.
+///
+/// # Errors
+/// A path that would overwrite the model itself, or that is of another format.
+pub fn check_out(path: &Path, out: &Path) -> Result<(), BadInput> {
+    let bad = |problem: &str, advice: String| Err(BadInput::new(out.display().to_string(), problem, advice));
+    // A folder and its `model` folder are the same model.
+    let model_path = |path: &Path| {
+        let path = path.canonicalize().ok()?;
+        let is_inner = path.ends_with("model") && path.join(MANIFEST_FILE).is_file();
+        if is_inner { path.parent().map(Path::to_path_buf) } else { Some(path) }
+    };
+    if model_path(path).is_some_and(|path| model_path(out) == Some(path)) {
+        return bad("is the model itself", "give another --out".into());
+    }
+    let extension = |path: &Path| path.extension().map(|extension| extension.to_ascii_lowercase());
+    if path.is_dir() {
+        return if out.is_file() { bad("is a file", "give a folder, as the model is one".into()) } else { Ok(()) };
+    }
+    if out.is_dir() || extension(path) != extension(out) {
+        let extension = extension(path).unwrap_or_default();
+        return bad("has another format than the model", format!("give a .{}", extension.to_string_lossy()));
+    }
+    Ok(())
+}
+
+/// Writes the model that was read from `path` with other splats as its finest cut, in the same format: a file, or a folder, where
+/// each block keeps the splats that it does not own in the finest cut. Returns the bytes of the file or of `merged.ply`.
+///
+/// # Errors
+/// A model that cannot be read again, or a file that cannot be written.
+pub fn rewrite(path: &Path, out: &Path, model: Model, splats: Splats) -> Result<u64, ModelError> {
+    let Some((manifest, _)) = &model.trained else {
+        let model = Model { splats, ..model };
+        let is_spz = path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("spz"));
+        let bytes = if is_spz { model.to_spz()? } else { model.to_ply() };
+        if let Some(folder) = out.parent().filter(|folder| !folder.as_os_str().is_empty()) {
+            fs::create_dir_all(folder).map_err(cannot("made", folder))?;
+        }
+        save(out, &bytes)?;
+        return Ok(bytes.len() as u64);
+    };
+    let Tree { plan, mut results, antialiased } = read_tree(path)?;
+    let leaves = plan.leaves();
+    for (&block, result) in &mut results {
+        let mut now = leaves.keep(&splats, &plan.ground, block).with_sh_degree(result.sh_degree());
+        now.append(&result.filter(|i| leaves.owner_of(&plan.ground, result.mean(i).as_dvec3()) != Some(block)));
+        *result = now;
+    }
+    let folder = begin(out, &plan)?;
+    let mut blocks = Vec::new();
+    for (&block, result) in &results {
+        let bytes = frame::encode_splats(result);
+        save(&folder.join("blocks").join(block_file(block)), &bytes)?;
+        blocks.push(BlockEntry { block, artefact: ArtefactId::of(&bytes), splats: result.len() as u64 });
+    }
+    // The order in which `plat train` lists them.
+    blocks.sort_by_key(|b| (b.block.level, b.block.y, b.block.x));
+    let splats = Tree { plan, results, antialiased }.merged(&leaves);
+    let manifest = Manifest { splats: splats.len() as u64, blocks, ..manifest.clone() };
+    finish(out, &folder, &manifest, &Model { splats, trained: None, ..model })
+}
+
+/// Writes `merged.ply`, the exposures and at last the manifest; returns the bytes of `merged.ply`.
+fn finish(out: &Path, folder: &Path, manifest: &Manifest, model: &Model) -> Result<u64, ModelError> {
+    let merged = model.to_ply();
+    save(&out.join(MERGED_FILE), &merged)?;
+    if let Some(exposures) = &model.exposures {
+        save(&folder.join(EXPOSURES_FILE), &exposures.to_frame())?;
+    }
+    save_json(&folder.join(MANIFEST_FILE), manifest)?;
+    Ok(merged.len() as u64)
+}

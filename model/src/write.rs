@@ -1,0 +1,104 @@
+//! Writes the model folder of a finished plan.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use blocks::Plan;
+use scene::{ArtefactId, BlockId, GeoOrigin, Splats, frame, ply};
+use store::BlockingStore;
+use store::file::{AtomicFile, save};
+
+use crate::error::{ModelError, cannot};
+use crate::files::{EXPOSURES_FILE, MANIFEST_FILE, MERGED_FILE, PLAN_FILE, block_file, save_json};
+use crate::manifest::{BlockEntry, Manifest, VERSION};
+use crate::ply_comments;
+use crate::read::read_block;
+
+/// Creates the model folder under `out` and writes the plan. First removes an older model's manifest, merged file and report,
+/// so that an interrupted write never passes for a model.
+pub(crate) fn begin(out: &Path, plan: &Plan) -> Result<PathBuf, ModelError> {
+    let folder = out.join("model");
+    if folder.join(MANIFEST_FILE).exists() {
+        fs::remove_dir_all(&folder).map_err(cannot("replaced", &folder))?;
+    }
+    for file in [MERGED_FILE, "report.json"].map(|name| out.join(name)) {
+        if file.exists() {
+            fs::remove_file(&file).map_err(cannot("replaced", &file))?;
+        }
+    }
+    let blocks = folder.join("blocks");
+    fs::create_dir_all(&blocks).map_err(cannot("made", &blocks))?;
+    save(&folder.join(PLAN_FILE), &plan.to_frame())?;
+    Ok(folder)
+}
+
+/// Sizes of a written model.
+pub struct Written {
+    /// Splats of the finest cut.
+    pub splats: u64,
+    /// Bytes of `merged.ply`.
+    pub bytes: u64,
+}
+
+/// Writes the results of all tasks of a plan, in the plan's order, under `out`. Holds one block in memory at a time, as a model
+/// may be larger than memory.
+///
+/// # Errors
+/// A task without a result, a store that fails, a damaged result, a file that cannot be written.
+pub fn write(
+    out: &Path,
+    plan: &Plan,
+    results: &[ArtefactId],
+    store: &BlockingStore,
+    geo_origin: Option<GeoOrigin>,
+    downscale: u32,
+) -> Result<Written, ModelError> {
+    let folder = begin(out, plan)?;
+    let (leaves, sh_degree) = (plan.leaves(), plan.settings.sh_degree);
+    let owned = |splats: &Splats, block| leaves.keep(splats, &plan.ground, block).with_sh_degree(sh_degree);
+
+    let (mut blocks, mut exposures, mut count) = (Vec::new(), None, 0);
+    for (index, task) in plan.tasks.iter().enumerate() {
+        let block = task.block;
+        let artefact = *results.get(index).ok_or(ModelError::NoResult(block))?;
+        let bytes = store.get(artefact)?;
+        let decoded = frame::decode_result(&bytes);
+        let (splats, about) = decoded.map_err(|error| ModelError::DamagedResult(block, error))?;
+        exposures = exposures.or(about.exposures);
+        save(&folder.join("blocks").join(block_file(block)), &bytes)?;
+        blocks.push(BlockEntry { block, artefact, splats: splats.len() as u64 });
+        count += owned(&splats, block).len();
+    }
+
+    let mut order: Vec<BlockId> = blocks.iter().map(|entry| entry.block).collect();
+    order.sort_unstable();
+    let mut merged = AtomicFile::create(&out.join(MERGED_FILE))?;
+    let header = ply::header(count, sh_degree, ply_comments(plan.settings.antialiased));
+    merged.write(&header)?;
+    let mut bytes = header.len() as u64;
+    for block in order {
+        let rows = ply::rows(&owned(&read_block(&folder, block)?, block));
+        merged.write(&rows)?;
+        bytes += rows.len() as u64;
+    }
+    merged.commit()?;
+
+    if let Some(id) = exposures {
+        save(&folder.join(EXPOSURES_FILE), &store.get(id)?)?;
+    }
+    let manifest = Manifest {
+        version: VERSION,
+        plan: plan.id(),
+        antialiased: plan.settings.antialiased,
+        sh_degree,
+        geo_origin,
+        ground: plan.ground,
+        test_every: plan.settings.test_every,
+        downscale,
+        exposures,
+        splats: count as u64,
+        blocks,
+    };
+    save_json(&folder.join(MANIFEST_FILE), &manifest)?;
+    Ok(Written { splats: count as u64, bytes })
+}
