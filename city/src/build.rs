@@ -1,6 +1,6 @@
-//! Building meshes: a few primitives, painted as they are laid, in whatever frame is set.
+//! Mesh builder: primitives with a current material, class and frame.
 //!
-//! Every face has its own corners (houses have hard edges), with uv in metres along its first edge and across it.
+//! Every face has its own corners, for hard edges, and uv in metres along and across its first edge.
 
 pub(crate) mod furniture;
 pub(crate) mod ground;
@@ -14,7 +14,7 @@ use glam::{Affine3A, Vec2, Vec3};
 use crate::materials::{self, Surface};
 use crate::types::{Asset, Class, Mesh};
 
-/// A mesh in the making.
+/// A mesh under construction.
 #[derive(Debug, Clone)]
 pub(crate) struct Builder {
     mesh: Mesh,
@@ -32,19 +32,19 @@ impl Builder {
         Asset { name: name.into(), mesh: self.mesh }
     }
 
-    /// What the next faces are made of.
+    /// Sets the material of the next faces.
     pub(crate) fn paint(&mut self, material: Surface) -> &mut Self {
         self.material = material;
         self
     }
 
-    /// What the next faces are part of.
+    /// Sets the class of the next faces.
     pub(crate) fn class(&mut self, class: Class) -> &mut Self {
         self.class = class;
         self
     }
 
-    /// Lays what `build` lays in a frame of its own.
+    /// Runs `build` in a nested frame.
     pub(crate) fn within(&mut self, frame: Affine3A, build: impl FnOnce(&mut Self)) {
         let before = self.frame;
         self.frame = before * frame;
@@ -52,7 +52,7 @@ impl Builder {
         self.frame = before;
     }
 
-    /// A corner, for faces that share theirs.
+    /// Adds a corner, for faces with shared corners.
     pub(crate) fn corner(&mut self, at: Vec3, uv: Vec2) -> u32 {
         let index = self.mesh.positions.len() as u32;
         self.mesh.positions.push(self.frame.transform_point3(at));
@@ -60,7 +60,7 @@ impl Builder {
         index
     }
 
-    /// A triangle of known corners; one without an area is left out.
+    /// Adds a triangle of existing corners unless it is degenerate.
     pub(crate) fn face(&mut self, corners: [u32; 3]) {
         let [a, b, c] = corners.map(|i| self.mesh.positions[i as usize]);
         if (b - a).cross(c - a).length_squared() < 1e-12 {
@@ -89,7 +89,7 @@ impl Builder {
         self.two_faces(corners);
     }
 
-    /// An upright rectangle that faces -y, with x and z as its uv, so that courses of bricks go on across neighbours.
+    /// An upright rectangle that faces -y, with x and z as uv, so that brick courses continue across adjacent panels.
     pub(crate) fn panel(&mut self, [x0, x1]: [f32; 2], [z0, z1]: [f32; 2], y: f32) {
         if x1 - x0 < 1e-3 || z1 - z0 < 1e-3 {
             return;
@@ -99,7 +99,7 @@ impl Builder {
         self.two_faces(corners);
     }
 
-    /// A plank: a face with a thickness behind it, closed on all sides.
+    /// A closed slab: a face with a thickness behind it.
     pub(crate) fn plank(&mut self, top: [Vec3; 4], thickness: f32) {
         let down = -(top[1] - top[0]).cross(top[3] - top[0]).normalize_or(Vec3::Z) * thickness;
         self.quad(top);
@@ -111,7 +111,7 @@ impl Builder {
         }
     }
 
-    /// A four-sided face whose uv run from 0 to 1: for texts.
+    /// A four-sided face with uv from 0 to 1, for texts.
     pub(crate) fn plate(&mut self, corners: [Vec3; 4]) {
         let uvs = [Vec2::ZERO, Vec2::X, Vec2::ONE, Vec2::Y];
         let corners: [u32; 4] = std::array::from_fn(|k| self.corner(corners[k], uvs[k]));
@@ -123,7 +123,7 @@ impl Builder {
         self.face([a, c, d]);
     }
 
-    /// An upright box, without its underside.
+    /// An upright box without its bottom face.
     pub(crate) fn block(&mut self, min: Vec3, max: Vec3) {
         self.tapered([min.truncate(), max.truncate()], min.z, [min.truncate(), max.truncate()], max.z);
     }
@@ -148,7 +148,7 @@ impl Builder {
         self.quad(high);
     }
 
-    /// A cone's stump from one point to another with `sides` sides and both caps.
+    /// A truncated cone between two points with `sides` sides and both caps.
     pub(crate) fn tube(&mut self, from: Vec3, to: Vec3, radius: [f32; 2], sides: usize) {
         let axis = (to - from).normalize_or(Vec3::Z);
         let right = axis.any_orthonormal_vector();
@@ -196,7 +196,7 @@ impl Builder {
         }
     }
 
-    /// A profile in the x-z plane, counter-clockwise seen from -y, drawn out from y = -w to y = w: sides, not caps.
+    /// Extrudes a profile in the x-z plane, counter-clockwise seen from -y, from y = -w to y = w, without caps.
     pub(crate) fn extrude(&mut self, profile: &[Vec2], half_width: &dyn Fn(Vec2) -> f32) {
         for k in 0..profile.len() {
             let (p, q) = (profile[k], profile[(k + 1) % profile.len()]);
@@ -206,7 +206,7 @@ impl Builder {
         }
     }
 
-    /// Both caps of such a profile, which must be star-shaped around its `centre`.
+    /// Both caps of an extruded profile that is star-shaped around `centre`.
     pub(crate) fn caps(&mut self, profile: &[Vec2], centre: Vec2, half_width: &dyn Fn(Vec2) -> f32) {
         for k in 0..profile.len() {
             let (p, q) = (profile[k], profile[(k + 1) % profile.len()]);
@@ -216,12 +216,12 @@ impl Builder {
         }
     }
 
-    /// The lowest point, to stand things on the ground.
+    /// The lowest z.
     pub(crate) fn lowest(&self) -> f32 {
         self.mesh.positions.iter().fold(f32::INFINITY, |low, p| low.min(p.z))
     }
 
-    /// Moves all there is.
+    /// Translates the whole mesh.
     pub(crate) fn shift(&mut self, by: Vec3) {
         for p in &mut self.mesh.positions {
             *p += by;

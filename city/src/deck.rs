@@ -18,16 +18,16 @@ const HIGH: f64 = 6.2;
 const THICK: f64 = 0.9;
 /// From the middle to the inner and to the outer lane.
 pub(crate) const LANES: [f64; 2] = [1.6, 4.6];
-/// The ramps' feet are this far from where the boulevard ends.
+/// Distance of a ramp's foot from the end of the boulevard.
 const FOOT: f64 = 15.0;
-/// Ramps are closed by walls to the ground up to this height.
+/// Ramps have side walls down to the ground up to this height.
 const CLOSED: f64 = 2.6;
 
-/// Where the deck runs and how high.
+/// Course and height of the deck.
 pub(crate) struct Deck<'a> {
     line: Polyline,
     terrain: &'a Terrain,
-    /// Stretches of the line that lie over crossings.
+    /// Intervals of arc length over crossings.
     crossings: Vec<[f64; 2]>,
     ramp: f64,
 }
@@ -66,23 +66,23 @@ impl<'a> Deck<'a> {
         HIGH.min(0.075 * self.ramp) * t * t * (3.0 - 2.0 * t)
     }
 
-    /// A place on the deck's surface (left of the line positive).
+    /// A point on the deck's surface, `side` to the left of the line.
     pub(crate) fn at(&self, s: f64, side: f64) -> DVec3 {
         let (p, along) = self.line.at(s);
         let q = p + side * along.perp();
         let (here, middle) = (self.terrain.height(q), self.terrain.height(p));
-        // level across where it is high, like the road where it comes down
+        // horizontal across at full height, following the road at the feet of the ramps
         let level = (self.lift(s) / 2.0).min(1.0);
         q.extend(here + (middle - here) * level + self.lift(s))
     }
 
-    /// First and last distance with a deck.
+    /// Arc lengths of the first and last point of the deck.
     fn ends(&self) -> [f64; 2] {
         let start = (0..).map(|k| FOOT + 0.25 * f64::from(k)).find(|&s| self.lift(s) > 0.03).unwrap_or(FOOT);
         [start, self.line.length - start]
     }
 
-    /// A lane, eastwards on the right side, westwards on the left: from ramp to ramp, short of where vehicles turn.
+    /// A lane from ramp to ramp, before the turning loops: eastwards on the right side, westwards on the left.
     pub(crate) fn lane(&self, offset: f64, east: bool) -> Vec<DVec3> {
         let [from, to] = [FOOT - 2.0, self.line.length - FOOT + 2.0];
         let count = ((to - from) / 4.0) as usize;
@@ -91,7 +91,7 @@ impl<'a> Deck<'a> {
         if east { lane.collect() } else { lane.rev().collect() }
     }
 
-    /// The way around: out on the outer lane, a turn at the ramp's foot, and back.
+    /// The closed route of vehicles: the outer lanes, joined by turns at the feet of the ramps.
     pub(crate) fn route(&self) -> Vec<DVec3> {
         let [from, to] = [FOOT - 5.0, self.line.length - FOOT + 5.0];
         let radius = LANES[1];
@@ -128,7 +128,7 @@ impl<'a> Deck<'a> {
         let [low, high] = [stations[0], stations[stations.len() - 1]];
         self.piers(&mut layer, low, high);
         let end = |s: f64| self.lift(s) < CLOSED;
-        // where a ramp's walls end there is an abutment
+        // abutments where the side walls of a ramp end
         for pair in stations.windows(2) {
             if end(pair[0]) != end(pair[1]) {
                 self.abutment(&mut layer, pair[usize::from(end(pair[0]))], end(pair[0]));
@@ -190,7 +190,7 @@ impl<'a> Deck<'a> {
         }
     }
 
-    /// A concrete foot, posts and a steel beam.
+    /// A concrete base, posts and a steel beam.
     fn guardrail(&self, layer: &mut GroundBuilder, stations: &[f64], side: f64) {
         layer.builder.class(Class::GuardRail);
         let (inner, outer) = (side * HALF, side * (HALF + BARRIER));
@@ -226,7 +226,7 @@ impl<'a> Deck<'a> {
         quads.into_iter().for_each(|q| layer.builder.quad(q));
     }
 
-    /// Pillars with heads, clear of crossings.
+    /// Pillars with crossheads, clear of crossings.
     fn piers(&self, layer: &mut GroundBuilder, low: f64, high: f64) {
         const EVERY: f64 = 22.0;
         let first = (low / EVERY).ceil() as usize;
@@ -247,7 +247,7 @@ impl<'a> Deck<'a> {
         }
     }
 
-    /// The wall across where a ramp becomes a bridge; `east` is where it looks.
+    /// The wall across the road where a ramp becomes a bridge; it faces east or west.
     fn abutment(&self, layer: &mut GroundBuilder, s: f64, east: bool) {
         let edge = HALF + BARRIER;
         let p = |side: f64, top: bool| {
@@ -260,7 +260,7 @@ impl<'a> Deck<'a> {
         layer.builder.class(Class::Wall).paint(m::CONCRETE).quad(quad);
     }
 
-    /// Lamps' places: on the outer edges, every 30 m, with the direction of the lane beside them.
+    /// Positions of lamps on the outer edges every 30 m, with the direction of the adjacent lane.
     pub(crate) fn lamps(&self) -> Vec<(DVec3, DVec2)> {
         let count = (self.line.length / 30.0) as usize;
         let lamp = |k: usize| {
@@ -268,7 +268,7 @@ impl<'a> Deck<'a> {
             let s = 30.0 * (k as f64 + 0.5);
             (self.lift(s) > 1.0).then(|| {
                 let at = self.at(s, side * (HALF + 0.5 * BARRIER)) + DVec3::Z * 0.45;
-                // the road is at -y of a lamp
+                // a lamp's arm points to -y, over the road
                 (at, self.line.at(s).1 * side)
             })
         };

@@ -1,4 +1,4 @@
-//! From settings to a city: plan the roads, build all pieces in parallel, put them together in order.
+//! Generates a city from settings: plans the roads, builds all parts in parallel and assembles them in a fixed order.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -22,10 +22,10 @@ use crate::traffic::{self, Mover};
 use crate::types::{Actor, City, Class, Trajectory};
 
 impl City {
-    /// Generates a city. Streets, trees and all follow from the settings alone.
+    /// Generates a city. The result depends on the settings alone.
     ///
     /// # Errors
-    /// A setting is out of its range.
+    /// A setting is out of range.
     pub fn generate(settings: &CitySettings) -> Result<Self, BadInput> {
         settings.check()?;
         let extent = settings.extent_metres();
@@ -82,7 +82,7 @@ impl City {
         self.actors.push(Actor { asset, class, instance: 0, world_from_asset, trajectory: None });
     }
 
-    /// Builds each shared asset that is used, once, and puts it wherever it stands or moves.
+    /// Builds each shared asset in use once, and adds an actor for each of its placements.
     fn populate(&mut self, placements: &[Placement], movers: Vec<Mover>, seed: &Random) {
         let used: BTreeSet<Prop> =
             placements.iter().map(|p| p.prop).chain(movers.iter().flat_map(|m| gait_phases(m.prop))).collect();
@@ -111,7 +111,7 @@ impl City {
     }
 }
 
-/// All shapes that a thing takes as it moves.
+/// The assets of a moving prop: all phases of a pedestrian's gait, or the prop itself.
 fn gait_phases(prop: Prop) -> impl Iterator<Item = Prop> {
     let count = if matches!(prop, Prop::Walker { .. }) { person::PHASES as u8 } else { 1 };
     (0..count).map(move |k| match prop {
@@ -120,7 +120,7 @@ fn gait_phases(prop: Prop) -> impl Iterator<Item = Prop> {
     })
 }
 
-/// What everything is built from.
+/// Inputs of all generators.
 struct Plan {
     settings: CitySettings,
     roads: Roads,
@@ -129,7 +129,7 @@ struct Plan {
 }
 
 impl Plan {
-    /// A block's ground and what stands on it.
+    /// The ground of a block and the props on it.
     fn block(&self, block: usize) -> (Piece, Vec<Placement>) {
         let variants = (3.0 + 2.0 * self.settings.area_km2).min(12.0) as u8;
         let mut parcel = Parcel::new(&self.roads, &self.terrain, block, variants, &self.random);
@@ -140,7 +140,7 @@ impl Plan {
         (piece, parcel.placements)
     }
 
-    /// Vehicles quarter by quarter, those on the deck, walkers block by block.
+    /// Vehicles by quarter, vehicles on the deck, pedestrians by block.
     fn movers(&self, deck: Option<&Deck>) -> Vec<Mover> {
         let Self { settings: CitySettings { traffic, .. }, roads, terrain, random } = self;
         let quarter = |q| traffic::vehicles(roads, terrain, q, *traffic, random);

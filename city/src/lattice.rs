@@ -1,4 +1,4 @@
-//! The lattice that roads follow: where its lines are, how they bend, which cells belong together, and where crossings begin.
+//! Layout of the road network: spacing of lattice lines, their bends, quarters and blocks, and the extents of crossings.
 
 use glam::DVec2;
 use rayon::prelude::*;
@@ -24,7 +24,7 @@ pub(crate) fn lay_roads(settings: &CitySettings, random: &Random) -> Roads {
     roads
 }
 
-/// The lattice before and after it is bent.
+/// The lattice: straight lines, and the map that bends them.
 struct Lattice {
     layout: Layout,
     is_compact: bool,
@@ -33,11 +33,11 @@ struct Lattice {
     fine: usize,
     bends: Vec<Bend>,
     random: Random,
-    /// Main cells to a region of the mixed city.
+    /// Main cells per region of one layout in a mixed city.
     region: [f64; 2],
 }
 
-/// A shift of one coordinate that waves along the other: it cannot fold the plane while slopes multiply to under 1.
+/// A sinusoidal shift of one coordinate along the other. The map is injective while the product of the slopes is under 1.
 #[derive(Clone, Copy)]
 struct Bend {
     layout: Layout,
@@ -53,7 +53,7 @@ impl Lattice {
         let layout = settings.layout;
         let extent = settings.extent_metres();
         let half = 0.5 * extent;
-        // a strip beside a wide plain has no room for bends and alleys
+        // a strip beside a wide plain has no space for bends and alleys
         let width = (1.0 - settings.plain) * extent;
         let is_narrow = width < NARROW_METRES;
         let is_compact = settings.is_compact();
@@ -113,7 +113,7 @@ impl Lattice {
         TURNS[(i + 2 * j) % 4]
     }
 
-    /// Quarters, some of them joined, and blocks.
+    /// Divides the lattice into quarters (one or several main cells) and blocks.
     fn assign_blocks(&mut self) -> Roads {
         let fine = self.fine;
         let cells = [self.xs.len() - 1, self.ys.len() - 1];
@@ -169,7 +169,7 @@ impl Lattice {
         }
     }
 
-    /// Where a place of the lattice lies in the world.
+    /// World position of a lattice point.
     fn bend(&self, u: f64, v: f64) -> DVec2 {
         let mut p = DVec2::new(u, v);
         for bend in &self.bends {
@@ -185,7 +185,7 @@ impl Lattice {
         p
     }
 
-    /// How much a place belongs to a layout: smooth over the width of a main cell.
+    /// Weight of a layout at a lattice point, 0 to 1, blended over the width of a main cell.
     fn weight(&self, layout: Layout, u: f64, v: f64) -> f64 {
         if self.layout != Layout::Mixed {
             return 1.0;
@@ -204,7 +204,7 @@ impl Lattice {
         along(j) * (1.0 - fv) + along(j + 1) * fv
     }
 
-    /// Lays centre lines through the lattice, cut back at crossings.
+    /// Samples the centre lines of all edges, shortened at crossings.
     fn draw_paths(&self, roads: &mut Roads) {
         let place = |i: usize, j: usize| self.bend(self.xs[i], self.ys[j]);
         let [nx, ny] = roads.cells;
@@ -214,7 +214,7 @@ impl Lattice {
             let roads: &Roads = roads;
             (0..roads.nodes.len()).into_par_iter().map(|n| arm_cuts(roads, &lines, n)).collect()
         };
-        // as many samples on every edge of a column (of a row), so that the sides of a block match
+        // all edges of a column or row get the same number of samples, so that opposite sides of a block match
         let lengths: Vec<f64> = lines.iter().map(|l| l.windows(2).map(|w| w[0].distance(w[1])).sum()).collect();
         let longest =
             |edges: &mut dyn Iterator<Item = usize>| edges.fold(SAMPLE_METRES, |most, e| lengths[e].max(most));
@@ -237,7 +237,7 @@ impl Lattice {
         }
     }
 
-    /// An edge's whole line from node to node, finely.
+    /// The densely sampled line of an edge from node to node.
     fn edge_line(&self, roads: &Roads, edge: usize) -> Vec<DVec2> {
         const FINE: usize = 48;
         let horizontals = self.horizontals(roads);
@@ -300,7 +300,6 @@ fn bends(layout: Layout, extent: f64, random: &mut Random) -> Vec<Bend> {
     use Layout::{CurvedCorridor, Winding};
     match layout {
         Layout::Grid | Layout::Deck => Vec::new(),
-        // crooked
         Layout::Alley => vec![
             bend(Layout::Alley, true, 87.0, 0.16),
             bend(Layout::Alley, false, 71.0, 0.16),
@@ -368,10 +367,10 @@ impl Spacing {
     }
 }
 
-/// A road as seen from one of its ends.
+/// One arm of a crossing: a road seen from its end.
 struct Arm {
     arm: usize,
-    /// Centre line away from the node, and the distance along it.
+    /// Centre line from the node outwards, and the arc length at each point.
     points: Vec<DVec2>,
     along: Vec<f64>,
     front: f64,
@@ -391,7 +390,7 @@ impl Arm {
         Some(Self { arm, points, along, front: roads.edges[index].as_ref()?.profile.front() })
     }
 
-    /// How far out this arm's front, on its left (1) or right (-1), lies within another arm's fronts.
+    /// Arc length up to which this arm's front line on the left (1) or right (-1) lies between another arm's front lines.
     fn within(&self, side: f64, other: &Self) -> f64 {
         let last = self.points.len() - 1;
         let inside = |k: usize| {
@@ -403,14 +402,14 @@ impl Arm {
                 p.distance(a.lerp(b, t)) < other.front - 0.05
             })
         };
-        // crossings end well before the middle of the longest cut
+        // a crossing takes less than 60 % of an arm
         let reach = self.along.partition_point(|&s| s < 0.6 * self.along[last]);
         let out = (0..reach).rev().find(|&k| inside(k)).map_or(0, |k| k + 1);
         self.along[out]
     }
 }
 
-/// How far from a node each of its arms begins: where its fronts have left its neighbours'.
+/// Distance from a node at which each arm starts: where its front lines no longer overlap those of its neighbours.
 fn arm_cuts(roads: &Roads, lines: &[Vec<DVec2>], node: usize) -> [f64; 4] {
     let mut cuts = [0.0f64; 4];
     let arms: Vec<Arm> = (0..4).filter_map(|arm| Arm::new(roads, lines, node, arm)).collect();
@@ -423,7 +422,7 @@ fn arm_cuts(roads: &Roads, lines: &[Vec<DVec2>], node: usize) -> [f64; 4] {
     cuts
 }
 
-/// Samples a line between its cuts evenly along its length.
+/// Samples an edge evenly between the crossings at its ends.
 fn set_path(edge: &mut Option<Edge>, line: &[DVec2], cuts: [f64; 2], samples: usize) {
     let Some(edge) = edge else { return };
     let mut along = vec![0.0];
@@ -435,7 +434,7 @@ fn set_path(edge: &mut Option<Edge>, line: &[DVec2], cuts: [f64; 2], samples: us
         let k = along.partition_point(|&a| a <= s).clamp(1, line.len() - 1);
         line[k - 1].lerp(line[k], (s - along[k - 1]) / (along[k] - along[k - 1]))
     };
-    // something is left of a short road
+    // a short road keeps at least 15 % of its length
     let scale = (0.85 * length / (cuts[0] + cuts[1])).min(1.0);
     let (from, to) = (scale * cuts[0], length - scale * cuts[1]);
     edge.path = (0..=samples)

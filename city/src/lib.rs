@@ -1,14 +1,14 @@
-//! Procedural cities with ground truth: the project's test bed, and a rehearsal of a capture before anybody pays for it.
+//! Procedural cities with ground truth: synthetic captures for tests, and for planning a real capture.
 //!
 //! ```text
-//! settings ──generate──▶ City: actors (asset, pose, trajectory), materials ──trace──▶ what a sensor sees, and its truth
+//! settings ──generate──▶ City: actors (asset, pose, trajectory), materials ──trace, sense──▶ images, sweeps, ground truth
 //! ```
-//! A city is a list of **actors**, each an asset, a rigid transform and perhaps a trajectory (as CarlaOcc's
-//! scenes are, supplement A); an **asset** is a mesh in its own frame, shared by all its actors. The same settings give
-//! the same city, whatever the number of threads.
+//! A city is a list of **actors**: each has an asset, a rigid transform and optionally a trajectory (the scene model of
+//! CarlaOcc, supplement A). An **asset** is a mesh in its own frame, shared by its actors. The same settings give the same
+//! city for any number of threads.
 //!
-//! Architecture invariant: no files, no clock; randomness comes from the seed (see [`random`]). World metres, z up, the
-//! city centred on the origin.
+//! Architecture invariant: no files, no clock; random numbers come from the seed (see [`random`]). World coordinates are
+//! metres, z up, with the city centred on the origin.
 
 mod build;
 mod deck;

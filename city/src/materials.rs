@@ -1,4 +1,4 @@
-//! What a city is made of: one table, the same for all cities.
+//! The table of materials, the same for all cities.
 //!
 //! Base colours are linear RGB. Reflectivities are for 905 nm at normal incidence, as lidar makers state their ranges by: dark
 //! asphalt about 0.1 to 0.2, concrete 0.3 to 0.45, brick 0.3 to 0.4, white render and paint 0.6 to 0.85, foliage 0.45 to 0.6 (near
@@ -11,7 +11,7 @@ use glam::{Vec2, Vec3};
 use crate::random::Random;
 use crate::types::{Material, Pattern};
 
-/// A row of the table.
+/// A row of the table of materials.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub(crate) struct Surface(pub(crate) u16);
 
@@ -23,7 +23,7 @@ macro_rules! surfaces {
         enum Rows { $($name),+ }
         $(pub(crate) const $name: Surface = Surface(Rows::$name as u16);)+
 
-        /// All rows but those of texts.
+        /// All materials without texts.
         fn rows() -> Vec<Material> {
             vec![$(Material {
                 name: $label.to_owned(),
@@ -146,10 +146,10 @@ const fn is_glass(surface: Surface) -> bool {
     surface.0 == GLASS.0
 }
 
-/// Number of rows before the texts'.
+/// First row of the materials with texts.
 const FIRST_TEXT: u16 = PLASTIC_RED.0 + 1;
 
-/// What signs say: words, ink, ground, in groups.
+/// A sign: text, ink colour, ground colour.
 type SignText = (&'static str, [f32; 3], [f32; 3]);
 
 const WHITE: [f32; 3] = [0.85, 0.85, 0.83];
@@ -160,7 +160,7 @@ const RED: [f32; 3] = [0.5, 0.02, 0.03];
 const CREAM: [f32; 3] = [0.75, 0.65, 0.45];
 const GOLD: [f32; 3] = [0.7, 0.45, 0.08];
 
-/// Names over shops.
+/// Shop names.
 const SHOPS: [SignText; 16] = [
     ("BAKERY", GOLD, [0.12, 0.06, 0.03]),
     ("CAFE LUNA", WHITE, GREEN),
@@ -179,7 +179,7 @@ const SHOPS: [SignText; 16] = [
     ("WINE BAR", CREAM, [0.18, 0.01, 0.03]),
     ("RECORDS", RED, BLACK),
 ];
-/// Names of streets.
+/// Street names.
 const STREETS: [SignText; 12] = [
     ("LIME STREET", WHITE, BLUE),
     ("MILL LANE", WHITE, BLUE),
@@ -194,7 +194,7 @@ const STREETS: [SignText; 12] = [
     ("ABBEY GATE", WHITE, BLUE),
     ("FOUNDRY LANE", WHITE, BLUE),
 ];
-/// What traffic signs say.
+/// Traffic signs.
 const TRAFFIC_SIGNS: [SignText; 6] = [
     ("STOP", WHITE, RED),
     ("30", BLACK, WHITE),
@@ -206,7 +206,7 @@ const TRAFFIC_SIGNS: [SignText; 6] = [
 /// Number plates.
 const PLATES: [SignText; 4] =
     [("PL 4711", BLACK, WHITE), ("AT 2026", BLACK, WHITE), ("GS 3141", BLACK, WHITE), ("KX 1618", BLACK, WHITE)];
-/// Routes and advertisements.
+/// Bus routes and advertisements.
 const POSTERS: [SignText; 6] = [
     ("12 CENTRAL", GOLD, BLACK),
     ("42 HARBOUR", GOLD, BLACK),
@@ -228,7 +228,7 @@ pub(crate) fn shop_name(random: &mut Random) -> Surface {
     text(0, random.below(SHOPS.len()))
 }
 
-/// The plates with street names, all of them.
+/// All street name plates.
 pub(crate) fn street_names() -> impl Iterator<Item = Surface> {
     (0..STREETS.len()).map(|k| text(SHOPS.len(), k))
 }
@@ -247,7 +247,7 @@ pub(crate) fn poster(k: usize) -> Surface {
     text(SHOPS.len() + STREETS.len() + TRAFFIC_SIGNS.len() + PLATES.len(), k.min(POSTERS.len() - 1))
 }
 
-/// The whole table, and what its texts say.
+/// The table of materials and the texts of signs.
 pub(crate) fn table() -> (Vec<Material>, Vec<String>) {
     let mut materials = rows();
     let texts: Vec<String> = sign_texts().map(|(text, ..)| text.to_owned()).collect();
@@ -268,7 +268,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_table_is_physical_and_its_texts_are_their_rows() {
+    fn material_values_are_in_range_and_texts_match_their_rows() {
         let (materials, texts) = table();
         assert_eq!(materials.len(), usize::from(FIRST_TEXT) + texts.len());
         for material in &materials {

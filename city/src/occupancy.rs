@@ -1,12 +1,11 @@
-//! Which voxels the city takes up: panoptic truth from the meshes themselves, at any size of voxel, of any block or around
-//! any pose, and not from what a lidar happened to see (CarlaOcc, supplement 2.1).
+//! Panoptic voxel occupancy of the city, computed from its meshes and not from lidar points (CarlaOcc, supplement 2.1).
 //!
-//! A voxel is occupied where a triangle meets it: the separating-axis test of a triangle and a box (Akenine-Möller 2001),
-//! all thirteen axes, in f64. Voxels are half-open: a face that lies exactly on the boundary of two belongs to the upper
-//! one. **Only surfaces count**: the inside of a house is free, as it is for whoever stands in it.
+//! A voxel is occupied if a triangle intersects it: the separating-axis test of a triangle and a box (Akenine-Möller 2001),
+//! all thirteen axes, in f64. Voxels are half-open: a face on the boundary of two voxels belongs to the upper one. **Only
+//! surfaces count**: the inside of a house is free.
 //!
-//! Where several surfaces share a voxel, what is counted comes before what is not, thin things before thick ones, and of
-//! equals the actor that is listed first.
+//! If several surfaces share a voxel, actors with an instance win over those without, then thin classes over thick ones,
+//! then the actor with the lower row.
 
 use glam::{DMat3, DVec3, UVec3};
 use rayon::prelude::*;
@@ -20,10 +19,10 @@ use crate::{
 
 /// [`Voxels::semantic`] of a free voxel.
 pub const FREE: u8 = 255;
-/// The most voxels of a grid.
+/// Largest number of voxels of a grid.
 pub const MAX_VOXELS: u64 = 1 << 29;
 
-/// Where voxels are: cubes along the axes of a frame.
+/// A grid of cubic voxels along the axes of a frame.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Grid {
@@ -38,20 +37,20 @@ pub struct Grid {
 }
 
 impl Grid {
-    /// A block along the world's axes; its upper corner is rounded up to whole voxels.
+    /// A box along the world axes; its upper corner is rounded up to whole voxels.
     ///
     /// # Errors
-    /// [`GridError`] for a block that cannot be.
+    /// [`GridError`] for a box out of range.
     pub fn world_aligned(low: DVec3, high: DVec3, voxel_metres: f64) -> Result<Self, GridError> {
         Self::new(Rigid::IDENTITY, low, high, voxel_metres)
     }
 
-    /// A block around a pose, in the pose's own axes: from `low` to `high`, metres from it.
+    /// A box in the axes of a pose, from `low` to `high`, metres.
     ///
     /// # Errors
-    /// [`GridError`] for a block or a pose that cannot be.
+    /// [`GridError`] for a box or a pose out of range.
     pub fn new(world_from_grid: Rigid, low: DVec3, high: DVec3, voxel_metres: f64) -> Result<Self, GridError> {
-        // a hair less, so that 51.2 m are 512 voxels of 0.1 m whatever the rounding
+        // slightly less, so that 51.2 m are 512 voxels of 0.1 m despite rounding
         let cells = ((high - low) / voxel_metres - 1e-6).ceil();
         if !(cells.is_finite() && cells.min_element() >= 1.0 && cells.max_element() < 1e6) {
             return Err(GridError::OutOfRange);
@@ -62,7 +61,7 @@ impl Grid {
     }
 
     /// # Errors
-    /// [`GridError`] for numbers that are none and for more voxels than [`MAX_VOXELS`].
+    /// [`GridError`] for numbers out of range and for more voxels than [`MAX_VOXELS`].
     pub fn check(&self) -> Result<(), GridError> {
         let voxels = self.size.to_array().iter().try_fold(1u64, |product, &n| product.checked_mul(u64::from(n)));
         if voxels.is_none_or(|n| n > MAX_VOXELS) {
@@ -73,25 +72,25 @@ impl Grid {
     }
 }
 
-/// A grid that cannot be filled.
+/// An invalid grid.
 #[derive(Debug, thiserror::Error, Clone, Copy, PartialEq, Eq)]
 pub enum GridError {
     /// More than [`MAX_VOXELS`].
     #[error("more than {MAX_VOXELS} voxels")]
     TooLarge,
-    /// A number that is none, or out of its range.
+    /// A number is not finite or out of range.
     #[error("a grid's corners, pose or voxel is out of range")]
     OutOfRange,
 }
 
-/// What is in each voxel, x fastest, then y, then z.
+/// Semantic and instance labels per voxel, x fastest, then y, then z.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Voxels {
-    /// Where they are.
+    /// The grid.
     pub grid: Grid,
     /// [`Class`], or [`FREE`].
     pub semantic: Vec<u8>,
-    /// [`crate::Actor::instance`]; 0 for what is not counted and for free voxels.
+    /// [`crate::Actor::instance`]; 0 for actors without an instance and for free voxels.
     pub instance: Vec<u32>,
 }
 
@@ -103,16 +102,16 @@ impl Voxels {
         (at.z * size.y + at.y) * size.x + at.x
     }
 
-    /// How many voxels are taken.
+    /// Number of occupied voxels.
     pub fn occupied_count(&self) -> usize {
         self.semantic.iter().filter(|&&class| class != FREE).count()
     }
 }
 
-/// Fills a grid with the city at a moment.
+/// Computes the occupancy of the city at a time.
 ///
 /// # Errors
-/// [`GridError`] for a grid that cannot be filled.
+/// [`GridError`] for an invalid grid.
 pub fn voxelize(city: &City, seconds: f64, grid: &Grid) -> Result<Voxels, GridError> {
     grid.check()?;
     let faces = faces(city, seconds, grid);
@@ -132,7 +131,7 @@ pub fn voxelize(city: &City, seconds: f64, grid: &Grid) -> Result<Voxels, GridEr
     Ok(Voxels { grid: *grid, semantic, instance })
 }
 
-/// A triangle in voxels: one unit is the side of one, the grid starts at the origin.
+/// A triangle in voxel units, relative to the grid's lowest corner.
 struct Face {
     corners: [DVec3; 3],
     low: DVec3,
@@ -142,7 +141,7 @@ struct Face {
     rank: u8,
 }
 
-/// The triangles that reach into a grid, in the order of actors.
+/// The triangles that overlap a grid, in the order of actors.
 fn faces(city: &City, seconds: f64, grid: &Grid) -> Vec<Face> {
     let grid_from_world = grid.world_from_grid.inverse();
     let top = grid.size.as_dvec3();
@@ -153,7 +152,7 @@ fn faces(city: &City, seconds: f64, grid: &Grid) -> Vec<Face> {
         let turn = DMat3::from_quat(rotation);
         let shift = grid_from_world.apply(pose.translation) - grid.low;
         let mesh = &asset.mesh;
-        // a sphere around the mesh says of most actors that they are not here
+        // a bounding sphere rejects most actors
         let reach = mesh.positions.iter().map(|p| p.length_squared()).fold(0.0, f32::max).sqrt();
         let reach = f64::from(reach) + grid.voxel_metres;
         if (shift + reach).min_element() < 0.0 || (shift - reach - top * grid.voxel_metres).max_element() > 0.0 {
@@ -183,7 +182,7 @@ fn faces(city: &City, seconds: f64, grid: &Grid) -> Vec<Face> {
     all.into_iter().flatten().collect()
 }
 
-/// What wins a voxel: counted things, and of those the thin ones.
+/// Priority in a shared voxel: actors with an instance first, then thin classes.
 fn rank(class: Class, instance: u32) -> u8 {
     let thin = match class {
         Class::Person | Class::Rider => 9,
@@ -204,7 +203,7 @@ impl Face {
         self.low.z < (z + 1) as f64 && self.high.z >= z as f64
     }
 
-    /// Calls for each voxel of a layer that the triangle meets.
+    /// Calls back for each voxel of a layer that the triangle intersects.
     fn for_each_voxel(&self, size: UVec3, z: usize, mut call: impl FnMut(usize)) {
         let first = |low: f64| low.floor().max(0.0) as u32;
         let end = |high: f64, n: u32| (high.floor() + 1.0).clamp(0.0, f64::from(n)) as u32;
@@ -218,7 +217,8 @@ impl Face {
         }
     }
 
-    /// Where, along a row of voxels, the triangle's plane can be; so that a large slope costs what its surface is.
+    /// Range of x in which the triangle's plane passes through a row of voxels, so that large sloping triangles cost no more
+    /// than their surface.
     fn row_span(&self, y: f64, z: f64) -> Option<(f64, f64)> {
         let [a, b, c] = self.corners;
         let n = (b - a).cross(c - a);
@@ -231,7 +231,7 @@ impl Face {
         Some((low - 1.0, high + 1.0))
     }
 
-    /// Whether the triangle meets the voxel with this lowest corner.
+    /// Whether the triangle intersects the voxel with this lowest corner.
     fn intersects(&self, voxel: DVec3) -> bool {
         // along the voxel's own axes: half-open
         let top = voxel + 1.0;
@@ -266,7 +266,7 @@ mod tests {
     }
 
     #[test]
-    fn a_known_box_takes_exactly_the_shell_of_its_voxels() {
+    fn a_box_occupies_exactly_the_shell_of_its_voxels() {
         for voxel in [0.05, 0.1, 0.5] {
             let grid = Grid::world_aligned(DVec3::splat(-0.5), DVec3::new(2.5, 2.0, 3.0), voxel).unwrap();
             let filled = voxelize(&boxed(), 0.0, &grid).unwrap();
@@ -289,7 +289,7 @@ mod tests {
     }
 
     #[test]
-    fn a_slope_takes_no_voxel_that_it_does_not_meet() {
+    fn a_slope_occupies_only_voxels_it_intersects() {
         // the plane x + y + z = 3.3 within the first octant, against its own arithmetic
         let mut city = City { materials: test_scene::city().materials, ..City::default() };
         let mut mesh = test_scene::rectangle(Vec3::ZERO, Vec3::X, Vec3::Y, 0, Class::Wall);
@@ -307,7 +307,7 @@ mod tests {
     }
 
     #[test]
-    fn around_a_pose_the_grid_turns_with_it() {
+    fn a_grid_around_a_pose_has_the_axes_of_the_pose() {
         let city = test_scene::city();
         let pose = Rigid {
             rotation: DQuat::from_rotation_z(std::f64::consts::FRAC_PI_2),
@@ -329,7 +329,7 @@ mod tests {
     }
 
     #[test]
-    fn grids_that_cannot_be_are_refused() {
+    fn invalid_grids_are_refused() {
         let block = |high: f64, voxel: f64| Grid::world_aligned(DVec3::ZERO, DVec3::splat(high), voxel);
         assert_eq!(block(1000.0, 0.05), Err(GridError::TooLarge));
         assert_eq!(block(10.0, 0.0), Err(GridError::OutOfRange));

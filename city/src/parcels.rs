@@ -1,4 +1,4 @@
-//! Blocks into lots: rows of houses along the fronts, parks, squares and car parks.
+//! Parcels: land use of blocks, and rows of houses along their fronts.
 
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use scene::Rigid;
@@ -13,14 +13,14 @@ use crate::settings::Layout;
 use crate::terrain::Terrain;
 use crate::types::Class;
 
-/// A shared asset at a place.
+/// A prop at a pose.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Placement {
     pub(crate) prop: Prop,
     pub(crate) pose: Rigid,
 }
 
-/// What a block is land_use for.
+/// Land use of a block.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum LandUse {
     Houses,
@@ -29,7 +29,7 @@ pub(crate) enum LandUse {
     CarPark,
 }
 
-/// A block while it is built on.
+/// A block during generation: its land use and the props placed so far.
 pub(crate) struct Parcel<'a> {
     pub(crate) roads: &'a Roads,
     pub(crate) terrain: &'a Terrain,
@@ -37,18 +37,18 @@ pub(crate) struct Parcel<'a> {
     pub(crate) layout: Layout,
     pub(crate) land_use: LandUse,
     pub(crate) random: Random,
-    /// Variants of each kind and width of house.
+    /// Number of variants of each kind and width of house.
     pub(crate) variants: u8,
-    /// What the houses cover.
+    /// Areas that are occupied by houses and other props.
     pub(crate) footprints: Vec<Footprint>,
     pub(crate) placements: Vec<Placement>,
 }
 
-/// A rectangle on the ground: where a house, a deck or a vehicle stands.
+/// An oriented rectangle on the ground that a prop occupies.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Footprint {
     pub(crate) centre: DVec2,
-    /// Unit direction of its length.
+    /// Unit direction of the length.
     pub(crate) along: DVec2,
     pub(crate) half: DVec2,
 }
@@ -59,7 +59,7 @@ impl Footprint {
         [-x - y, x - y, x + y, -x + y].map(|d| self.centre + d)
     }
 
-    /// Whether two come closer than this (separating axes; negative allows an overlap).
+    /// Whether two footprints are closer than `gap` (separating axes; a negative gap allows an overlap).
     pub(crate) fn overlaps(&self, other: &Self, gap: f64) -> bool {
         let between = other.centre - self.centre;
         [self.along, self.along.perp(), other.along, other.along.perp()].into_iter().all(|axis| {
@@ -76,12 +76,12 @@ impl Footprint {
     }
 }
 
-/// Upright, with x along a direction.
+/// An upright pose with x along a direction.
 pub(crate) fn upright(at: DVec3, along: DVec2) -> Rigid {
     Rigid { rotation: DQuat::from_rotation_z(along.to_angle()), translation: at }
 }
 
-/// Standing square on sloping ground, with x along a direction of the map.
+/// A pose perpendicular to sloping ground, with x along a direction.
 pub(crate) fn on_slope(terrain: &Terrain, at: DVec2, along: DVec2) -> Rigid {
     let slope = |d: DVec2| (terrain.at(at + d) - terrain.at(at - d)).normalize();
     let x = slope(along);
@@ -95,7 +95,7 @@ impl<'a> Parcel<'a> {
         let layout = roads.quarters[roads.blocks[block].quarter].layout;
         let mut random = random.fork(0xB10C).fork(block as u64);
         let land_use = match (layout, random.unit()) {
-            // a compact city has too few blocks to give one away
+            // a compact city has too few blocks for other uses
             _ if roads.is_compact => LandUse::Houses,
             (Layout::CurvedCorridor, _) => LandUse::Houses,
             (Layout::Alley, u) if u < 0.05 => LandUse::Square,
@@ -119,7 +119,7 @@ impl<'a> Parcel<'a> {
         }
     }
 
-    /// What covers the block's ground.
+    /// Ground cover of the block.
     pub(crate) fn cover(&self) -> Cover {
         let lawn = (m::LAWN, Class::Terrain);
         let (ground, rim) = match (self.land_use, self.layout) {
@@ -133,12 +133,12 @@ impl<'a> Parcel<'a> {
         Cover { ground, rim }
     }
 
-    /// Height of the block's ground at a place behind the fronts.
+    /// The ground of the block at a point behind the fronts.
     pub(crate) fn ground(&self, p: DVec2) -> DVec3 {
         self.terrain.at(p) + DVec3::Z * self.curb()
     }
 
-    /// Height of the curbs around: those of the quarter's own roads.
+    /// Curb height of the quarter's own roads.
     fn curb(&self) -> f64 {
         match self.layout {
             Layout::Winding => RoadKind::Winding,
@@ -153,7 +153,7 @@ impl<'a> Parcel<'a> {
         self.placements.push(Placement { prop, pose });
     }
 
-    /// The four sides without their corners, at a distance from the centre lines: counter-clockwise, the block on the left.
+    /// The four sides without corners at an offset from the centre lines, counter-clockwise, with the block on the left.
     pub(crate) fn sides(&self, distance: &dyn Fn(&Profile) -> f64) -> Vec<(Polyline, Profile)> {
         let (ring, turns) = self.roads.ring(&self.walk, distance);
         let count = ring.len();
@@ -169,7 +169,7 @@ impl<'a> Parcel<'a> {
             .collect()
     }
 
-    /// Rows of houses on all four sides.
+    /// Places rows of houses on all four sides.
     pub(crate) fn place_houses(&mut self) {
         if self.land_use != LandUse::Houses {
             return;
@@ -177,7 +177,7 @@ impl<'a> Parcel<'a> {
         let outline: Vec<DVec2> = self.roads.ring(&self.walk, &Profile::front).0.iter().map(|p| p.at).collect();
         let mut sides = self.sides(&Profile::front);
         if self.roads.is_compact {
-            // blocks are not deep enough for houses on all sides: those on the fitting_widths road come first
+            // blocks are not deep enough for houses on all sides: the widest road comes first
             sides.sort_by(|a, b| b.1.front().total_cmp(&a.1.front()));
         }
         for (line, profile) in sides {
@@ -201,7 +201,7 @@ impl<'a> Parcel<'a> {
         }
     }
 
-    /// Houses along a front.
+    /// Places a row of houses along a front line.
     fn place_row(&mut self, line: &Polyline, profile: &Profile, outline: &[DVec2]) {
         let villas = self.layout == Layout::Winding;
         let mut s = if villas { self.random.range(1.0, 4.0).into() } else { 0.0 };
@@ -224,20 +224,20 @@ impl<'a> Parcel<'a> {
             s += match kind {
                 HouseKind::Villa => self.random.range(4.0, 9.0).into(),
                 HouseKind::Tower => self.random.range(2.0, 4.0).into(),
-                // a passage now and then
+                // an occasional passage
                 _ if self.random.chance(0.1) => self.random.range(1.2, 3.5).into(),
                 _ => 0.0,
             };
         }
     }
 
-    /// A house at `s` along a front, if there is room for it behind.
+    /// Places a house at arc length `s` of a front line if its footprint is free.
     fn place_house(&mut self, line: &Polyline, s: f64, kind: HouseKind, width: usize, back: f64, outline: &[DVec2]) {
         let size = DVec2::new(WIDTHS[width].into(), kind.depth().into());
         let points: Vec<DVec2> = (0..=4).map(|k| line.at(s + size.x * f64::from(k) / 4.0).0).collect();
         let along = (points[4] - points[0]).normalize_or(DVec2::X);
         let inwards = along.perp();
-        // a straight front behind a bending one
+        // houses are straight: behind a convex front line the house is set back
         let behind = points.iter().map(|&p| (p - points[0]).dot(inwards)).fold(0.0, f64::max) + 0.02 + back;
         let front = points[0].midpoint(points[4]) + behind * inwards;
         let footprint = Footprint { centre: front + 0.5 * size.y * inwards, along, half: 0.5 * size };
@@ -257,7 +257,7 @@ impl<'a> Parcel<'a> {
     }
 }
 
-/// Whether a polygon holds a point (the even-odd rule).
+/// Whether a polygon contains a point (even-odd rule).
 pub(crate) fn contains(polygon: &[DVec2], p: DVec2) -> bool {
     let mut inside = false;
     for k in 0..polygon.len() {

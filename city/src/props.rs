@@ -1,4 +1,4 @@
-//! What is shared: each kind of house, tree, vehicle, person and piece of street furniture is one asset for all its actors.
+//! Props: the shared assets. Each kind of house, tree, vehicle, person and street furniture is one asset for all its actors.
 
 use crate::build::furniture::Piece;
 use crate::build::house::{self, HouseKind, WIDTHS};
@@ -8,7 +8,7 @@ use crate::build::vehicle::{self, VehicleKind};
 use crate::random::Random;
 use crate::types::{Asset, Class};
 
-/// A shared asset's name.
+/// Key of a shared asset.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) enum Prop {
     /// A house of a kind and a row of [`WIDTHS`].
@@ -20,7 +20,7 @@ pub(crate) enum Prop {
     Tree(u8),
     Hedge,
     Vehicle(VehicleKind, u8),
-    /// Somebody in a phase of walking.
+    /// A pedestrian in a phase of the gait.
     Walker {
         build: u8,
         phase: u8,
@@ -29,7 +29,7 @@ pub(crate) enum Prop {
 }
 
 impl Prop {
-    /// The class of the whole.
+    /// Class of the prop as a whole.
     pub(crate) fn class(self) -> Class {
         match self {
             Self::House { .. } => Class::Building,
@@ -40,12 +40,12 @@ impl Prop {
         }
     }
 
-    /// Whether it has an instance number: all but what comes in pieces of two metres.
+    /// Whether actors of this prop get an instance number: all but hedges, fences and walls, which are pieces of 2 m.
     pub(crate) fn is_counted(self) -> bool {
         !matches!(self, Self::Hedge | Self::Furniture(Piece::Fence | Piece::Wall))
     }
 
-    /// Builds it; the same for the same seed.
+    /// Builds the asset; the same seed gives the same asset.
     pub(crate) fn build(self, seed: &Random) -> Asset {
         match self {
             Self::House { kind, width, variant } => {

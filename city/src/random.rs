@@ -1,9 +1,9 @@
-//! Random numbers as pure functions of a key and a counter, so that neither order nor threads can change them.
+//! Counter-based random numbers: pure functions of a key and a counter, independent of order and threads.
 
 use glam::Vec2;
 pub use scene::random::bits;
 
-/// A stream of random numbers: whoever builds something takes one of its own, by what it builds and where.
+/// A stream of random numbers. Each generator forks its own stream, by purpose and place.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Random {
     key: u64,
@@ -16,7 +16,7 @@ impl Random {
         Self { key, count: 0 }
     }
 
-    /// A stream apart, by a number that says what for.
+    /// An independent stream for a purpose.
     pub fn fork(&self, purpose: u64) -> Self {
         Self::new(bits(self.key, purpose ^ 0xC17C_17C1_7C17_C17C))
     }
@@ -33,27 +33,27 @@ impl Random {
         scene::random::uniform(self.key, self.count)
     }
 
-    /// Uniform between two numbers.
+    /// Uniform in [from, to).
     pub fn range(&mut self, from: f32, to: f32) -> f32 {
         from + (to - from) * self.unit()
     }
 
-    /// Uniform in `0 .. n`; 0 for none.
+    /// Uniform in `0 .. n`; 0 if `n` is 0.
     pub fn below(&mut self, n: usize) -> usize {
         (self.bits() % (n.max(1) as u64)) as usize
     }
 
-    /// True this often.
+    /// True with this probability.
     pub fn chance(&mut self, probability: f32) -> bool {
         self.unit() < probability
     }
 
-    /// One of some things.
+    /// A uniformly chosen element.
     ///
     /// # Panics
-    /// There are none.
-    pub fn one_of<'a, T>(&mut self, things: &'a [T]) -> &'a T {
-        &things[self.below(things.len())]
+    /// The slice is empty.
+    pub fn one_of<'a, T>(&mut self, items: &'a [T]) -> &'a T {
+        &items[self.below(items.len())]
     }
 
     /// Uniform in a rectangle.
@@ -73,7 +73,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn streams_are_apart_and_uniform() {
+    fn streams_are_independent_and_uniform() {
         let (mut a, mut b) = (Random::new(1), Random::new(1).fork(2));
         assert_ne!(a.bits(), b.bits());
         let mean: f32 = (0..10_000).map(|_| a.unit()).sum::<f32>() / 1e4;

@@ -1,33 +1,33 @@
-//! The road network: a lattice of lines, bent by a smooth map, of which each layout keeps what it likes.
+//! The road network: a lattice of lines bent by a smooth map, on which each layout has its own kinds of roads.
 //!
 //! ```text
 //!  quarter = a cell between main lines        block = quarter, or a part of it between alleys
-//!  ┌────────┬──┬──┬──┬────────┐               main lines carry streets, lines between them alleys
-//!  │        ├──┼──┼──┤        │               an edge between two blocks is a road; inside a block there is none
+//!  ┌────────┬──┬──┬──┬────────┐               main lines are streets, fine lines between them are alleys
+//!  │        ├──┼──┼──┤        │               an edge between two blocks is a road; an edge inside a block is none
 //!  │        ├──┼──┼──┤        │
 //!  └────────┴──┴──┴──┴────────┘
 //! ```
-//! Every block is a rectangle of cells with roads all around, so every road leads somewhere, and everything beside a road
-//! (curbs, fronts, lanes, walkers' paths) is a **ring** around some blocks: the road's centre line at a distance, with
-//! rounded corners. Rings at different distances never cross. An architecture invariant: no meshes in here.
+//! Every block is a rectangle of cells with roads on all sides, so there are no dead ends. Everything beside a road (curbs,
+//! front lines, lanes, pedestrian paths) is a **ring** around blocks: the centre lines at an offset, with rounded corners.
+//! Rings at different offsets do not cross. Architecture invariant: this module builds no meshes.
 
 use glam::DVec2;
 
 use crate::settings::Layout;
 
-/// What a road is like across. Metres.
+/// Cross-section of a road, metres.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Profile {
     pub(crate) kind: RoadKind,
-    /// Half the carriageway.
+    /// Half the width of the carriageway.
     pub(crate) half: f64,
     /// Width of each pavement.
     pub(crate) pavement: f64,
-    /// From the centre line to the middle of the driving lane beside the curb.
+    /// From the centre line to the middle of the outermost driving lane.
     pub(crate) lane: f64,
     /// Height of the curb.
     pub(crate) curb: f64,
-    /// Vehicles park along the curb.
+    /// Whether vehicles park along the curb.
     pub(crate) parking: bool,
 }
 
@@ -57,30 +57,30 @@ impl RoadKind {
 }
 
 impl Profile {
-    /// From the centre line to the fronts.
+    /// Setback: from the centre line to the building fronts.
     pub(crate) fn front(&self) -> f64 {
         self.half + self.pavement
     }
 }
 
-/// A road between two neighbouring crossings, from where the one ends to where the other begins.
+/// A road between two neighbouring crossings, without the crossings.
 #[derive(Debug, Clone)]
 pub(crate) struct Edge {
     pub(crate) profile: Profile,
-    /// The centre line and its unit direction (towards growing lattice lines).
+    /// Points of the centre line with unit directions (towards increasing lattice lines).
     pub(crate) path: Vec<(DVec2, DVec2)>,
 }
 
-/// A turn of the walk around blocks. Arms of a crossing are numbered 0 east, 1 north, 2 west, 3 south.
+/// A step of a walk around blocks. Arms of a crossing are numbered 0 east, 1 north, 2 west, 3 south.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Step {
     /// Along an edge, with the block on the left.
     Along { edge: usize, forward: bool },
-    /// Through a crossing, in by one arm and out by another; `turn` at a corner of the walk.
+    /// Through a crossing, from one arm to another; `turn` at a corner of the walk.
     Through { node: usize, from: usize, to: usize, turn: bool },
 }
 
-/// A cell between main lines, with its layout.
+/// One or several cells between main lines with one layout.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Quarter {
     /// Lattice lines: west, east, south, north.
@@ -90,7 +90,7 @@ pub(crate) struct Quarter {
     pub(crate) row: usize,
 }
 
-/// What lies between roads.
+/// An area between roads.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Block {
     /// Lattice lines: west, east, south, north.
@@ -98,37 +98,37 @@ pub(crate) struct Block {
     pub(crate) quarter: usize,
 }
 
-/// The network.
+/// The road network.
 #[derive(Debug, Clone)]
 pub(crate) struct Roads {
     /// Number of cells of the fine lattice.
     pub(crate) cells: [usize; 2],
-    /// Fine lines to a main cell.
+    /// Fine cells per main cell.
     pub(crate) fine: usize,
     /// Horizontal edges row by row (`cells[0] × (cells[1] + 1)`), then vertical ones (`(cells[0] + 1) × cells[1]`).
     pub(crate) edges: Vec<Option<Edge>>,
-    /// Where lines cross, row by row.
+    /// Positions of the lattice nodes, row by row.
     pub(crate) nodes: Vec<DVec2>,
     pub(crate) quarters: Vec<Quarter>,
     pub(crate) blocks: Vec<Block>,
-    /// The horizontal line that the deck runs over.
+    /// The horizontal line that the deck follows.
     pub(crate) deck: Option<usize>,
     /// The city is compact: roads at its edge are lanes (see [`crate::CitySettings::is_compact`]).
     pub(crate) is_compact: bool,
 }
 
-/// Points of a rounded corner between the roads that meet in it, without its ends: odd, so that one is the middle.
+/// Inner points of a rounded corner between two roads. Odd, so that one is the middle.
 pub(crate) const CORNER_POINTS: usize = 5;
-/// Sampling of roads, metres.
+/// Distance between samples of a road, metres.
 pub(crate) const SAMPLE_METRES: f64 = 4.0;
 
 /// A point of a ring.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct RingPoint {
     pub(crate) at: DVec2,
-    /// The road it is beside, or that it comes from at a crossing.
+    /// The road beside the point, at a crossing the road before it.
     pub(crate) profile: Profile,
-    /// The step it belongs to.
+    /// The step of the walk.
     pub(crate) step: usize,
 }
 
@@ -147,7 +147,7 @@ impl Roads {
         self.cells[0] * (self.cells[1] + 1) + i + j * (self.cells[0] + 1)
     }
 
-    /// The edge that is an arm of a node, and whether it runs away from it.
+    /// The edge at an arm of a node, and whether its direction points away from the node.
     pub(crate) fn arm(&self, node: usize, arm: usize) -> Option<(usize, bool)> {
         let (i, j) = (node % (self.cells[0] + 1), node / (self.cells[0] + 1));
         let (index, away) = match arm {
@@ -160,7 +160,7 @@ impl Roads {
         self.edges[index].is_some().then_some((index, away))
     }
 
-    /// The end of an arm at its node: place, direction away from the node, profile.
+    /// The end of an arm at its node: position, direction away from the node, profile.
     pub(crate) fn arm_end(&self, node: usize, arm: usize) -> Option<(DVec2, DVec2, Profile)> {
         let (index, away) = self.arm(node, arm)?;
         let edge = self.edges[index].as_ref()?;
@@ -168,7 +168,7 @@ impl Roads {
         Some((at, if away { direction } else { -direction }, edge.profile))
     }
 
-    /// The two quarters beside an edge.
+    /// The blocks on both sides of an edge.
     fn adjacent_blocks(&self, index: usize) -> [Option<usize>; 2] {
         let horizontals = self.cells[0] * (self.cells[1] + 1);
         let cell = |i: usize, j: usize| (i < self.cells[0] && j < self.cells[1]).then(|| self.block_at(i, j));
@@ -184,13 +184,13 @@ impl Roads {
 
     fn block_at(&self, i: usize, j: usize) -> usize {
         let holds = |lines: &[usize; 4]| lines[0] <= i && i < lines[1] && lines[2] <= j && j < lines[3];
-        // blocks of a quarter are consecutive, quarters of a row too: a scan of one row of quarters
+        // blocks are sorted by rows of quarters, so only one row is searched
         let row = j / self.fine;
         let from = self.blocks.partition_point(|b| self.quarters[b.quarter].row < row);
         (from..self.blocks.len()).find(|&b| holds(&self.blocks[b].lines)).unwrap_or(0)
     }
 
-    /// What road an edge is, if it is one: none inside a block.
+    /// The kind of road of an edge; `None` inside a block.
     pub(crate) fn kind_of(&self, index: usize) -> Option<RoadKind> {
         let horizontals = self.cells[0] * (self.cells[1] + 1);
         let line =
@@ -216,7 +216,7 @@ impl Roads {
         })
     }
 
-    /// The walk around a rectangle of lattice lines with it on the left; the four corners are its 'turns'.
+    /// The counter-clockwise walk around a rectangle of lattice lines, with the rectangle on the left and four turns.
     pub(crate) fn walk_around(&self, [west, east, south, north]: [usize; 4]) -> Vec<Step> {
         let mut steps = Vec::new();
         let mut side = |count: usize, arm: usize, edge: &dyn Fn(usize) -> usize, node: &dyn Fn(usize) -> usize| {
@@ -235,10 +235,10 @@ impl Roads {
         steps
     }
 
-    /// The walk around the whole city with the country on the left.
+    /// The clockwise walk around the whole city, with the countryside on the left.
     pub(crate) fn walk_outside(&self) -> Vec<Step> {
         let mut steps = self.walk_around([0, self.cells[0], 0, self.cells[1]]);
-        // the last corner is the first of the way back
+        // the walk starts with an edge
         steps.reverse();
         steps.rotate_left(1);
         for step in &mut steps {
@@ -250,8 +250,7 @@ impl Roads {
         steps
     }
 
-    /// The closed line beside a walk at a distance from the centre lines (to the left of the walk), and the indices of the
-    /// middles of its turns.
+    /// The closed line at an offset to the left of the centre lines of a walk, and the indices of the middles of its turns.
     pub(crate) fn ring(&self, walk: &[Step], distance: &dyn Fn(&Profile) -> f64) -> (Vec<RingPoint>, Vec<usize>) {
         let (mut ring, mut turns) = (Vec::new(), Vec::new());
         let mut profile = RoadKind::Street.profile();
@@ -279,7 +278,7 @@ impl Roads {
         (ring, turns)
     }
 
-    /// The inner points of the curve through a crossing, on the left of who comes in by `from` and leaves by `to`.
+    /// The inner points of the curve through a crossing from arm `from` to arm `to`, at an offset to the left.
     pub(crate) fn corner(
         &self,
         node: usize,
@@ -290,7 +289,7 @@ impl Roads {
         let end = |arm: usize, side: f64| {
             self.arm_end(node, arm).map(|(at, out, profile)| (at + side * distance(&profile) * out.perp(), out))
         };
-        // to the left of who comes in is to the right of who looks out
+        // left of the incoming direction is right of the outgoing direction
         let ends = end(from, -1.0).zip(end(to, 1.0));
         let (a, control, b) = ends.map_or((DVec2::ZERO, DVec2::ZERO, DVec2::ZERO), |((a, out_a), (b, out_b))| {
             let middle = 0.5 * (a + b);
@@ -315,7 +314,7 @@ mod tests {
     use crate::settings::CitySettings;
 
     #[test]
-    fn blocks_tile_the_lattice_and_every_road_leads_somewhere() {
+    fn blocks_tile_the_lattice_and_no_road_is_a_dead_end() {
         for &layout in Layout::ALL {
             let settings = CitySettings { layout, area_km2: 0.6, ..CitySettings::default() };
             let roads = lay_roads(&settings, &Random::new(5));
@@ -333,7 +332,7 @@ mod tests {
     }
 
     #[test]
-    fn opposite_sides_of_a_block_have_as_many_points_and_rings_nest() {
+    fn opposite_sides_of_a_block_have_equal_point_counts_and_rings_nest() {
         let settings = CitySettings { layout: Layout::Mixed, area_km2: 0.6, ..CitySettings::default() };
         let roads = lay_roads(&settings, &Random::new(6));
         let area = |ring: &[RingPoint]| {

@@ -1,4 +1,4 @@
-//! What a city is asked for by.
+//! The settings that a city is generated from.
 
 use std::fmt;
 use std::str::FromStr;
@@ -11,20 +11,20 @@ const COMPACT_BELOW_KM2: f64 = 0.05;
 /// Smallest width from the edge of the plain to the east edge, metres: one block of houses and its roads.
 const MIN_BUILT_METRES: f64 = 44.0;
 
-/// Everything that a city follows from.
+/// Settings of a city. The city is a function of them alone.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct CitySettings {
-    /// Everything random follows from it.
+    /// Seed of all random numbers.
     pub seed: u64,
     /// Area of the square city, km²: 0.005 to 25. Below 0.05 the city is **compact**, see
     /// [`is_compact`](Self::is_compact).
     pub area_km2: f64,
-    /// How its streets run.
+    /// Street layout.
     pub layout: Layout,
-    /// How many vehicles and walkers move.
+    /// Amount of moving vehicles and pedestrians.
     pub traffic: Traffic,
-    /// Share of the city, from its west side, that is a bare plain: 0 to 0.8.
+    /// Share of the city, from its west edge, that is a bare plain: 0 to 0.8.
     pub plain: f64,
 }
 
@@ -74,7 +74,7 @@ impl CitySettings {
     }
 }
 
-/// An enum whose values have names in lower case with hyphens.
+/// Defines an enum whose values have kebab-case names.
 macro_rules! named_enum {
     ($(#[$meta:meta])* $type:ident, $what:literal, { $($(#[$doc:meta])* $variant:ident = $name:literal),+ $(,)? }) => {
         $(#[$meta])*
@@ -83,10 +83,10 @@ macro_rules! named_enum {
         pub enum $type { $($(#[$doc])* $variant),+ }
 
         impl $type {
-            /// All of them, in the order of their declaration.
+            /// All values, in the order of declaration.
             pub const ALL: &'static [Self] = &[$(Self::$variant),+];
 
-            /// The name that people type.
+            /// The kebab-case name, as in command lines and files.
             pub fn name(self) -> &'static str {
                 match self { $(Self::$variant => $name),+ }
             }
@@ -113,11 +113,11 @@ macro_rules! named_enum {
 pub(crate) use named_enum;
 
 named_enum!(
-    /// How streets run: a plain grid, the four layouts that reconstruction finds hard (SDG, section 2.2), and all of them.
+    /// Street layouts: a plain grid, the four layouts that are hard to reconstruct (SDG, section 2.2), and all of them.
     Layout, "layout", {
         /// Streets at right angles.
         Grid = "grid",
-        /// Long bending canyons between tall facades, few cross streets.
+        /// Long curved canyons between tall facades, few cross streets.
         CurvedCorridor = "curved-corridor",
         /// Passages of 3 to 5 m between houses, off narrow lanes.
         Alley = "alley",
@@ -131,13 +131,13 @@ named_enum!(
 );
 
 named_enum!(
-    /// How much moves (the levels of CarlaOcc, supplement 1.1). Parked vehicles stay at every level.
+    /// Traffic levels (CarlaOcc, supplement 1.1). Parked vehicles are the same at every level.
     Traffic, "traffic", {
-        /// Nothing moves, nobody walks.
+        /// No moving vehicles or pedestrians.
         None = "none",
         /// Free driving.
         Light = "light",
-        /// A usual day.
+        /// Ordinary traffic.
         Medium = "medium",
         /// Short distances, low and uneven speeds.
         Heavy = "heavy",
@@ -149,7 +149,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn names_are_read_as_they_are_written() {
+    fn names_round_trip() {
         for layout in Layout::ALL {
             assert_eq!(layout.to_string().parse::<Layout>().unwrap(), *layout);
         }
@@ -161,7 +161,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_out_of_range_is_refused_in_one_line() {
+    fn settings_out_of_range_are_refused_in_one_line() {
         let wrong = [
             CitySettings { area_km2: 0.0049, ..Default::default() },
             CitySettings { area_km2: 0.005, plain: 0.5, ..Default::default() },

@@ -1,4 +1,4 @@
-//! What stands between curb and front, along the curb, and behind the fronts: lamps, signs, parked vehicles, trees, yards.
+//! Placement of street furniture, parked vehicles, trees and yards on a parcel.
 
 use glam::{DVec2, DVec3};
 
@@ -12,7 +12,7 @@ use crate::random::Random;
 use crate::roads::{Profile, RoadKind};
 use crate::settings::Layout;
 
-/// Cars by how many there are.
+/// Car kinds, repeated by their frequency.
 const CARS: [VehicleKind; 10] = [
     VehicleKind::Hatchback,
     VehicleKind::Hatchback,
@@ -26,13 +26,13 @@ const CARS: [VehicleKind; 10] = [
     VehicleKind::Pickup,
 ];
 
-/// Some car in some colour.
+/// A random car in a random colour.
 pub(crate) fn random_car(random: &mut Random) -> Prop {
     Prop::Vehicle(*random.one_of(&CARS), random.below(PAINTS) as u8)
 }
 
 impl Parcel<'_> {
-    /// Everything but houses.
+    /// Places everything but houses.
     pub(crate) fn furnish(&mut self) {
         self.place_curbside();
         self.park_vehicles();
@@ -44,14 +44,14 @@ impl Parcel<'_> {
         }
     }
 
-    /// A place on the pavement, this far behind the curb.
+    /// Places a prop on the pavement at arc length `s` of a line.
     fn on_pavement(&mut self, line: &Polyline, s: f64, profile: &Profile, prop: Prop) {
         let (p, along) = line.at(s);
         let at = self.terrain.at(p) + DVec3::Z * profile.curb;
         self.place(prop, upright(at, along));
     }
 
-    /// Lamps, signs, trees and the like behind the curb.
+    /// Places lamps, signs and trees behind the curb.
     fn place_curbside(&mut self) {
         let behind = |p: &Profile| p.half + if p.pavement > 2.5 { 0.7 } else { 0.32 };
         for (line, profile) in self.sides(&behind) {
@@ -62,7 +62,7 @@ impl Parcel<'_> {
             }
         }
         if self.layout == Layout::Alley {
-            // lamps stand in the corners of the fronts, out of the way
+            // alley pavements are narrow: lamps stand at the corners of the fronts
             let (ring, turns) = self.roads.ring(&self.walk, &|p| p.front() + 0.2);
             for &turn in turns.iter().step_by(2) {
                 let at = self.ground(ring[turn].at);
@@ -86,7 +86,7 @@ impl Parcel<'_> {
         let mut s = 5.0;
         let mut slot = self.random.below(4);
         while s < length - 5.0 {
-            // room for a bus stop
+            // space for a bus stop
             if profile.pavement > 3.5 && (-5.0..4.0).contains(&(s - 0.5 * length)) {
                 s = 0.5 * length + 5.0;
                 continue;
@@ -121,7 +121,7 @@ impl Parcel<'_> {
         Prop::Tree(*self.random.one_of(kinds) as u8)
     }
 
-    /// Vehicles along the curb, heading as the lane beside them.
+    /// Parks vehicles along the curb, in the driving direction of the adjacent lane.
     fn park_vehicles(&mut self) {
         for (line, profile) in self.sides(&|p| p.half - 1.07) {
             if !profile.parking {
@@ -133,7 +133,7 @@ impl Parcel<'_> {
                 let prop = if self.random.chance(0.06) {
                     Prop::Vehicle(VehicleKind::MotorcycleParked, self.random.below(PAINTS) as u8)
                 } else if matches!(self.layout, Layout::Grid | Layout::Deck) && self.random.chance(0.05) {
-                    // long ones where streets are straight
+                    // long vehicles only on straight streets
                     let kind = *self.random.one_of(&[VehicleKind::Bus, VehicleKind::Truck, VehicleKind::Truck]);
                     Prop::Vehicle(kind, self.random.below(PAINTS) as u8)
                 } else {
@@ -141,7 +141,7 @@ impl Parcel<'_> {
                 };
                 let Prop::Vehicle(kind, _) = prop else { continue };
                 let length = f64::from(kind.size().x);
-                // wide ones stand a little off the curb
+                // wide vehicles stand closer to the lane
                 let aside = (f64::from(kind.size().y) - 1.9).max(0.0) * 0.25;
                 if s + length > line.length - 8.5 {
                     break;
@@ -153,7 +153,7 @@ impl Parcel<'_> {
         }
     }
 
-    /// Puts something behind the fronts if it is clear of houses, of other such things, and of the pavement.
+    /// Places a prop behind the fronts if the point is clear of the pavement and of all footprints.
     fn place_if_free(&mut self, prop: Prop, p: DVec2, along: DVec2, clear: f64, outline: &[DVec2]) -> bool {
         let free = contains(outline, p)
             && outline.iter().all(|q| q.distance(p) > clear)
@@ -170,7 +170,7 @@ impl Parcel<'_> {
         self.roads.ring(&self.walk, &Profile::front).0.iter().map(|p| p.at).collect()
     }
 
-    /// Trees at random, so many to a hectare.
+    /// Scatters trees at random, at a density per hectare.
     fn scatter_trees(&mut self, per_hectare: f64, kinds: &[u8], outline: &[DVec2], clear: f64) {
         let (low, high) = outline.iter().fold((DVec2::MAX, DVec2::MIN), |(a, b), &p| (a.min(p), b.max(p)));
         let tries = ((high - low).element_product() * per_hectare / 1e4) as usize;
@@ -195,7 +195,7 @@ impl Parcel<'_> {
         }
     }
 
-    /// Cars beside villas.
+    /// Parks cars beside villas.
     fn park_in_driveways(&mut self, outline: &[DVec2]) {
         for house in self.footprints.clone() {
             let beside = house.centre + (house.half.x + 1.7) * house.along - 0.3 * house.half.y * house.along.perp();
@@ -214,7 +214,7 @@ impl Parcel<'_> {
         }
     }
 
-    /// A hedge, a fence or a low wall behind the pavement, open where cars come out.
+    /// Places hedges, fences or low walls behind the pavement, with gaps at driveways.
     fn place_garden_fronts(&mut self) {
         for (line, _) in self.sides(&|p| p.front() + 0.45) {
             let prop = match self.random.below(4) {
@@ -254,8 +254,8 @@ impl Parcel<'_> {
         let outline = self.outline();
         let middle = outline.iter().sum::<DVec2>() / outline.len() as f64;
         let along = (outline[outline.len() / 8] - outline[0]).normalize_or(DVec2::X);
-        let room = outline.iter().all(|p| p.distance(middle) > 22.0);
-        if room && matches!(self.layout, Layout::Deck | Layout::Grid) {
+        let fits = outline.iter().all(|p| p.distance(middle) > 22.0);
+        if fits && matches!(self.layout, Layout::Deck | Layout::Grid) {
             let at = self.ground(middle);
             let footprint = Footprint { centre: middle + 8.0 * along.perp(), along, half: DVec2::new(10.5, 11.0) };
             self.place(Prop::Furniture(Piece::Platform), upright(at, along));
@@ -276,14 +276,14 @@ impl Parcel<'_> {
         self.place_if_free(Prop::Furniture(Piece::Column), middle, along, 2.0, &outline);
     }
 
-    /// Rows of cars.
+    /// Places rows of parked cars.
     fn fill_car_park(&mut self) {
         let outline = self.outline();
         let Some((line, _)) = self.sides(&|p| p.front() + 5.0).into_iter().next() else { return };
         let (corner, along) = line.at(0.0);
         let across = along.perp();
         for row in 0..12 {
-            // two rows back to back, then a lane
+            // two rows back to back, then an aisle
             let y = 5.9 * f64::from(row) + 6.0 * f64::from((row + 1) / 2);
             for k in 0..(line.length / 2.7) as usize {
                 let p = corner + along * (2.7 * k as f64 + 2.0) + across * y;

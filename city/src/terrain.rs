@@ -1,7 +1,7 @@
-//! The ground's height as a function of the place: gentle hills, a flat plain in the west, slopes beyond the city.
+//! Terrain height: gentle hills, a flat plain in the west, rising slopes beyond the city.
 //!
-//! Waves are long against the 4 m at which ground meshes are sampled (curvature under 0.0016 / m), so that a mesh stays
-//! within millimetres of the function, and who stands on the function stands on the mesh.
+//! Waves are long against the 4 m at which ground meshes are sampled (curvature under 0.0016 / m). The mesh therefore stays
+//! within millimetres of the function, and actors placed on the function stand on the mesh.
 
 use std::f64::consts::TAU;
 
@@ -10,21 +10,21 @@ use glam::{DVec2, DVec3};
 use crate::random::Random;
 use crate::settings::Layout;
 
-/// One sine wave over the plane.
+/// A plane sine wave.
 #[derive(Debug, Clone, Copy)]
 struct Wave {
-    /// Radians per metre, along the direction in which it runs.
+    /// Wave vector, radians per metre.
     direction: DVec2,
     phase: f64,
     amplitude: f64,
 }
 
-/// The ground.
+/// The terrain of a city.
 #[derive(Debug, Clone)]
 pub(crate) struct Terrain {
     waves: Vec<Wave>,
     half_extent: f64,
-    /// West of this is the plain.
+    /// x of the east edge of the plain.
     plain_edge: f64,
 }
 
@@ -48,17 +48,17 @@ impl Terrain {
         Self { waves, half_extent, plain_edge }
     }
 
-    /// Height of the ground at a place, metres.
+    /// Height of the ground at a point, metres.
     pub(crate) fn height(&self, p: DVec2) -> f64 {
         let hills: f64 = self.waves.iter().map(|w| w.amplitude * (w.direction.dot(p) + w.phase).sin()).sum();
-        // the plain runs out over 150 m
+        // hills grow over 150 m from the plain's edge
         let flat = ((self.plain_edge + 30.0 - p.x) / 150.0).clamp(0.0, 1.0);
         let hills = hills * (1.0 - flat * flat * (3.0 - 2.0 * flat));
         let beyond = (p.abs() - self.half_extent).max(DVec2::ZERO).length();
         hills + 40.0 * beyond * beyond / (beyond * beyond + 1e5)
     }
 
-    /// The place with its height.
+    /// The point on the ground.
     pub(crate) fn at(&self, p: DVec2) -> DVec3 {
         p.extend(self.height(p))
     }

@@ -1,9 +1,9 @@
-//! Who moves: vehicles that go around quarters, walkers that go around blocks.
+//! Moving actors: vehicles that circle quarters, pedestrians that circle blocks.
 //!
-//! Everybody on one route moves alike, only later: distances hold by construction, at corners too. Rounds go clockwise, on the
-//! right, in the lane beside the quarter; quarters do not overlap, so rounds neither share a lane nor cross. Vehicles go
-//! around the quarters of every second row; the lanes beside the other rows are for who drives with sensors
-//! ([`City::streets`]).
+//! All movers on a route follow the same timetable with an offset, so headways hold everywhere, also at corners. Vehicle
+//! routes run clockwise (right-hand traffic) in the lane beside a quarter. Quarters do not overlap, so routes neither share
+//! a lane nor cross. Vehicles circle the quarters of every second row; the lanes beside the other rows stay free for cars
+//! with sensors ([`City::streets`]).
 
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use scene::Rigid;
@@ -22,24 +22,24 @@ use crate::street_furniture::random_car;
 use crate::terrain::Terrain;
 use crate::types::Waypoint;
 
-/// Trajectories last this long.
+/// Duration of trajectories, seconds.
 pub(crate) const SECONDS: f64 = 630.0;
 
-/// Somebody who moves.
+/// A moving prop.
 pub(crate) struct Mover {
     pub(crate) prop: Prop,
     pub(crate) waypoints: Vec<Waypoint>,
-    /// Seconds for a route of the gait; `None` for vehicles.
+    /// Duration of a gait cycle, seconds; `None` for vehicles.
     pub(crate) gait_seconds: Option<f64>,
 }
 
-/// What a level of traffic means.
+/// Parameters of a traffic level.
 struct TrafficLevel {
-    /// Seconds between vehicles of a route.
+    /// Seconds between vehicles on a route.
     headway: f64,
-    /// Metres per second on a straight: from, to.
+    /// Range of speeds on a straight, metres per second.
     speed: [f32; 2],
-    /// Metres of pavement to a walker.
+    /// Metres of pavement per pedestrian.
     walkers: f64,
 }
 
@@ -52,22 +52,22 @@ fn traffic_level(traffic: Traffic) -> Option<TrafficLevel> {
     }
 }
 
-/// Whether vehicles go around a quarter.
+/// Whether generated vehicles circle a quarter.
 fn has_traffic(quarter: &Quarter) -> bool {
     quarter.row.is_multiple_of(2)
 }
 
-/// A closed way with a timetable.
+/// A closed path with a timetable.
 struct Route {
-    /// Places and upright-ness: pose of who is there.
+    /// Pose of a mover at each point.
     poses: Vec<Rigid>,
-    /// Seconds since the start at each, and for the duration route.
+    /// Seconds from the start at each point, and for the whole route.
     times: Vec<f64>,
     duration: f64,
 }
 
 impl Route {
-    /// A timetable for a closed way: no faster than `speed`, slower in bends, with gentle changes.
+    /// Computes a timetable: at most `speed`, with limited lateral and longitudinal acceleration.
     fn new(points: &[DVec3], poses: Vec<Rigid>, speed: f64) -> Self {
         const SIDEWAYS: f64 = 2.2;
         const CHANGE: f64 = 1.4;
@@ -81,7 +81,7 @@ impl Route {
                 (SIDEWAYS * radius).sqrt().clamp(3.0_f64.min(speed), speed)
             })
             .collect();
-        // twice around, so that the ends of the round agree
+        // two laps, so that the speeds at the seam agree
         for k in (0..2 * count).rev() {
             let (here, next) = (k % count, (k + 1) % count);
             speeds[here] = speeds[here].min((speeds[next].powi(2) + 2.0 * CHANGE * step(k)).sqrt());
@@ -98,7 +98,7 @@ impl Route {
         Self { poses, times, duration }
     }
 
-    /// The waypoints of somebody who was at the start `elapsed` seconds ago, from 0 to the end of time.
+    /// The waypoints of a mover that left the start `elapsed` seconds before time 0, until [`SECONDS`].
     fn waypoints(&self, elapsed: f64) -> Vec<Waypoint> {
         let mut k = self.times.partition_point(|&t| t <= elapsed).saturating_sub(1);
         let mut lap = 0.0;
@@ -117,21 +117,21 @@ impl Route {
         }
     }
 
-    /// So many starts around the round, unevenly by a share of their distance.
+    /// Start offsets around the route, jittered by a share of the headway.
     fn start_times(&self, count: usize, uneven: f64, random: &mut Random) -> Vec<f64> {
         let start = |k: usize, jitter: f64| (k as f64 + uneven * jitter) / count as f64 * self.duration;
         (0..count).map(|k| start(k, random.unit().into())).collect()
     }
 }
 
-/// The lane beside a rectangle of lattice lines, clockwise.
+/// The clockwise lane beside a rectangle of lattice lines.
 fn quarter_lane(roads: &Roads, lines: [usize; 4], terrain: &Terrain) -> Vec<DVec3> {
     let mut ring = roads.ring(&roads.walk_around(lines), &|p| p.lane).0;
     ring.reverse();
     thin_points(ring.iter().map(|p| terrain.at(p.at)).collect())
 }
 
-/// Leaves out every second point where a closed way is straight, and points that lie on their neighbours.
+/// Removes every second point on straight stretches of a closed path, and duplicate points.
 fn thin_points(points: Vec<DVec3>) -> Vec<DVec3> {
     let mut kept: Vec<DVec3> = Vec::with_capacity(points.len());
     let mut skipped = false;
@@ -142,7 +142,7 @@ fn thin_points(points: Vec<DVec3>) -> Vec<DVec3> {
             continue;
         };
         let turn = (p - last).truncate().angle_to((next - p).truncate()).abs();
-        // neither a bend nor a step up
+        // neither a bend nor a change of slope
         let even = (p.z - last.z.midpoint(next.z)).abs() < 0.015 + 0.1 * (p.distance(last) - next.distance(p)).abs();
         let straight = turn < 0.01 && even && !skipped && next.distance(last) < 9.0;
         skipped = straight;
@@ -153,13 +153,13 @@ fn thin_points(points: Vec<DVec3>) -> Vec<DVec3> {
     kept
 }
 
-/// Directions along a closed way.
+/// Unit direction of a closed path at a point.
 fn heading(points: &[DVec3], k: usize) -> DVec3 {
     let count = points.len();
     (points[(k + 1) % count] - points[(k + count - 1) % count]).normalize_or(DVec3::X)
 }
 
-/// Poses along a closed way of who leans with the road.
+/// Poses along a closed path that follow the slope of the road.
 fn poses_on_slope(points: &[DVec3]) -> Vec<Rigid> {
     (0..points.len())
         .map(|k| {
@@ -184,19 +184,19 @@ pub(crate) fn vehicles(
     let Some(level) = traffic_level(traffic).filter(|_| has_traffic(quarter)) else { return Vec::new() };
     let points = quarter_lane(roads, quarter.lines, terrain);
     let pace = if matches!(quarter.layout, Layout::Alley | Layout::Winding) { 0.6 } else { 1.0 };
-    // rounds of a compact city are short: light traffic could be none
+    // routes of a compact city are short: light traffic could give no vehicle
     vehicles_on_route(&points, &level, pace, usize::from(roads.is_compact), &mut random)
 }
 
 /// The vehicles on the deck.
 pub(crate) fn deck_vehicles(deck: &Deck, traffic: Traffic, random: &Random) -> Vec<Mover> {
     let Some(level) = traffic_level(traffic) else { return Vec::new() };
-    // ramps bend upwards: all points stay
+    // all points are kept, because ramps are curved vertically
     vehicles_on_route(&deck.route(), &level, 1.0, 0, &mut random.fork(0xDEC4))
 }
 
-/// Vehicles one after another on a round, with a factor on their speed. Buses and lorries do not drive: they would swing into
-/// the other lane at corners.
+/// Vehicles at intervals on a route; `pace` is a factor on their speed. No buses or lorries: they would cut into the other
+/// lane at corners.
 fn vehicles_on_route(
     points: &[DVec3],
     level: &TrafficLevel,
@@ -224,7 +224,7 @@ fn random_vehicle(random: &mut Random) -> Prop {
     Prop::Vehicle(kind, random.below(PAINTS) as u8)
 }
 
-/// The walkers on the pavement of a block.
+/// The pedestrians on the pavement of a block.
 pub(crate) fn walkers(roads: &Roads, terrain: &Terrain, block: usize, traffic: Traffic, random: &Random) -> Vec<Mover> {
     let mut random = random.fork(0x3A1C).fork(block as u64);
     let Some(level) = traffic_level(traffic) else { return Vec::new() };
@@ -244,7 +244,7 @@ pub(crate) fn walkers(roads: &Roads, terrain: &Terrain, block: usize, traffic: T
     movers
 }
 
-/// Walkers one after another around a block.
+/// Pedestrians at intervals on a route around a block.
 fn walkers_on_route(
     roads: &Roads,
     terrain: &Terrain,
@@ -277,8 +277,8 @@ fn walkers_on_route(
         .collect()
 }
 
-/// The lanes that are kept free of traffic: around every row of quarters that has none, around single quarters of it (for
-/// the cross streets), through alleys, and along the deck.
+/// The lanes without generated traffic: around every second row of quarters, around single quarters of it (for the cross
+/// streets), through alleys, along the deck, and around a compact city.
 pub(crate) fn free_lanes(roads: &Roads, terrain: &Terrain, deck: Option<&Deck>) -> Vec<Vec<DVec3>> {
     let rows = roads.cells[1] / roads.fine;
     let close = |mut lane: Vec<DVec3>| {
@@ -307,7 +307,7 @@ pub(crate) fn free_lanes(roads: &Roads, terrain: &Terrain, deck: Option<&Deck>) 
     lanes
 }
 
-/// Every run of alleys along a line, in one direction.
+/// Every run of alleys along a lattice line, in one direction.
 fn alleys(roads: &Roads, terrain: &Terrain) -> Vec<Vec<DVec3>> {
     let mut lanes = Vec::new();
     let mut run: Vec<DVec2> = Vec::new();

@@ -1,11 +1,11 @@
-//! The nouns of a city.
+//! The data model of a city: classes, materials, meshes, actors.
 
 use glam::{DVec3, Vec2, Vec3};
 use scene::Rigid;
 use serde::{Deserialize, Serialize};
 
-/// What a surface is part of. The numbers are those of Cityscapes' evaluation where it has the class (`trainId`),
-/// and go on from 32 where it has not; they are what label images hold.
+/// Semantic class of a surface. The numbers are the `trainId` of Cityscapes, and continue from 32 for classes that
+/// Cityscapes does not have. Label images hold these numbers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 #[repr(u8)]
@@ -14,11 +14,11 @@ pub enum Class {
     Road = 0,
     /// Pavements and their curbs, squares.
     Sidewalk = 1,
-    /// Houses with all that is fixed to them, window glass too.
+    /// Houses and everything fixed to them, including window glass.
     Building = 2,
-    /// Free-standing walls, also those of a ramp.
+    /// Free-standing walls, including those of ramps.
     Wall = 3,
-    /// Fences and railings that are not a road's.
+    /// Fences and railings away from roads.
     Fence = 4,
     /// Posts of lamps, signs and signals.
     Pole = 5,
@@ -30,11 +30,11 @@ pub enum Class {
     Vegetation = 8,
     /// Lawn, gravel, bare ground.
     Terrain = 9,
-    /// Where no ray hits: no mesh has it.
+    /// Pixels whose ray hits nothing; no mesh has this class.
     Sky = 10,
-    /// Who walks or stands.
+    /// Pedestrians.
     Person = 11,
-    /// Who rides a bicycle or a motorcycle.
+    /// Riders of bicycles and motorcycles.
     Rider = 12,
     /// Cars and vans.
     Car = 13,
@@ -42,7 +42,7 @@ pub enum Class {
     Truck = 14,
     /// Buses.
     Bus = 15,
-    /// Rail vehicles: none are generated.
+    /// Rail vehicles; none are generated.
     Train = 16,
     /// Motorcycles.
     Motorcycle = 17,
@@ -52,14 +52,14 @@ pub enum Class {
     RoadMarking = 32,
     /// Barriers along a road.
     GuardRail = 33,
-    /// What carries a deck, and its sides.
+    /// Pillars and sides of a deck.
     Bridge = 34,
     /// Benches, bins, shelters, bollards, hydrants.
     StreetFurniture = 35,
 }
 
 impl Class {
-    /// All of them, in the order of their numbers.
+    /// All classes, in the order of their numbers.
     pub const ALL: [Self; 23] = [
         Self::Road,
         Self::Sidewalk,
@@ -87,14 +87,13 @@ impl Class {
     ];
 }
 
-/// How a material's colour varies over a surface. Patterns are functions of the surface's own coordinates (`uv`, metres),
-/// so that they stay with it, and are filtered to the footprint of a pixel: no detail finer than it is drawn.
+/// Procedural texture of a material: a function of the surface's uv (metres), filtered over the footprint of a pixel.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case", tag = "kind")]
 pub enum Pattern {
-    /// One colour: what stereo and structure from motion find nothing on.
+    /// One colour: textureless for stereo and structure from motion.
     Plain,
-    /// Speckle and stains over octaves of noise from `finest_metres` to `coarsest_metres`, `amount` 0 to 1.
+    /// Fractal noise: speckle and stains.
     Noise {
         /// Wavelength of the finest octave, metres.
         finest_metres: f32,
@@ -103,7 +102,7 @@ pub enum Pattern {
         /// Share by which the colour changes, 0 to 1.
         amount: f32,
     },
-    /// Courses of bricks or tiles of this size with joints of another shade, half a brick offset where `bond`.
+    /// Courses of bricks or tiles with joints.
     Bricks {
         /// Length along u and height along v of a brick with its joint, metres.
         size_metres: Vec2,
@@ -125,8 +124,8 @@ pub enum Pattern {
         /// Share by which the colour of one panel differs from the next, 0 to 1.
         amount: f32,
     },
-    /// Text in a dot-matrix font, in `ink` on the base colour: the row of [`City::texts`]; the surface's uv run from 0 to 1,
-    /// u with the writing and v upwards.
+    /// Text in a dot-matrix font, in `ink` on the base colour. The surface's uv run from 0 to 1, u in reading direction, v
+    /// upwards.
     Text {
         /// Row of [`City::texts`].
         row: u32,
@@ -135,10 +134,10 @@ pub enum Pattern {
     },
 }
 
-/// What a surface is made of. Colours are linear RGB, 0 to 1; roughness and metallic as in glTF.
+/// A surface material. Colours are linear RGB, 0 to 1; roughness and metallic as in glTF.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Material {
-    /// For people and files: "asphalt", "brick, red" ...
+    /// Readable name: "asphalt", "brick, red" ...
     pub name: String,
     /// Linear RGB, 0 to 1.
     pub base_colour: Vec3,
@@ -146,91 +145,90 @@ pub struct Material {
     pub roughness: f32,
     /// glTF's metallic, 0 to 1.
     pub metallic: f32,
-    /// Share of light that goes straight through: 0 for all but glass.
+    /// Transmitted share of light; 0 for all but glass.
     pub transparency: f32,
-    /// Share of a lidar's pulse that comes back from a surface it hits squarely (905 nm), 0 to 1.
+    /// Reflectivity for a lidar pulse at normal incidence (905 nm), 0 to 1.
     pub lidar_reflectivity: f32,
     /// How the base colour varies.
     pub pattern: Pattern,
 }
 
-/// Triangles in the frame of an asset: metres, counter-clockwise seen from outside. A surface that is seen from both sides
-/// (a leaf, a pane) has one triangle; whoever traces turns its normal to the ray.
+/// Triangles in the frame of an asset: metres, counter-clockwise seen from outside. Two-sided surfaces (leaves, panes) have
+/// one triangle; the ray tracer flips its normal towards the ray.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Mesh {
     /// Corners.
     pub positions: Vec<Vec3>,
-    /// Metres along the surface, one for each corner (0 to 1 on a [`Pattern::Text`]).
+    /// Texture coordinates per corner, metres (0 to 1 on a [`Pattern::Text`]).
     pub uvs: Vec<Vec2>,
-    /// Corners of each triangle.
+    /// Corner indices of each triangle.
     pub triangles: Vec<[u32; 3]>,
-    /// Row of [`City::materials`], one for each triangle.
+    /// Row of [`City::materials`] per triangle.
     pub materials: Vec<u16>,
-    /// Class, one for each triangle.
+    /// Class per triangle.
     pub classes: Vec<Class>,
 }
 
-/// A mesh that actors share.
+/// A mesh shared by actors.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Asset {
-    /// For people and files: "house 17", "car, estate" ...
+    /// Readable name: "house 17", "car, estate" ...
     pub name: String,
     /// Its triangles.
     pub mesh: Mesh,
 }
 
-/// Where something is at a moment.
+/// A pose at a time.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Waypoint {
-    /// Seconds since the city's beginning.
+    /// City time, seconds.
     pub seconds: f64,
-    /// The pose then.
+    /// The pose at that time.
     pub world_from_asset: Rigid,
 }
 
-/// A motion: poses at growing moments, interpolated (translation straight, rotation by slerp), held before the first
+/// A motion: poses at increasing times, interpolated (translation linearly, rotation by slerp), constant before the first
 /// and after the last.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Trajectory {
     /// In order of time.
     pub waypoints: Vec<Waypoint>,
-    /// Assets in turn, for what changes its shape as it moves: a walker's, one for each part of its gait. Empty: always the
-    /// actor's.
+    /// Assets of the phases of a pedestrian's gait. Empty: the actor's own asset at all times.
     pub gait: Vec<u32>,
-    /// Seconds for one round of `gait`.
+    /// Duration of one cycle of `gait`, seconds.
     pub gait_seconds: f64,
 }
 
-/// Something that stands, lies or moves in the city.
+/// An asset placed in the city, static or moving.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Actor {
     /// Row of [`City::assets`].
     pub asset: u32,
-    /// What it is as a whole: the class of its boxes.
+    /// Class of the actor as a whole, and of its bounding box.
     pub class: Class,
-    /// Instance, from 1, for what is counted (houses, vehicles, people, trees, poles, signs); 0 for ground and
-    /// for what comes in pieces: hedges, fences, walls.
+    /// Instance number from 1, unique per city, for countable things (houses, vehicles, people, trees, poles, signs); 0 for
+    /// ground, hedges, fences and walls.
     pub instance: u32,
-    /// Its pose where it has no trajectory.
+    /// The pose of an actor without trajectory.
     pub world_from_asset: Rigid,
-    /// How it moves, if it does.
+    /// The motion of a moving actor.
     pub trajectory: Option<Trajectory>,
 }
 
-/// A city: what stands where and what it is made of.
+/// A generated city.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct City {
-    /// Side of the square that is built on, metres.
+    /// Side of the square city, metres.
     pub extent_metres: f64,
-    /// What meshes' triangles are made of.
+    /// Materials of the meshes' triangles.
     pub materials: Vec<Material>,
-    /// What signs say.
+    /// Texts of signs.
     pub texts: Vec<String>,
-    /// The meshes that actors share.
+    /// Meshes shared by actors.
     pub assets: Vec<Asset>,
-    /// What stands, lies or moves in the city.
+    /// Everything in the city, static and moving.
     pub actors: Vec<Actor>,
-    /// Lanes for whoever drives with sensors: polylines on the road's surface in driving direction (on the right of the
-    /// street), world metres. Generated traffic keeps off these lanes.
+    /// Lanes for cars with sensors: polylines on the road surface in driving direction (right-hand traffic), world metres.
+    /// Generated traffic does not use these lanes.
     pub streets: Vec<Vec<DVec3>>,
 }

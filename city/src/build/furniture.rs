@@ -1,6 +1,6 @@
-//! What stands along streets: lamps, signs, signals, benches, bins, bollards, shelters, fences, platforms.
+//! Meshes of street furniture: lamps, signs, signals, benches, bins, bollards, shelters, fences, platforms.
 //!
-//! Each stands on the plane of its origin; x runs along the curb in walking direction of the block, the road is at -y.
+//! The origin is on the ground. x runs along the curb with the block on the left, the road is at -y.
 
 use glam::{Vec2, Vec3};
 
@@ -15,9 +15,9 @@ pub(crate) enum Piece {
     Lamp,
     OldLamp,
     Signal,
-    /// A traffic sign: the row of [`m::order`].
+    /// A traffic sign: the index of [`m::traffic_sign`].
     Sign(u8),
-    /// A plate with a street's name: its number.
+    /// A plate with a street name, by number.
     StreetName(u8),
     /// A give-way triangle.
     Yield,
@@ -29,7 +29,7 @@ pub(crate) enum Piece {
     Column,
     Fence,
     Wall,
-    /// A walkers' platform on pillars.
+    /// A pedestrian platform on pillars.
     Platform,
 }
 
@@ -46,7 +46,7 @@ impl Piece {
         }
     }
 
-    /// Builds it.
+    /// Builds the asset.
     pub(crate) fn build(self, mut random: Random) -> Asset {
         let mut b = Builder::new(self.class());
         match self {
@@ -74,7 +74,7 @@ fn post(b: &mut Builder, at: Vec2, height: f32, radius: f32) {
     b.class(Class::Pole).paint(m::STEEL).tube(at.extend(-0.2), at.extend(height), [radius, 0.8 * radius], 8);
 }
 
-/// An arm over the road.
+/// A street lamp with an arm over the road.
 fn lamp(b: &mut Builder) {
     post(b, Vec2::ZERO, 7.2, 0.09);
     b.tube(Vec3::new(0.0, 0.0, 7.1), Vec3::new(0.0, -1.7, 7.5), [0.05, 0.04], 6);
@@ -92,7 +92,7 @@ fn old_lamp(b: &mut Builder) {
 
 fn signal(b: &mut Builder) {
     post(b, Vec2::ZERO, 3.2, 0.06);
-    // it looks at who comes along x, in the lane beside the block
+    // faces +x, towards oncoming traffic in the lane beside the block
     b.class(Class::TrafficLight).paint(m::TRIM).cuboid(Vec3::new(0.07, -0.17, 2.25), Vec3::new(0.3, 0.17, 3.3));
     for (surface, z) in [(m::LAMP_RED, 3.1), (m::LAMP_AMBER, 2.78), (m::LAMP_GREEN, 2.46)] {
         b.paint(surface).tube(Vec3::new(0.3, 0.0, z), Vec3::new(0.33, 0.0, z), [0.11; 2], 10);
@@ -100,7 +100,7 @@ fn signal(b: &mut Builder) {
     }
 }
 
-/// A disc or board that looks along +x.
+/// A board that faces +x.
 fn board(b: &mut Builder, surface: Surface, [y0, y1]: [f32; 2], [z0, z1]: [f32; 2], x: f32) {
     let p = |x: f32, y: f32, z: f32| Vec3::new(x, y, z);
     b.class(Class::TrafficSign).paint(surface);
@@ -194,7 +194,7 @@ fn shelter(b: &mut Builder, random: &mut Random) {
     b.plate([p(1.895, 0.4, 0.5), p(1.895, -0.15, 0.5), p(1.895, -0.15, 2.0), p(1.895, 0.4, 2.0)]);
 }
 
-/// A column for advertisements, of eight sides.
+/// An advertising column with eight sides.
 fn column(b: &mut Builder, random: &mut Random) {
     const FLAT: f32 = 0.37;
     let half = FLAT * (std::f32::consts::PI / 8.0).tan();
@@ -223,7 +223,7 @@ fn fence(b: &mut Builder) {
     }
 }
 
-/// A raised walkway of 20 m × 12 m with railings, pillars and a stair.
+/// A raised platform of 20 m × 12 m with railings, pillars and stairs.
 fn platform(b: &mut Builder) {
     let (low, high, z) = (Vec2::new(-10.0, 0.0), Vec2::new(10.0, 12.0), 4.2);
     b.class(Class::Bridge).paint(m::CONCRETE).cuboid(low.extend(z - 0.5), high.extend(z));
@@ -236,7 +236,7 @@ fn platform(b: &mut Builder) {
             b.tube(Vec3::new(x, y, -2.0), Vec3::new(x, y, z - 0.5), [0.3; 2], 12);
         }
     }
-    // the stair comes up at the right end of the back
+    // the stairs arrive at the right end of the back edge
     let corners = [low, Vec2::new(high.x, low.y), high, Vec2::new(8.0, high.y), Vec2::new(low.x, high.y)];
     for (from, to) in [(0, 1), (1, 2), (3, 4), (4, 0)] {
         railing(b, corners[from].extend(z), corners[to].extend(z));
@@ -250,7 +250,7 @@ fn platform(b: &mut Builder) {
     }
 }
 
-/// Posts, two tubes and a rail from one point to another.
+/// A railing with posts and three tubes between two points.
 pub(crate) fn railing(b: &mut Builder, from: Vec3, to: Vec3) {
     b.class(Class::GuardRail).paint(m::STEEL);
     let count = ((to - from).length() / 2.0).ceil().max(1.0) as usize;

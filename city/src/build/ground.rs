@@ -1,6 +1,6 @@
-//! Ground meshes: carriageways, crossings, curbs, pavements, what lies between roads, and the country around.
+//! Ground meshes: carriageways, crossings, curbs, pavements, block interiors and the countryside.
 //!
-//! Neighbouring pieces share their corners (the same points of the same rings), so that there are no cracks.
+//! Adjacent pieces use the same points of the same rings as corners, so that there are no cracks.
 
 use glam::{DVec2, DVec3, Vec2, Vec3};
 
@@ -15,16 +15,16 @@ use crate::types::{Asset, Class};
 pub(crate) const PAINT_HEIGHT: f64 = 0.005;
 /// Width of a curb stone.
 const CURB_STONE: f64 = 0.15;
-/// How far the country goes beyond the city.
+/// Width of the countryside around the city, metres.
 const COUNTRYSIDE_METRES: f64 = 420.0;
 
-/// A ground mesh and where its frame's origin is.
+/// A ground mesh and the world position of its frame's origin.
 pub(crate) struct Piece {
     pub(crate) asset: Asset,
     pub(crate) origin: DVec3,
 }
 
-/// Lays ground in a frame that stands at `origin`.
+/// Builds ground in a frame at `origin`.
 pub(crate) struct GroundBuilder<'a> {
     pub(crate) builder: Builder,
     pub(crate) terrain: &'a Terrain,
@@ -40,18 +40,18 @@ impl<'a> GroundBuilder<'a> {
         Piece { asset: self.builder.finish(name), origin: self.origin }
     }
 
-    /// A place of the world in the frame, so far above the ground.
+    /// A world point at a height above the ground, in the frame.
     pub(crate) fn local(&self, p: DVec2, above: f64) -> Vec3 {
         (self.terrain.at(p) + DVec3::Z * above - self.origin).as_vec3()
     }
 
-    /// A shared corner with the world's x and y as its uv.
+    /// Adds a shared corner with world x and y as uv.
     fn corner(&mut self, p: DVec2, above: f64) -> u32 {
         let at = self.local(p, above);
         self.builder.corner(at, p.as_vec2())
     }
 
-    /// A grid of corners (`rows[k][c]`), its faces up where c grows to the left of growing k.
+    /// Faces of a grid of corners (`rows[k][c]`); they face up if c increases to the left of increasing k.
     fn grid_faces(&mut self, rows: &[Vec<u32>], mut paint: impl FnMut(&mut Builder, usize, usize)) {
         for (k, pair) in rows.windows(2).enumerate() {
             for c in 0..pair[0].len().min(pair[1].len()).saturating_sub(1) {
@@ -64,7 +64,7 @@ impl<'a> GroundBuilder<'a> {
     }
 }
 
-/// A crossing with the roads that go out of it to the east and north.
+/// A crossing with its eastern and northern arms.
 pub(crate) fn crossing(roads: &Roads, terrain: &Terrain, node: usize, random: &Random) -> Option<Piece> {
     let arms: Vec<(usize, Profile)> = (0..4).filter_map(|arm| Some((arm, roads.arm_end(node, arm)?.2))).collect();
     if arms.is_empty() {
@@ -83,7 +83,7 @@ pub(crate) fn crossing(roads: &Roads, terrain: &Terrain, node: usize, random: &R
     Some(layer.finish(format!("road {node}")))
 }
 
-/// Whether streets meet in a node: where only alleys join, a street goes on.
+/// Whether more than two roads other than alleys meet at a node.
 fn is_crossing(roads: &Roads, node: usize) -> bool {
     let street = |arm| roads.arm_end(node, arm).is_some_and(|m| m.2.kind != RoadKind::Alley);
     (0..4).filter(|&arm| street(arm)).count() > 2
@@ -94,7 +94,7 @@ fn strips(profile: &Profile) -> usize {
     (2.0 * profile.half / 3.5).ceil() as usize
 }
 
-/// Where a cross-section's corners are, from the right to the left.
+/// Offsets of the corners of a cross-section, from right to left.
 fn cross_section(profile: &Profile) -> impl Iterator<Item = f64> + use<> {
     let (half, count) = (profile.half, strips(profile));
     (0..=count).map(move |c| half * (2.0 * c as f64 / count as f64 - 1.0))
@@ -109,7 +109,7 @@ fn junction(layer: &mut GroundBuilder, roads: &Roads, node: usize, arms: &[(usiz
         let corner: Vec<DVec2> = roads.corner(node, next, arm, &|p| p.half).collect();
         rim.extend(corner.into_iter().rev());
     }
-    // every point of the rim is seen from where the centre lines meet
+    // the rim is star-shaped around the node
     let middle = roads.nodes[node];
     let paved = if arms.iter().all(|a| a.1.kind == RoadKind::Alley) { m::COBBLES } else { m::ASPHALT };
     layer.builder.class(Class::Road).paint(paved);
@@ -195,7 +195,7 @@ fn markings(layer: &mut GroundBuilder, line: &Polyline, profile: &Profile, cross
     for side in [-1.0, 1.0] {
         solid(layer, side * (half - 2.15), start, end);
     }
-    // zebra crossings and stop lines at both ends; those who come in keep right
+    // zebra crossings and stop lines at both ends, the stop lines in the incoming lane
     let bars = ((2.0 * half - 0.6) / 1.0) as usize;
     let ends = [[1.0, 5.2, -1.0], [length - 4.0, length - 5.6, 1.0]];
     for ([zebra, stop, way], _) in ends.into_iter().zip(crossed).filter(|end| end.1) {
@@ -209,7 +209,7 @@ fn markings(layer: &mut GroundBuilder, line: &Polyline, profile: &Profile, cross
 }
 
 impl GroundBuilder<'_> {
-    /// A stripe on a road between two distances along its line and two beside it (left positive).
+    /// A stripe on a road between two arc lengths and two offsets (left positive).
     pub(crate) fn stripe(&mut self, line: &Polyline, [from, to]: [f64; 2], sides: [f64; 2], above: f64) {
         let count = ((to - from) / 2.0).ceil().max(1.0) as usize;
         let rows: Vec<Vec<u32>> = (0..=count)
@@ -222,7 +222,7 @@ impl GroundBuilder<'_> {
     }
 }
 
-/// A polyline by the distance along it.
+/// A polyline parametrised by arc length.
 pub(crate) struct Polyline {
     points: Vec<(DVec2, DVec2)>,
     along: Vec<f64>,
@@ -239,7 +239,7 @@ impl Polyline {
         Self { points: points.to_vec(), along, length }
     }
 
-    /// A polyline with its directions still to be found.
+    /// A polyline with directions from its points.
     pub(crate) fn through(points: &[DVec2]) -> Self {
         let direction = |k: usize| {
             let (a, b) = (points[k.saturating_sub(1)], points[(k + 1).min(points.len() - 1)]);
@@ -248,7 +248,7 @@ impl Polyline {
         Self::new(&(0..points.len()).map(|k| (points[k], direction(k))).collect::<Vec<_>>())
     }
 
-    /// Place and unit direction at a distance.
+    /// Point and unit direction at an arc length.
     pub(crate) fn at(&self, s: f64) -> (DVec2, DVec2) {
         if self.points.len() < 2 {
             return self.points.first().copied().unwrap_or((DVec2::ZERO, DVec2::X));
@@ -260,16 +260,16 @@ impl Polyline {
     }
 }
 
-/// How the inside of a block is covered.
+/// Ground cover of a block.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Cover {
-    /// Most of it.
+    /// Cover of the interior.
     pub(crate) ground: (Surface, Class),
-    /// The metres next to the pavement.
+    /// Cover next to the pavement.
     pub(crate) rim: (Surface, Class),
 }
 
-/// A block's pavement and inside.
+/// Pavement and interior of a block.
 pub(crate) fn block_ground(roads: &Roads, terrain: &Terrain, walk: &[Step], cover: Cover, name: String) -> Piece {
     let rings = Rings::new(roads, walk);
     let count = rings.front.len();
@@ -280,7 +280,7 @@ pub(crate) fn block_ground(roads: &Roads, terrain: &Terrain, walk: &[Step], cove
     layer.finish(name)
 }
 
-/// The lines of a pavement: foot of the curb, back of the curb stone, fronts.
+/// The rings of a pavement: foot of the curb, back of the curb stone, front line.
 struct Rings {
     foot: Vec<RingPoint>,
     stone: Vec<RingPoint>,
@@ -296,7 +296,7 @@ impl Rings {
         Self { foot, stone, front, turns }
     }
 
-    /// Curb and slabs between two points of the ring.
+    /// Builds curb and slabs between two points of the ring.
     fn pavement(&self, layer: &mut GroundBuilder, from: usize, to: usize) {
         let count = self.foot.len();
         let row = |layer: &mut GroundBuilder, ring: &[RingPoint], high: bool| -> Vec<u32> {
@@ -320,7 +320,7 @@ impl Rings {
     }
 }
 
-/// The ground behind the fronts: a Coons patch between the four sides.
+/// The ground behind the fronts, a Coons patch of the four sides.
 fn block_interior(layer: &mut GroundBuilder, rings: &Rings, cover: Cover) {
     let Ok(turns) = <[usize; 4]>::try_from(rings.turns.clone()) else { return };
     let count = rings.front.len();
@@ -353,7 +353,7 @@ fn block_interior(layer: &mut GroundBuilder, rings: &Rings, cover: Cover) {
     });
 }
 
-/// The pavement around the city and the country beyond it, in pieces.
+/// The outer pavement of the city and the countryside, in pieces.
 pub(crate) fn countryside(roads: &Roads, terrain: &Terrain, half: f64, west_gap: f64) -> Vec<Piece> {
     const PIECE: usize = 24;
     let walk = roads.walk_outside();
@@ -385,11 +385,11 @@ pub(crate) fn countryside(roads: &Roads, terrain: &Terrain, half: f64, west_gap:
         .collect()
 }
 
-/// Where the country ends, for each point of the outer ring: on a square.
+/// The outer rim of the countryside, a square, for each point of the outer ring.
 fn countryside_rim(rings: &Rings, half: f64) -> Vec<DVec2> {
     let count = rings.front.len();
     let far = half + COUNTRYSIDE_METRES;
-    // the walk with the country on the left: turns at the corners of the square in this order
+    // the turns of the walk correspond to the corners of the square
     let mut targets = vec![DVec2::ZERO; count];
     for k in 0..rings.turns.len() {
         let (from, mut to) = (rings.turns[k], rings.turns[(k + 1) % rings.turns.len()]);
@@ -400,7 +400,7 @@ fn countryside_rim(rings: &Rings, half: f64) -> Vec<DVec2> {
         let [a, b] = [from, to].map(|i| corner(rings.front[i % count].at - rings.centre()));
         for i in from..to {
             let p = rings.front[i % count].at;
-            // straight out, but for a fan at each corner: so lines to the horizon do not cross a bending side
+            // straight outwards, with a fan at each corner, so that the lines do not cross a curved side
             let out = if a.x == b.x { DVec2::new(a.x, p.y) } else { DVec2::new(p.x, a.y) };
             let (near, steps) = if i - from <= to - i { (a, i - from) } else { (b, to - i) };
             targets[i % count] = out.lerp(near, (1.0 - steps as f64 / (CORNER_POINTS + 2) as f64).max(0.0));
@@ -415,14 +415,14 @@ impl Rings {
     }
 }
 
-/// Shares of the way to the horizon at which the country has corners: close together near the city, and across a plain.
+/// Relative distances from city to rim at which the countryside has corners: denser near the city and across a plain.
 fn radial_shares(west_gap: f64) -> Vec<f64> {
     let count = 14 + ((west_gap / 40.0) as usize).min(60);
     let power = if west_gap > 0.0 { 1.3 } else { 2.0 };
     (0..=count).map(|k| (k as f64 / count as f64).powf(power)).collect()
 }
 
-/// The uv of a place, for those who lay their own.
+/// The uv of a ground point.
 pub(crate) fn uv(p: DVec2) -> Vec2 {
     p.as_vec2()
 }

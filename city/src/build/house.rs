@@ -1,7 +1,7 @@
-//! Houses: walls with windows that are real recesses, doors, shops, balconies and roofs.
+//! House meshes: walls with recessed windows, doors, shops, balconies and roofs.
 //!
-//! A house stands behind its front: x along the street from `-width / 2`, y inwards from 0, z up from the pavement. Its plinth
-//! goes down four metres, for streets that climb.
+//! x runs along the street from `-width / 2`, y inwards from the front at 0, z up from the pavement. The plinth goes down
+//! four metres, for sloping streets.
 
 use glam::{Affine3A, Vec2, Vec3};
 
@@ -10,7 +10,7 @@ use crate::materials::{self as m, Surface};
 use crate::random::Random;
 use crate::types::{Asset, Class};
 
-/// Kinds of houses, by where they stand.
+/// Kinds of houses.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) enum HouseKind {
     /// Three to six floors in a row.
@@ -25,10 +25,10 @@ pub(crate) enum HouseKind {
     Tower,
 }
 
-/// The widths that houses have, metres.
+/// Widths of houses, metres.
 pub(crate) const WIDTHS: [f32; 7] = [6.0, 7.5, 9.0, 10.5, 12.0, 14.0, 17.0];
 
-/// How far a plinth goes down, metres.
+/// Depth of the plinth below the pavement, metres.
 pub(crate) const PLINTH: f32 = 4.0;
 
 impl HouseKind {
@@ -44,7 +44,7 @@ impl HouseKind {
     }
 }
 
-/// How a house looks.
+/// The architectural style of a house.
 struct Style {
     kind: HouseKind,
     wall: Surface,
@@ -110,7 +110,7 @@ impl Style {
         }
     }
 
-    /// Height of the floor of a storey.
+    /// Height of a floor.
     fn level(&self, floor: usize) -> f32 {
         if floor == 0 { 0.0 } else { self.ground_storey + (floor - 1) as f32 * self.storey }
     }
@@ -147,12 +147,12 @@ enum Wall {
     Back,
 }
 
-/// A wall in its own frame: x from 0 to `length`, facing -y.
+/// A facade in its own frame: x from 0 to `length`, facing -y.
 fn facade(b: &mut Builder, style: &mut Style, length: f32, wall: Wall) {
     b.paint(m::PLINTH).panel([0.0, length], [-PLINTH, 0.0], 0.0);
     let bays = ((length / style.bay) as usize).max(1);
     let bay = length / bays as f32;
-    // party walls are blank but for some houses' at corners and gaps
+    // party walls are blank; some have windows, for houses at corners and gaps
     let open = match wall {
         Wall::Front | Wall::Back => true,
         Wall::Side => style.kind == HouseKind::Villa || style.kind == HouseKind::Tower || style.random.chance(0.3),
@@ -185,7 +185,7 @@ fn facade(b: &mut Builder, style: &mut Style, length: f32, wall: Wall) {
     b.paint(style.wall).panel([0.0, length], [style.level(style.floors), style.eaves()], 0.0);
 }
 
-/// A bay of wall with an opening in it.
+/// A bay of wall around an opening.
 fn around(b: &mut Builder, wall: Surface, [x0, x1]: [f32; 2], [z0, z1]: [f32; 2], low: Vec2, high: Vec2) {
     b.paint(wall);
     b.panel([x0, low.x], [z0, z1], 0.0);
@@ -203,7 +203,7 @@ fn recess(b: &mut Builder, low: Vec2, high: Vec2, [y0, y1]: [f32; 2]) {
     b.quad([p(low.x, y1, high.y), p(high.x, y1, high.y), p(high.x, y0, high.y), p(low.x, y0, high.y)]);
 }
 
-/// A framed pane `inset` behind the wall, and a back plane behind the pane.
+/// A framed pane set back from the wall, and a back plane `room` metres behind it.
 fn pane(b: &mut Builder, style: &mut Style, low: Vec2, high: Vec2, bars: [usize; 2], behind: Surface, room: f32) {
     const FRAME: f32 = 0.06;
     let inset = if style.kind == HouseKind::Tower { 0.05 } else { style.random.range(0.08, 0.15) };
@@ -258,7 +258,7 @@ fn doorway(b: &mut Builder, style: &mut Style, across: [f32; 2], heights: [f32; 
     b.paint(m::RIM).cuboid(Vec3::new(high.x - 0.14, 0.14, low.y + 1.0), Vec3::new(high.x - 0.1, 0.2, low.y + 1.12));
 }
 
-/// A ground floor of glass with a door in it and a name above.
+/// A shop front with a door and a name plate.
 fn shop(b: &mut Builder, style: &mut Style, length: f32, height: f32, bays: usize, door: usize) {
     let bay = length / bays as f32;
     for k in 0..bays {
@@ -317,7 +317,7 @@ fn roof(b: &mut Builder, style: &mut Style, width: f32, depth: f32) {
     }
 }
 
-/// Two slopes, the ridge along the street.
+/// A gable roof with its ridge along the street.
 fn gable(b: &mut Builder, style: &mut Style, tiles: Surface, width: f32, depth: f32) {
     let (half, eaves) = (0.5 * width, style.eaves());
     let rise = style.random.range(0.33, 0.5) * depth;
@@ -357,7 +357,7 @@ fn chimney(b: &mut Builder, style: &mut Style, half: f32, y: f32, ridge: f32) {
     }
 }
 
-/// Four slopes.
+/// A hip roof.
 fn hip(b: &mut Builder, style: &mut Style, tiles: Surface, width: f32, depth: f32) {
     let (over, eaves) = (0.45, style.eaves());
     let (half, rise) = (0.5 * width, 0.4 * depth.min(width));
@@ -373,7 +373,7 @@ fn hip(b: &mut Builder, style: &mut Style, tiles: Surface, width: f32, depth: f3
     chimney(b, style, 0.5 * half + 0.6, 0.5 * depth, eaves + 0.8 * rise);
 }
 
-/// A steep slope with dormers, flat on top.
+/// A mansard roof: steep with dormers, flat on top.
 fn mansard(b: &mut Builder, style: &mut Style, width: f32, depth: f32) {
     let (half, eaves, rise) = (0.5 * width, style.eaves(), 2.9);
     b.paint(m::STONE).cuboid(Vec3::new(-half, -0.25, eaves - 0.25), Vec3::new(half, 0.0, eaves));
@@ -399,7 +399,7 @@ fn mansard(b: &mut Builder, style: &mut Style, width: f32, depth: f32) {
     chimney(b, style, half, depth - 1.6, eaves + rise);
 }
 
-/// A parapet around a flat roof with what stands on it.
+/// A flat roof with parapet, equipment, stair hut and mast.
 fn flat(b: &mut Builder, style: &mut Style, width: f32, depth: f32) {
     let (half, eaves, thick) = (0.5 * width, style.eaves(), 0.25);
     let top = eaves + style.random.range(0.4, 1.0);

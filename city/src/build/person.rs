@@ -1,7 +1,7 @@
-//! People as jointed bodies: walking in sixteen phases of their gait, and riding.
+//! Meshes of people as articulated bodies: walking, in sixteen gait phases, and riding.
 //!
-//! x is ahead, y to the left, z up; the lower foot stands in the plane of the origin. Angles of hip, knee, shoulder and elbow
-//! follow sines that resemble measured gait (Winter, "Biomechanics and Motor Control of Human Movement", chapter 3): hips
+//! x is forward, y left, z up; the lower foot stands at z = 0. Angles of hip, knee, shoulder and elbow
+//! are sines that approximate measured gait (Winter, "Biomechanics and Motor Control of Human Movement", chapter 3): hips
 //! swing about ±25°, a knee bends to 60° while its leg swings, arms go against the legs.
 
 use std::f32::consts::TAU;
@@ -12,14 +12,14 @@ use super::Builder;
 use crate::materials::{self as m, Surface};
 use crate::types::{Asset, Class};
 
-/// Phases of a gait.
+/// Phases of a gait cycle.
 pub(crate) const PHASES: usize = 16;
-/// Number of different people.
+/// Number of body builds.
 pub(crate) const BUILDS: usize = 8;
-/// Length of a double step of somebody 1.75 m tall, metres.
+/// Stride (two steps) of a person 1.75 m tall, metres.
 pub(crate) const STRIDE: f64 = 1.4;
 
-/// What somebody looks like.
+/// Build and clothing of a person.
 struct Appearance {
     height: f32,
     girth: f32,
@@ -54,12 +54,12 @@ const APPEARANCES: [Appearance; BUILDS] = [
     appearance(1.80, 1.05, m::CLOTH_BLACK, m::CLOTH_GREY, m::SKIN_LIGHT, [false, false, true]),
 ];
 
-/// Height of a build relative to the average: its stride too.
+/// Height of a build relative to the average; its stride scales alike.
 pub(crate) fn scale(build: usize) -> f64 {
     f64::from(APPEARANCES[build % BUILDS].height) / 1.75
 }
 
-/// Angles of the limbs, radians, positive ahead.
+/// Joint angles, radians, positive forward.
 #[derive(Clone, Copy)]
 struct Pose {
     hips: [f32; 2],
@@ -72,7 +72,7 @@ struct Pose {
 fn gait(phase: usize) -> Pose {
     let turn = |side: f32| TAU * (phase as f32 / PHASES as f32) + side * TAU / 2.0;
     let hip = |t: f32| 0.07 + 0.42 * t.sin();
-    // a knee bends most while its thigh comes forward
+    // the knee bends most while the thigh swings forward
     let knee = |t: f32| 0.12 + 0.9 * (t.cos().max(0.0)).powi(2);
     let shoulder = |t: f32| -0.4 * t.sin();
     let elbow = |t: f32| 0.35 - 0.2 * t.sin();
@@ -86,7 +86,7 @@ fn gait(phase: usize) -> Pose {
     }
 }
 
-/// Somebody in a phase of walking.
+/// A pedestrian in a gait phase.
 pub(crate) fn walker(build: usize, phase: usize) -> Asset {
     let appearance = &APPEARANCES[build % BUILDS];
     let mut b = Builder::new(Class::Person);
@@ -96,7 +96,7 @@ pub(crate) fn walker(build: usize, phase: usize) -> Asset {
     b.finish(format!("person {build}, phase {phase}"))
 }
 
-/// Somebody who rides: hips at the origin.
+/// A rider with the hips at the origin.
 pub(crate) fn rider(b: &mut Builder, build: usize, pedals: bool) {
     let appearance = &APPEARANCES[build % BUILDS];
     let spread = if pedals { 0.35 } else { 0.0 };
@@ -129,7 +129,7 @@ fn body(b: &mut Builder, appearance: &Appearance, pose: Pose) {
             [0.034 * h, 0.024 * h],
             7,
         );
-        // a foot stays near the horizontal while it is loaded
+        // the loaded foot stays nearly horizontal
         let pitch = (0.6 * foot).min(0.2);
         b.within(Affine3A::from_translation(ankle) * Affine3A::from_rotation_y(-pitch), |b| {
             let (low, high) = (Vec3::new(-0.045, -0.024, -0.035), Vec3::new(0.105, 0.024, 0.012));
@@ -139,7 +139,7 @@ fn body(b: &mut Builder, appearance: &Appearance, pose: Pose) {
     b.within(Affine3A::from_translation(hip) * Affine3A::from_rotation_y(pose.lean), |b| torso(b, appearance, pose));
 }
 
-/// What is above the hips, in their frame.
+/// The upper body in the frame of the hips.
 fn torso(b: &mut Builder, appearance: &Appearance, pose: Pose) {
     let (h, g) = (appearance.height, appearance.girth);
     let still = |_: Vec3| 1.0;

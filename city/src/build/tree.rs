@@ -1,4 +1,4 @@
-//! Trees and hedges: a trunk that forks, a crown of lumps, and single leaves that fray its outline.
+//! Meshes of trees and hedges: trunk and branches, a crown of ellipsoids, and single leaves along its outline.
 
 use std::f32::consts::TAU;
 
@@ -9,11 +9,11 @@ use crate::materials::{self as m, Surface};
 use crate::random::Random;
 use crate::types::{Asset, Class};
 
-/// How a kind of tree grows. Metres.
+/// A tree species; lengths in metres.
 struct Species {
     name: &'static str,
     height: f32,
-    /// Where the crown begins.
+    /// Height at which the crown begins.
     trunk: f32,
     radius: f32,
     bark: Surface,
@@ -49,12 +49,12 @@ const SPECIES: [Species; 9] = [
     species("young lime", [5.0, 2.3, 1.3], m::BARK, [m::LEAVES_LIGHT, m::LEAVES], Shape::Round),
 ];
 
-/// Number of kinds.
+/// Number of species.
 pub(crate) const KINDS: usize = SPECIES.len();
-/// Kinds that are narrow enough for a pavement, clear of who walks under them.
+/// Species that are narrow enough for a pavement and high enough to walk under.
 pub(crate) const STREET_KINDS: [usize; 4] = [0, 1, 4, 8];
 
-/// A tree, its foot in the origin.
+/// A tree with its foot at the origin.
 pub(crate) fn tree(kind: usize, mut random: Random) -> Asset {
     let species = &SPECIES[kind % KINDS];
     let mut b = Builder::new(Class::Vegetation);
@@ -70,7 +70,7 @@ pub(crate) fn tree(kind: usize, mut random: Random) -> Asset {
     b.finish(format!("tree, {}", species.name))
 }
 
-/// A crown of lumps on branches.
+/// A round crown of lumps on branches.
 fn round(b: &mut Builder, species: &Species, random: &mut Random) {
     let top = Vec3::new(0.0, 0.0, species.trunk);
     let (rise, width) = (species.height - species.trunk, 0.02 * species.height);
@@ -116,7 +116,7 @@ fn cone(b: &mut Builder, species: &Species, random: &mut Random) {
     }
 }
 
-/// A lump of foliage: a swollen ball and leaves that stick out of it.
+/// A lump of foliage: a deformed ellipsoid with leaves on its surface.
 fn lump(b: &mut Builder, species: &Species, random: &mut Random, centre: Vec3, radii: Vec3) {
     let waves = [random.range(0.0, TAU), random.range(0.0, TAU), random.range(0.0, TAU)];
     let swell = move |d: Vec3| {
@@ -136,7 +136,7 @@ fn lump(b: &mut Builder, species: &Species, random: &mut Random, centre: Vec3, r
     }
 }
 
-/// A spray of leaves: one triangle, seen from both sides.
+/// A leaf: one two-sided triangle.
 fn leaf(b: &mut Builder, random: &mut Random, at: Vec3, size: f32) {
     let mut corner =
         || at + size * Vec3::new(random.range(-1.0, 1.0), random.range(-1.0, 1.0), random.range(-0.8, 0.8));
@@ -144,7 +144,7 @@ fn leaf(b: &mut Builder, random: &mut Random, at: Vec3, size: f32) {
     b.triangle(corners);
 }
 
-/// Two metres of hedge along x.
+/// A hedge piece of 2 m along x.
 pub(crate) fn hedge(mut random: Random) -> Asset {
     let mut b = Builder::new(Class::Vegetation);
     b.paint(m::HEDGE);

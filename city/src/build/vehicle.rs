@@ -1,6 +1,6 @@
-//! Vehicles: a body drawn out of its side view and drawn in towards the roof, panes, wheels, lamps and plates.
+//! Vehicle meshes: an extruded side view with a tapered cabin, panes, wheels, lamps and number plates.
 //!
-//! x is ahead, y to the left, z up; the origin is on the ground under the middle.
+//! x is forward, y left, z up; the origin is on the ground below the centre.
 
 use glam::{Affine3A, Vec2, Vec3};
 
@@ -32,7 +32,7 @@ pub(crate) enum VehicleKind {
 use VehicleKind as K;
 
 impl VehicleKind {
-    /// What its boxes are called.
+    /// Class of the vehicle.
     pub(crate) fn class(self) -> Class {
         match self {
             K::Bus => Class::Bus,
@@ -81,12 +81,12 @@ pub(crate) fn vehicle(kind: VehicleKind, paint: usize, mut random: Random) -> As
     b.finish(format!("{kind:?}, {paint}").to_lowercase())
 }
 
-/// The side view of a car's lower body and of its cabin, as shares of length (from the back) and metres of height.
+/// Side view of a car's body and cabin: x as shares of the length from the rear, heights in metres.
 struct SideView {
-    /// Front and rear of the cabin at the belt line and at the roof.
+    /// Rear and front of the cabin at the belt line and at the roof.
     belt: [f32; 2],
     roof: [f32; 2],
-    /// Heights of sill, bonnet, belt line and roof; a pickup's and saloon's boot is as high as the belt line.
+    /// Heights of sill, bonnet, belt line and roof. The boot is as high as the belt line.
     heights: [f32; 4],
 }
 
@@ -107,7 +107,7 @@ fn car(b: &mut Builder, kind: VehicleKind, colour: Surface, random: &mut Random)
     let x = |share: f32| (share - 0.5) * size.x;
     let [sill, bonnet, belt, roof] = view.heights;
     let half = 0.5 * size.y;
-    // the lower body: widest at half its height
+    // the body is widest at half its height
     let body = [
         Vec2::new(x(0.02), sill),
         Vec2::new(x(0.98), sill),
@@ -147,7 +147,7 @@ fn car(b: &mut Builder, kind: VehicleKind, colour: Surface, random: &mut Random)
     }
 }
 
-/// The cabin: a frustum in the body's colour with panes a little outside of it.
+/// The cabin: a frustum in the body's colour with panes slightly in front of its faces.
 fn cabin(b: &mut Builder, kind: VehicleKind, colour: Surface, view: &SideView, size: Vec2, half: f32) {
     let x = |share: f32| (share - 0.5) * size.x;
     let [.., belt, roof] = view.heights;
@@ -155,7 +155,7 @@ fn cabin(b: &mut Builder, kind: VehicleKind, colour: Surface, view: &SideView, s
     let low = [Vec2::new(x(view.belt[0]), -half + 0.02), Vec2::new(x(view.belt[1]), half - 0.02)];
     let high = [Vec2::new(x(view.roof[0]), -narrow), Vec2::new(x(view.roof[1]), narrow)];
     b.paint(colour).tapered(low, belt, high, roof);
-    // a point of the frustum's side faces: u along it, v up it
+    // a point of a side face of the frustum: u along it, v up
     let at = |a: Vec2, c: Vec2, ah: Vec2, ch: Vec2, u: f32, v: f32, out: Vec3| {
         a.lerp(c, u).lerp(ah.lerp(ch, u), v).extend(belt + v * (roof - belt)) + 0.008 * out
     };
@@ -190,7 +190,7 @@ fn wheels(b: &mut Builder, x: f32, half: f32, radius: f32) {
         let at = |y: f32| Vec3::new(x, side * y, radius);
         b.paint(m::TYRE).tube(at(half - 0.22), at(half + 0.005), [radius; 2], 14);
         b.paint(m::RIM).tube(at(half - 0.02), at(half + 0.015), [0.62 * radius; 2], 9);
-        // an arch of shadow above the wheel
+        // the wheel arch
         b.paint(m::TRIM);
         let rim = |k: usize| {
             let turn = std::f32::consts::PI * (k as f32 / 8.0);
@@ -296,7 +296,7 @@ fn truck(b: &mut Builder, colour: Surface, random: &mut Random) {
     lamps(b, [-4.5, 4.5], y, 0.8, random);
 }
 
-/// A wheel that stands alone, in the plane of x and z.
+/// A wheel of a two-wheeler, in the x-z plane.
 fn single_wheel(b: &mut Builder, x: f32, radius: f32, half: f32, spokes: bool) {
     let at = |y: f32| Vec3::new(x, y, radius);
     if !spokes {

@@ -1,7 +1,7 @@
-//! What GPS and an inertial unit say along a path, and how far off the poses are that are reported.
+//! GPS and IMU readings along a path, and the errors of reported poses.
 //!
-//! A GPS error is a slow wander (a Gauss-Markov process, Gelb 1974) and white noise. Gyro and accelerometer have a
-//! bias that walks and white noise (the usual model, Woodman 2007); the accelerometer feels what holds the car up.
+//! The GPS error is a first-order Gauss–Markov process (Gelb 1974) plus white noise. Gyro and accelerometer have a
+//! random-walk bias plus white noise (Woodman 2007); the accelerometer measures specific force, including gravity.
 
 use glam::{DQuat, DVec3};
 use scene::{Camera, Rigid};
@@ -13,41 +13,41 @@ use crate::{
     random::{Random, bits},
 };
 
-/// Metres per second squared, down.
+/// Standard gravity, metres per second squared.
 pub const GRAVITY: f64 = 9.806_65;
 
-/// Errors of GPS, of a unit's make and how often it is read.
+/// Rates and error models of GPS and IMU.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Inertial {
-    /// Readings of gyro and accelerometer a second.
+    /// IMU readings per second.
     pub rate: f64,
-    /// Every how manyth reading has a GPS fix.
+    /// IMU readings per GPS fix.
     pub fix_every: u32,
-    /// The wander's spread, metres (1σ); up it is twice that.
+    /// Gauss–Markov GPS error, metres (1σ); twice that vertically.
     pub wander_metres: f64,
-    /// Seconds in which the wander forgets.
+    /// Correlation time of the Gauss–Markov error, seconds.
     pub wander_seconds: f64,
-    /// White noise of a fix, metres (1σ); up it is twice that.
+    /// White noise of a fix, metres (1σ); twice that vertically.
     pub fix_noise_metres: f64,
-    /// White noise of reported headings and tilts, degrees (1σ).
+    /// White noise of reported attitudes, degrees (1σ).
     pub attitude_noise_degrees: f64,
-    /// White noise of the gyro, rad/s (1σ of a reading).
+    /// White noise of the gyro, rad/s (1σ per reading).
     pub gyro_noise: f64,
-    /// Spread of the gyro's bias at the start, rad/s.
+    /// Initial gyro bias, rad/s (1σ).
     pub gyro_bias: f64,
-    /// White noise of the accelerometer, m/s² (1σ of a reading).
+    /// White noise of the accelerometer, m/s² (1σ per reading).
     pub accelerometer_noise: f64,
-    /// Spread of the accelerometer's bias at the start, m/s².
+    /// Initial accelerometer bias, m/s² (1σ).
     pub accelerometer_bias: f64,
-    /// Share of its spread that a bias walks in a second (1σ).
+    /// Random walk of a bias per √s, as a share of its initial spread (1σ).
     pub bias_walk: f64,
-    /// Of all of it.
+    /// Seed of all errors.
     pub seed: u64,
 }
 
 impl Default for Inertial {
-    /// A unit for cars and GPS with corrections.
+    /// An automotive IMU, and GPS with corrections.
     fn default() -> Self {
         Self {
             rate: 100.0,
@@ -66,34 +66,34 @@ impl Default for Inertial {
     }
 }
 
-/// A reading and its truth. Gyro and accelerometer are in the body's axes.
+/// A reading and its ground truth. Gyro and accelerometer are in body axes.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Reading {
-    /// The city's clock.
+    /// City time, seconds.
     pub seconds: f64,
-    /// Truth: the pose.
+    /// Ground truth: the pose.
     pub world_from_body: Rigid,
-    /// Truth: world metres per second.
+    /// Ground truth: velocity, world metres per second.
     pub velocity: DVec3,
-    /// Truth: turning, rad/s.
+    /// Ground truth: angular velocity, rad/s.
     pub true_gyro: DVec3,
-    /// Truth: what an accelerometer without errors feels, m/s²: at rest [`GRAVITY`] up.
+    /// Ground truth: specific force, m/s²; at rest [`GRAVITY`] upwards.
     pub true_accelerometer: DVec3,
-    /// Truth: the gyro's bias.
+    /// Ground truth: the gyro's bias.
     pub gyro_bias: DVec3,
-    /// Truth: the accelerometer's bias.
+    /// Ground truth: the accelerometer's bias.
     pub accelerometer_bias: DVec3,
-    /// Reading: rad/s.
+    /// Measured: angular velocity, rad/s.
     pub gyro: DVec3,
-    /// Reading: m/s².
+    /// Measured: specific force, m/s².
     pub accelerometer: DVec3,
-    /// Reading: world metres, where there was a fix.
+    /// Measured: GPS position, world metres, for readings with a fix.
     pub fix: Option<DVec3>,
 }
 
 impl Inertial {
     /// # Errors
-    /// [`SenseError`] for settings that cannot be.
+    /// [`SenseError`] for settings out of range.
     pub fn check(&self) -> Result<(), SenseError> {
         check_range("rate", self.rate, 0.1, 1e4)?;
         check_range("fix_every", f64::from(self.fix_every), 1.0, 1e9)?;
@@ -111,10 +111,10 @@ impl Inertial {
         spreads.iter().try_for_each(|(name, spread)| check_range(name, *spread, 0.0, 1e4).map(|_| ()))
     }
 
-    /// Readings along a path that is passed smoothly.
+    /// Readings along a path, interpolated by a Catmull–Rom spline.
     ///
     /// # Errors
-    /// [`SenseError`] for settings or a path that cannot be, or more readings than a list may hold.
+    /// [`SenseError`] for settings or a path out of range, or more readings than [`super::MAX_READINGS`].
     pub fn readings(&self, path: &[Waypoint]) -> Result<Vec<Reading>, SenseError> {
         self.check()?;
         let sane = path.iter().all(|w| w.seconds.is_finite() && w.world_from_asset.is_sane());
@@ -153,10 +153,10 @@ impl Inertial {
         Ok(all)
     }
 
-    /// Reports shots as GPS and attitude would: all shots of a moment are off by the same, as cameras on one car are.
+    /// Adds GPS and attitude errors to reported poses. Shots of the same time get the same error, as cameras on one car do.
     ///
     /// # Errors
-    /// [`SenseError`] for settings that cannot be, or shots over more time than can be walked through.
+    /// [`SenseError`] for settings out of range, or shots over too long a time.
     pub fn report(&self, mut shots: Vec<Shot>) -> Result<Vec<Shot>, SenseError> {
         self.check()?;
         let times = || shots.iter().map(|s| s.seconds).filter(|s| s.is_finite());
@@ -176,7 +176,7 @@ impl Inertial {
         Ok(shots)
     }
 
-    /// The slow part of the GPS error: a knot each second.
+    /// The Gauss–Markov part of the GPS error, one knot per second.
     fn wander(&self, from: f64, to: f64) -> Result<Wander, SenseError> {
         let knots = check_count(to - from + 2.0)?;
         let mut random = Random::new(self.seed).fork(31);
@@ -205,7 +205,7 @@ impl Wander {
     }
 }
 
-/// Up, GPS is twice as far off.
+/// Standard deviations per axis: the vertical GPS error is twice the horizontal one.
 fn upright(spread: f64) -> DVec3 {
     DVec3::new(spread, spread, 2.0 * spread)
 }
@@ -214,7 +214,7 @@ fn normal(random: &mut Random) -> DVec3 {
     DVec3::new(f64::from(random.normal()), f64::from(random.normal()), f64::from(random.normal()))
 }
 
-/// Truth at a moment, from differences over `step` seconds to both sides.
+/// Ground truth at a time, from central differences over ± `step` seconds.
 fn state(path: &[Waypoint], seconds: f64, step: f64) -> Option<Reading> {
     let (before, here, after) =
         (catmull_rom(path, seconds - step)?, catmull_rom(path, seconds)?, catmull_rom(path, seconds + step)?);
@@ -253,7 +253,7 @@ mod tests {
     }
 
     #[test]
-    fn a_circle_turns_and_pulls_inwards() {
+    fn a_circle_has_constant_angular_velocity_and_centripetal_acceleration() {
         let readings = Inertial::default().readings(&circle()).unwrap();
         assert_eq!(readings.len(), 1991);
         let inner = &readings[100..1800];
@@ -272,7 +272,7 @@ mod tests {
     }
 
     #[test]
-    fn cameras_of_one_moment_are_off_by_the_same() {
+    fn cameras_of_one_time_have_the_same_error() {
         let shots = rig::drive(&test_scene::city(), &rig::Rig::default()).unwrap();
         let reported = Inertial::default().report(shots.clone()).unwrap();
         let off = |i: usize| reported[i].reported.centre() - reported[i].camera.centre();

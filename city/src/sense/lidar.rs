@@ -1,11 +1,11 @@
-//! A turning lidar: CarlaOcc's by default (supplement 1.1: 32 channels from −30° to 10°, 80 m, 20 Hz, 250,000 firings a
-//! second).
+//! A spinning lidar, by default that of CarlaOcc (supplement 1.1: 32 channels from −30° to 10°, 80 m, 20 Hz, 250,000 firings
+//! per second).
 //!
-//! What comes back of a pulse is `P = ρ · cos θ · e^(−2αr) / r²`: the lidar equation for a matt surface that is larger
-//! than the beam (Jelalian 1992; Wagner 2006), with the material's reflectivity ρ, the angle of incidence θ and the
-//! air's extinction α. Intensity is `P · r²`, as sensors report it calibrated for range (Material, appendix C). A pulse is
-//! missed where P is near or under the noise: half of those are that come from a tenth-white wall at the greatest range.
-//! Glass sends a part back and lets the rest through and back again; the stronger of both returns counts.
+//! The received power is `P = ρ · cos θ · e^(−2αr) / r²`: the lidar equation for a diffuse surface larger than the beam
+//! (Jelalian 1992; Wagner 2006), with reflectivity ρ, angle of incidence θ and extinction α. Intensity is `P · r²`,
+//! calibrated for range as sensors report it (Material, appendix C). Pulses are lost at random where P is near the noise
+//! floor; half of the pulses are lost on a surface of 10 % reflectivity at the maximum range. At glass the stronger of two
+//! returns counts: the one of the glass and the one through it.
 
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
@@ -20,36 +20,36 @@ use crate::{
     trace::{Hit, Light, Moment, Ray, RayMask, World, degrade::degrade_light},
 };
 
-/// Times for which what moves is placed anew in a turn.
+/// Times within a sweep for which moving actors are placed.
 const TIME_STEPS: usize = 8;
-/// Reflectivity of the wall that is half missed at the greatest range.
+/// Reflectivity of a surface of which half of the returns are lost at the maximum range.
 const THRESHOLD_REFLECTIVITY: f64 = 0.1;
 
-/// A lidar's make.
+/// Settings of a lidar.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Lidar {
-    /// Where it is on the car.
+    /// Mounting on the car.
     pub mount: Mount,
-    /// Beams.
+    /// Number of beams.
     pub channels: u32,
     /// Elevation of the lowest beam, degrees.
     pub lowest_degrees: f64,
     /// Elevation of the highest beam, degrees.
     pub highest_degrees: f64,
-    /// Metres that it sees.
+    /// Maximum range, metres.
     pub range_metres: f64,
-    /// Turns a second.
+    /// Revolutions per second.
     pub turns_per_second: f64,
-    /// Firings a second, of all beams together.
+    /// Firings per second, of all beams together.
     pub firings_per_second: f64,
-    /// Noise of a range, metres (1σ).
+    /// Range noise, metres (1σ).
     pub noise_metres: f64,
-    /// Noise of an intensity, relative (1σ).
+    /// Relative intensity noise (1σ).
     pub intensity_noise: f64,
-    /// Extinction by clear air, 1/m.
+    /// Extinction of clear air, 1/m.
     pub extinction: f64,
-    /// Of noise and losses.
+    /// Seed of noise and losses.
     pub seed: u64,
 }
 
@@ -71,51 +71,51 @@ impl Default for Lidar {
     }
 }
 
-/// One turn.
+/// One revolution of a lidar.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Sweep {
-    /// The city's clock at the middle of the turn.
+    /// City time at the middle of the sweep, seconds.
     pub seconds: f64,
-    /// Truth: the pose then, x ahead, y left, z up.
+    /// Ground truth: the pose at that time, x forward, y left, z up.
     pub world_from_sensor: Rigid,
-    /// In the order of firing, for all that met something in range.
+    /// The returns of all firings that hit a surface in range, in firing order.
     pub returns: Vec<Return>,
 }
 
-/// What became of a firing.
+/// The result of a firing.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Return {
-    /// The city's clock at the firing.
+    /// City time of the firing, seconds.
     pub seconds: f64,
-    /// Beam, from the lowest.
+    /// Beam index, from the lowest.
     pub channel: u16,
-    /// Unit vector from the sensor as it then stood, in its own axes.
+    /// Unit vector in the sensor's axes at the time of firing.
     pub direction: Vec3,
-    /// Truth: metres to the surface.
+    /// Ground truth: range, metres.
     pub true_range: f64,
-    /// Truth: the point of the surface, world metres.
+    /// Ground truth: the point of the surface, world metres.
     pub point: DVec3,
-    /// Truth: the surface's class.
+    /// Ground truth: the surface's class.
     pub class: crate::Class,
-    /// Truth: its instance.
+    /// Ground truth: the surface's instance.
     pub instance: u32,
-    /// Truth: its material.
+    /// Ground truth: the surface's material.
     pub material: u16,
-    /// Truth: the pulse went through glass.
+    /// Ground truth: the pulse went through glass.
     pub through_glass: bool,
-    /// Truth: intensity without noise, 0 to 1.
+    /// Ground truth: intensity without noise, 0 to 1.
     pub true_intensity: f32,
-    /// Reading: metres.
+    /// Measured: metres.
     pub range: f32,
-    /// Reading: calibrated for range, 0 to 1.
+    /// Measured: calibrated for range, 0 to 1.
     pub intensity: f32,
-    /// The pulse was too weak: there is no reading.
+    /// The pulse was too weak: there is no measurement.
     pub lost: bool,
 }
 
 impl Lidar {
     /// # Errors
-    /// [`SenseError`] for a make that cannot be, or with more firings in a turn than a list may hold.
+    /// [`SenseError`] for settings out of range, or more firings per sweep than [`super::MAX_READINGS`].
     pub fn check(&self) -> Result<(), SenseError> {
         check_range("channels", f64::from(self.channels), 1.0, 1024.0)?;
         check_range("lowest_degrees", self.lowest_degrees, -90.0, self.highest_degrees)?;
@@ -130,10 +130,10 @@ impl Lidar {
         Ok(())
     }
 
-    /// Turns that fit on a leg.
+    /// Number of sweeps along a leg.
     ///
     /// # Errors
-    /// [`SenseError`] for a make that cannot be, or more turns than a list may hold.
+    /// [`SenseError`] for settings out of range, or more sweeps than [`super::MAX_READINGS`].
     pub fn sweep_count(&self, leg: &[Waypoint]) -> Result<usize, SenseError> {
         self.check()?;
         let (Some(first), Some(last)) = (leg.first(), leg.last()) else { return Ok(0) };
@@ -144,10 +144,10 @@ impl Lidar {
         (self.firings_per_second / self.turns_per_second / f64::from(self.channels)).round().clamp(1.0, 1e9) as u32
     }
 
-    /// A turn of a lidar whose car drives a leg; none where the leg is empty or the sensor silent.
+    /// A sweep of a lidar whose car drives a leg; `None` for an empty leg or a sensor dropout.
     ///
     /// # Errors
-    /// [`SenseError`] for a make that cannot be.
+    /// [`SenseError`] for settings out of range.
     pub fn sweep_on_leg(
         &self,
         world: &World,
@@ -165,10 +165,10 @@ impl Lidar {
         self.sweep(world, &pose, &motion, seconds, faults).map(Some)
     }
 
-    /// A turn around a moment; the sensor moves on while it turns.
+    /// A sweep centred on a time, with the motion of the sensor and of actors during the sweep.
     ///
     /// # Errors
-    /// [`SenseError`] for a make or a pose that cannot be.
+    /// [`SenseError`] for settings or a pose out of range.
     pub fn sweep(
         &self,
         world: &World,
@@ -195,7 +195,7 @@ impl Lidar {
                 lidar: self,
                 moment: &moments[((share * TIME_STEPS as f64) as usize).min(TIME_STEPS - 1)],
                 pose: motion.extrapolate(pose, after(share)),
-                // clockwise from behind, so that the middle of the turn looks ahead
+                // clockwise from the rear, so that the middle of the sweep points forward
                 azimuth: std::f64::consts::PI - std::f64::consts::TAU * share,
                 seconds: seconds + after(share),
                 extinction: self.extinction + fog,
@@ -208,7 +208,7 @@ impl Lidar {
     }
 }
 
-/// All beams of a moment.
+/// The beams that fire at one time.
 struct Firing<'a> {
     lidar: &'a Lidar,
     moment: &'a Moment<'a>,
@@ -231,7 +231,7 @@ impl Firing<'_> {
         let (hit, intensity, through_glass) = self.strongest_return(&ray)?;
         let true_range = f64::from(hit.distance);
         let mut random = Random::new(bits(self.key, u64::from(channel)));
-        // the noise under which a return is lost is that of the faint wall at the end of the range
+        // noise floor: the power of the threshold reflectivity at the maximum range
         let end = lidar.range_metres;
         let threshold = THRESHOLD_REFLECTIVITY * (-2.0 * lidar.extinction * end).exp() / (end * end);
         let power = intensity / (true_range * true_range).max(0.25);
@@ -255,7 +255,7 @@ impl Firing<'_> {
         })
     }
 
-    /// The stronger of what glass sends back and what comes through it.
+    /// The stronger return of glass and of the surface behind it.
     fn strongest_return(&self, ray: &Ray) -> Option<(Hit, f64, bool)> {
         let hit = self.moment.cast(ray, RayMask::All)?;
         let own = self.intensity(ray, &hit);
@@ -277,7 +277,7 @@ impl Firing<'_> {
         let material = self.moment.material(hit).1;
         let cosine = f64::from(-hit.normal.dot(ray.direction)).clamp(0.0, 1.0);
         let clear = f64::from(material.transparency.clamp(0.0, 1.0));
-        // what does not go through comes back; a pane met squarely flashes
+        // the untransmitted share is reflected; a pane at normal incidence gives a specular flash
         let matt = f64::from(material.lidar_reflectivity.clamp(0.0, 1.0)) * cosine * (1.0 - clear);
         let flash = if clear > 0.0 { cosine.powi(400) } else { 0.0 };
         (matt + flash).min(1.0) * (-2.0 * self.extinction * f64::from(hit.distance)).exp()
@@ -296,7 +296,7 @@ mod tests {
     }
 
     #[test]
-    fn true_points_lie_on_surfaces_and_readings_near_them() {
+    fn true_points_lie_on_surfaces_and_measurements_near_them() {
         let seen = sweep(DVec3::new(0.0, 0.0, 1.73), &[]);
         assert!(seen.returns.len() > 5000, "{}", seen.returns.len());
         let (mut walls, mut off, mut kept) = (0, 0.0, 0.0);
@@ -323,7 +323,7 @@ mod tests {
     }
 
     #[test]
-    fn glass_lets_pulses_through_unless_they_meet_it_squarely() {
+    fn glass_transmits_pulses_except_at_normal_incidence() {
         // beams at the height of the pane go through to the wall 2 m behind it
         let seen = sweep(DVec3::new(0.0, 0.0, 1.73), &[]);
         let through: Vec<&Return> = seen.returns.iter().filter(|r| r.through_glass).collect();
@@ -333,7 +333,7 @@ mod tests {
     }
 
     #[test]
-    fn far_and_grazed_surfaces_are_lost_and_fog_loses_more() {
+    fn distant_and_grazing_returns_are_lost_and_fog_loses_more() {
         let lost = |sweep: &Sweep, near: bool| {
             let some: Vec<&Return> = sweep.returns.iter().filter(|r| (r.true_range < 10.0) == near).collect();
             some.iter().filter(|r| r.lost).count() as f64 / some.len().max(1) as f64
@@ -350,7 +350,7 @@ mod tests {
     }
 
     #[test]
-    fn a_turn_of_a_leg_is_the_same_for_any_number_of_threads() {
+    fn a_sweep_is_the_same_for_any_number_of_threads() {
         let city = test_scene::city();
         let world = World::new(&city).unwrap();
         let legs = rig::legs(&city, &rig::Rig::default()).unwrap();

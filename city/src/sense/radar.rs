@@ -1,14 +1,12 @@
-//! A radar for the road: some hundred detections a sweep, each a range, an azimuth and a radial velocity.
+//! An automotive radar: some hundred detections per sweep, each with range, azimuth and radial velocity.
 //!
-//! A fan of rays finds what it can see; a surface scatters back by what it is (metal and vehicles most, walls less,
-//! ground and leaves little) and how squarely it is met. Power falls with the fourth power of range (the radar
-//! equation, Skolnik 2008). Returns that share a cell of range, azimuth and velocity are one detection, of the
-//! strongest; the cells that scatter most are kept, as gain is turned down for what is near. **Ghosts** are what
-//! multipath makes: a strong return seen again, farther along the same azimuth and with its velocity doubled (the pulse
-//! went there twice), or mirrored in the road side's plane. Velocities are positive away from the sensor and relative
-//! to it, as radars report them.
+//! A fan of rays samples the field of view. Backscatter depends on the class (metal and vehicles most, walls less, ground
+//! and leaves little) and on the angle of incidence. Power falls with the fourth power of range (radar equation, Skolnik
+//! 2008). The strongest return of each cell of range, azimuth and velocity is a detection; the detections with the largest
+//! range-independent power are kept. **Ghosts** model multipath: a return at twice its range and velocity, or one at a
+//! larger range and mirrored azimuth. Velocities are relative to the sensor and positive away from it.
 //!
-//! Street Detection Gaussians (section 3.4) uses such detections as sparse, geometrically reliable depth.
+//! Street Detection Gaussians (section 3.4) uses radar detections as sparse, geometrically reliable depth.
 
 use std::collections::BTreeMap;
 
@@ -25,39 +23,39 @@ use crate::{
     trace::{Hit, Moment, Ray, RayMask, motion},
 };
 
-/// Rays of a column of the fan.
+/// Rays per column of the fan.
 const ROWS: u32 = 13;
 
-/// A radar's make.
+/// Settings of a radar.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Radar {
-    /// Where it is on the car.
+    /// Mounting on the car.
     pub mount: Mount,
     /// Horizontal field of view, degrees.
     pub field_degrees: f64,
     /// Vertical field of view, degrees.
     pub elevation_degrees: f64,
-    /// Metres that it sees.
+    /// Maximum range, metres.
     pub range_metres: f64,
-    /// Size of a cell in range, metres.
+    /// Range resolution, metres.
     pub range_cell_metres: f64,
-    /// Size of a cell in azimuth, degrees.
+    /// Azimuth resolution, degrees.
     pub azimuth_cell_degrees: f64,
-    /// Size of a cell in velocity, metres per second.
+    /// Velocity resolution, metres per second.
     pub velocity_cell: f64,
-    /// The most detections of a sweep, without ghosts.
+    /// Largest number of detections per sweep, without ghosts.
     #[serde(rename = "most")]
     pub max_detections: u32,
-    /// Noise of a range, metres (1σ).
+    /// Range noise, metres (1σ).
     pub range_noise_metres: f64,
-    /// Noise of an azimuth, degrees (1σ).
+    /// Azimuth noise, degrees (1σ).
     pub azimuth_noise_degrees: f64,
-    /// Noise of a velocity, metres per second (1σ).
+    /// Velocity noise, metres per second (1σ).
     pub velocity_noise: f64,
-    /// Ghosts for each detection.
+    /// Mean number of ghosts per detection.
     pub ghosts: f64,
-    /// Of noise and ghosts.
+    /// Seed of noise and ghosts.
     pub seed: u64,
 }
 
@@ -81,38 +79,38 @@ impl Default for Radar {
     }
 }
 
-/// What a radar reports, and what is so.
+/// A radar detection and its ground truth.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Detection {
-    /// Reading: metres.
+    /// Measured: range, metres.
     pub range: f32,
-    /// Reading: radians to the left.
+    /// Measured: azimuth, radians to the left.
     pub azimuth: f32,
-    /// Reading: metres per second away from the sensor, relative to it.
+    /// Measured: radial velocity relative to the sensor, metres per second, positive away from it.
     pub velocity: f32,
-    /// Reading: power over the noise, decibels.
+    /// Measured: signal-to-noise ratio, decibels.
     pub power: f32,
-    /// Truth: there is nothing; the other truths are of the return that was mirrored.
+    /// Ground truth: the detection is a multipath ghost. Its other ground truth is that of the original return.
     pub ghost: bool,
-    /// Truth: metres.
+    /// Ground truth: range, metres.
     pub true_range: f64,
-    /// Truth: radians to the left.
+    /// Ground truth: azimuth, radians to the left.
     pub true_azimuth: f64,
-    /// Truth: metres per second.
+    /// Ground truth: radial velocity, metres per second.
     pub true_velocity: f64,
-    /// Truth: the point that scattered, world metres.
+    /// Ground truth: the scattering point, world metres.
     pub point: DVec3,
-    /// Truth: its class.
+    /// Ground truth: class.
     pub class: Class,
-    /// Truth: its instance.
+    /// Ground truth: instance.
     pub instance: u32,
-    /// Truth: its material.
+    /// Ground truth: material.
     pub material: u16,
 }
 
 impl Radar {
     /// # Errors
-    /// [`SenseError`] for a make that cannot be.
+    /// [`SenseError`] for settings out of range.
     pub fn check(&self) -> Result<(), SenseError> {
         check_range("field_degrees", self.field_degrees, 1.0, 360.0)?;
         check_range("elevation_degrees", self.elevation_degrees, 0.0, 120.0)?;
@@ -128,10 +126,10 @@ impl Radar {
         Ok(())
     }
 
-    /// A sweep from a pose (`world_from_sensor`, x ahead, y left, z up) that moves; nothing where the sensor is silent.
+    /// A sweep from a moving sensor (`world_from_sensor`, x forward, y left, z up); empty during a sensor dropout.
     ///
     /// # Errors
-    /// [`SenseError`] for a make or a pose that cannot be.
+    /// [`SenseError`] for settings or a pose out of range.
     pub fn sweep(
         &self,
         moment: &Moment,
@@ -154,9 +152,9 @@ impl Radar {
         Ok(detections)
     }
 
-    /// Everything the fan meets, without noise.
+    /// The returns of all rays, without noise.
     fn returns(&self, moment: &Moment, pose: &Rigid, sensor_motion: &Motion) -> Vec<Detection> {
-        // four columns to a cell, so that a pole is not missed for long
+        // four columns per azimuth cell, so that poles are hit
         let columns = (4.0 * self.field_degrees / self.azimuth_cell_degrees).ceil() as u32;
         let column = |i: u32| {
             let azimuth = (self.field_degrees * ((f64::from(i) + 0.5) / f64::from(columns) - 0.5)).to_radians();
@@ -174,7 +172,7 @@ impl Radar {
         columns.into_iter().flatten().collect()
     }
 
-    /// What comes back along a ray; the thin glass of windows is not there for it.
+    /// The return along a ray; window glass is transparent to radar.
     fn return_along(
         &self,
         moment: &Moment,
@@ -189,7 +187,7 @@ impl Radar {
         let point = pose.translation + towards * range;
         let velocity =
             (motion::velocity_at(moment.actor(&hit), moment.seconds, point) - sensor_motion.velocity).dot(towards);
-        // a square metre of metal, met squarely at the end of the range, is 10 dB over the noise
+        // a square metre of metal at normal incidence and maximum range is 10 dB above the noise
         let scattered = scattering(moment, &hit, ray).max(1e-9);
         let power = 10.0 + 10.0 * scattered.log10() + 40.0 * (self.range_metres / range).log10();
         Some(Detection {
@@ -208,7 +206,7 @@ impl Radar {
         })
     }
 
-    /// The strongest return of each cell, and of those the strongest.
+    /// The strongest return of each cell, and of these the strongest [`Self::max_detections`].
     fn strongest_per_cell(&self, returns: Vec<Detection>) -> Vec<Detection> {
         let mut cells: BTreeMap<[i64; 3], Detection> = BTreeMap::new();
         for found in returns.into_iter().filter(|found| found.power > 0.0) {
@@ -223,7 +221,7 @@ impl Radar {
             }
         }
         let mut kept: Vec<Detection> = cells.into_values().collect();
-        // gain is turned down for what is near, or nothing else would be seen
+        // sensitivity-time control: near returns would displace all others
         let range_independent_power = |found: &Detection| f64::from(found.power) + 40.0 * found.true_range.log10();
         kept.sort_by(|a, b| range_independent_power(b).total_cmp(&range_independent_power(a)));
         kept.truncate(self.max_detections as usize);
@@ -241,7 +239,7 @@ impl Radar {
         }
     }
 
-    /// Sometimes, the ghost of a return.
+    /// The ghost of a return, with the probability [`Self::ghosts`].
     fn ghost_of(&self, found: &Detection, random: &mut Random) -> Option<Detection> {
         let appears = random.chance(self.ghosts as f32);
         let twice = random.chance(0.5);
@@ -255,7 +253,7 @@ impl Radar {
     }
 }
 
-/// Radar cross-section of what a ray meets, square metres in the manner of speaking of a road radar.
+/// Radar cross-section of a hit, square metres; plausible values, not measured.
 fn scattering(moment: &Moment, hit: &Hit, ray: &Ray) -> f64 {
     let material = moment.material(hit).1;
     let (section, breadth) = match moment.class(hit) {
@@ -279,7 +277,7 @@ mod tests {
     use crate::{test_scene, trace::World};
 
     #[test]
-    fn a_van_that_drives_away_is_seen_to_do_so() {
+    fn a_receding_van_has_a_positive_velocity() {
         let city = test_scene::city();
         let world = World::new(&city).unwrap();
         // the van is 20 m ahead of a sensor that follows it at 4 m/s
@@ -303,7 +301,7 @@ mod tests {
     }
 
     #[test]
-    fn a_box_straight_ahead_moves_at_ten_metres_a_second() {
+    fn a_van_straight_ahead_moves_at_ten_metres_per_second() {
         let city = test_scene::city();
         let world = World::new(&city).unwrap();
         let radar = Radar { velocity_noise: 0.0, ghosts: 1.0, ..Radar::default() };
@@ -326,7 +324,7 @@ mod tests {
     }
 
     #[test]
-    fn makes_that_cannot_be_are_refused_and_a_dropped_sensor_is_silent() {
+    fn invalid_settings_are_refused_and_a_dropped_out_sensor_is_silent() {
         assert!(Radar { azimuth_cell_degrees: 0.0, ..Radar::default() }.check().is_err());
         assert!(Radar { ghosts: f64::NAN, ..Radar::default() }.check().is_err());
         let city = test_scene::city();

@@ -1,8 +1,8 @@
-//! A car with six cameras that drives the streets end to end.
+//! A car with six cameras that drives all free lanes of a city.
 //!
-//! Placement follows KITTI-360 as CarlaOcc (supplement 1.1) completes it: no tilt, perspective lenses of one field of view
-//! (103.7°, 1408 × 376), a stereo pair ahead, one camera to each side and a stereo pair behind. Metres from the point of
-//! the road under the car's centre, x ahead, y left, z up:
+//! Mounting follows KITTI-360 with the additions of CarlaOcc (supplement 1.1): no tilt, perspective lenses with the same
+//! field of view (103.7°, 1408 × 376), a forward stereo pair, one camera to each side and a rear stereo pair. Offsets in
+//! metres from the point of the road under the car's centre, x forward, y left, z up:
 //!
 //! | camera | x | y | z | yaw |
 //! |---|---|---|---|---|
@@ -17,43 +17,43 @@ use serde::{Deserialize, Serialize};
 use super::{Motion, SenseError, Shot, camera_towards, check_count, check_range, pinhole};
 use crate::{City, Waypoint, trace::motion};
 
-/// A sensor on a car: metres from the point of the road under its centre.
+/// Mounting of a sensor on a car, relative to the point of the road under the car's centre.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Mount {
-    /// Its name.
+    /// Name of the sensor.
     pub name: String,
-    /// x ahead, y left, z up, metres.
+    /// x forward, y left, z up, metres.
     pub offset: DVec3,
-    /// To the left, degrees.
+    /// Yaw to the left, degrees.
     pub yaw_degrees: f64,
 }
 
-/// The car, its cameras and how it drives.
+/// A car with cameras, and its motion.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Rig {
     /// The cameras.
     pub cameras: Vec<Mount>,
-    /// Pixels in a row.
+    /// Image width, pixels.
     pub width: u32,
-    /// Rows.
+    /// Image height, pixels.
     pub height: u32,
     /// Horizontal field of view, degrees.
     pub field_degrees: f64,
-    /// Metres from one round of pictures to the next.
+    /// Distance between exposures of all cameras, metres.
     pub spacing_metres: f64,
-    /// Metres per second.
+    /// Speed, metres per second.
     pub speed: f64,
-    /// Metres to the right of the lines of [`City::streets`].
+    /// Offset to the right of the lines of [`City::streets`], metres.
     pub lane_metres: f64,
-    /// The city's clock where it starts.
+    /// City time at the start, seconds.
     pub start_seconds: f64,
-    /// Every street by a car of its own, all starting at once; else one car drives one after the other.
+    /// Whether each street has its own car, all starting at the same time. Otherwise one car drives the streets in turn.
     pub fleet: bool,
-    /// Seconds from the first to the last row.
+    /// Readout time of the rolling shutter, seconds.
     pub rolling_shutter_seconds: f64,
-    /// Seconds that the shutter is open.
+    /// Exposure time, seconds.
     pub shutter_seconds: f64,
 }
 
@@ -84,10 +84,10 @@ impl Default for Rig {
     }
 }
 
-/// Drives every street of a city and lists the pictures on the way, round by round.
+/// Drives every street of a city and lists the shots, in order of street, position and camera.
 ///
 /// # Errors
-/// [`SenseError`] for settings out of range, or more pictures than a list may hold.
+/// [`SenseError`] for settings out of range, or more shots than [`super::MAX_READINGS`].
 pub fn drive(city: &City, rig: &Rig) -> Result<Vec<Shot>, SenseError> {
     let lens = pinhole(rig.width, rig.height, rig.field_degrees)?;
     check_range("rolling_shutter_seconds", rig.rolling_shutter_seconds, 0.0, 1.0)?;
@@ -110,7 +110,7 @@ pub fn drive(city: &City, rig: &Rig) -> Result<Vec<Shot>, SenseError> {
                 let camera = camera_towards(lens, pose.translation + arm, forward, DVec3::Z);
                 let name = format!("{}-{street:04}-{i:05}", mount.name);
                 let mut shot = Shot::new(name, &mount.name, here.seconds, camera);
-                // a camera on an arm moves with the car and is swung around its centre
+                // lever arm: the camera also moves with the car's rotation
                 shot.motion = Motion { velocity: motion.velocity + motion.spin.cross(arm), ..motion };
                 shot.rolling_shutter_seconds = rig.rolling_shutter_seconds;
                 shot.shutter_seconds = rig.shutter_seconds;
@@ -121,10 +121,10 @@ pub fn drive(city: &City, rig: &Rig) -> Result<Vec<Shot>, SenseError> {
     Ok(shots)
 }
 
-/// The car's poses (x ahead, y left, z up; the origin on the road) street by street, a waypoint each spacing.
+/// The car's poses (x forward, y left, z up; the origin on the road) per street, one waypoint per spacing.
 ///
 /// # Errors
-/// [`SenseError`] for settings out of range, or more waypoints than a list may hold.
+/// [`SenseError`] for settings out of range, or more waypoints than [`super::MAX_READINGS`].
 pub fn legs(city: &City, rig: &Rig) -> Result<Vec<Vec<Waypoint>>, SenseError> {
     let spacing = check_range("spacing_metres", rig.spacing_metres, 0.01, 1e4)?;
     let speed = check_range("speed", rig.speed, 0.01, 100.0)?;
@@ -146,7 +146,8 @@ pub fn legs(city: &City, rig: &Rig) -> Result<Vec<Vec<Waypoint>>, SenseError> {
     Ok(legs)
 }
 
-/// The pose of a car's sensor at a moment of a leg, `world_from_sensor` with x ahead, y left and z up, and its motion.
+/// The pose of a car's sensor at a time of a leg (`world_from_sensor`, x forward, y left, z up) and its motion. `None` for an
+/// empty leg.
 pub fn sensor_pose_at(leg: &[Waypoint], mount: &Mount, seconds: f64) -> Option<(Rigid, Motion)> {
     const STEP: f64 = 0.01;
     let at = |seconds| {
@@ -154,21 +155,21 @@ pub fn sensor_pose_at(leg: &[Waypoint], mount: &Mount, seconds: f64) -> Option<(
         let turn = DQuat::from_rotation_z(mount.yaw_degrees.to_radians());
         Some(Rigid { rotation: car.rotation * turn, translation: car.apply(mount.offset) })
     };
-    // held at its ends a leg has no motion: look inwards there
+    // one-sided differences at the ends of a leg
     let (first, last) = (leg.first()?.seconds, leg.last()?.seconds);
     let (from, to) = ((seconds - STEP).max(first), (seconds + STEP).min(last));
     Some((at(seconds)?, Motion::between(&at(from)?, &at(to)?, to - from)))
 }
 
-/// A polyline by its length.
+/// A polyline parametrised by arc length.
 pub(crate) struct Polyline<'a> {
     points: &'a [DVec3],
-    /// Metres to each point.
+    /// Arc length at each point, metres.
     ways: Vec<f64>,
 }
 
 impl<'a> Polyline<'a> {
-    /// None for lines without a length or with points that are none.
+    /// `None` for lines without length or with invalid points.
     pub(crate) fn new(points: &'a [DVec3]) -> Option<Self> {
         let mut ways = vec![0.0];
         for pair in points.windows(2) {
@@ -182,7 +183,7 @@ impl<'a> Polyline<'a> {
         self.ways[self.ways.len() - 1]
     }
 
-    /// The point this far along.
+    /// The point at an arc length.
     pub(crate) fn at(&self, way: f64) -> DVec3 {
         let next = self.ways.partition_point(|w| *w < way).clamp(1, self.points.len() - 1);
         let (from, to) = (self.ways[next - 1], self.ways[next]);
@@ -190,7 +191,8 @@ impl<'a> Polyline<'a> {
         self.points[next - 1].lerp(self.points[next], share)
     }
 
-    /// A car's pose this far along and so far to the right; it looks where the road leads over its own length.
+    /// A car's pose at an arc length and an offset to the right. The heading is the direction of the road over the car's
+    /// length.
     pub(crate) fn pose(&self, way: f64, right: f64) -> Rigid {
         const AXLE: f64 = 2.0;
         let ahead = self.at((way + AXLE).min(self.length())) - self.at((way - AXLE).max(0.0));
@@ -207,7 +209,7 @@ mod tests {
     use crate::test_scene;
 
     #[test]
-    fn six_cameras_look_around_from_a_car() {
+    fn six_cameras_are_mounted_as_specified() {
         let city = test_scene::city();
         let shots = drive(&city, &Rig::default()).unwrap();
         assert_eq!(shots.len(), 6 * 61);
@@ -225,7 +227,7 @@ mod tests {
     }
 
     #[test]
-    fn settings_that_cannot_be_are_refused() {
+    fn settings_out_of_range_are_refused() {
         let city = test_scene::city();
         for rig in [
             Rig { spacing_metres: 0.0, ..Rig::default() },

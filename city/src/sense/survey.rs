@@ -1,5 +1,5 @@
-//! Pictures from above and from where a camera stays: aerial blocks flown to an overlap, nadir or with five headings,
-//! surveillance cameras over streets, and free paths between poses.
+//! Camera shots other than from cars: aerial blocks with a given overlap (nadir, or nadir and four obliques), surveillance
+//! cameras over streets, and free camera paths.
 
 use glam::{DVec2, DVec3};
 use scene::{Camera, Pinhole};
@@ -12,31 +12,31 @@ use crate::{
     trace::{Moment, Ray, motion},
 };
 
-/// A block flown over a city in parallel lines.
+/// An aerial block in parallel flight lines.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Survey {
-    /// Metres over the mean height of the streets.
+    /// Flight height over the mean height of the streets, metres.
     pub height_metres: f64,
-    /// Share of a nadir picture that the next on the line shows too, 0 to 0.95.
+    /// Overlap of consecutive nadir images of a line, 0 to 0.95.
     pub forward_overlap: f64,
-    /// Share of it that the next line shows too, 0 to 0.95.
+    /// Overlap of adjacent lines, 0 to 0.95.
     pub side_overlap: f64,
-    /// Degrees off the vertical of four more cameras, ahead, back, left and right (a Maltese cross); 0 for nadir alone.
+    /// Tilt of the four oblique cameras (forward, back, left, right) off the vertical, degrees; 0 for nadir only.
     pub tilt_degrees: f64,
-    /// Pixels across the line of flight.
+    /// Pixels across the flight line.
     pub width: u32,
-    /// Pixels along it.
+    /// Pixels along the flight line.
     pub height: u32,
-    /// Field of view across, degrees.
+    /// Field of view across the flight line, degrees.
     pub field_degrees: f64,
-    /// Metres per second.
+    /// Flight speed, metres per second.
     pub speed: f64,
-    /// The city's clock at the first picture.
+    /// City time of the first shot, seconds.
     pub start_seconds: f64,
-    /// What to fly over, from a corner to the opposite one, world metres; the whole city where there is none.
+    /// Area to cover, two opposite corners, world metres; `None` for the whole city.
     pub area: Option<[DVec2; 2]>,
-    /// Seconds that the shutter is open.
+    /// Exposure time, seconds.
     pub shutter_seconds: f64,
 }
 
@@ -59,10 +59,10 @@ impl Default for Survey {
 }
 
 impl Survey {
-    /// Lines, and stops on each, at which a picture is taken in every heading.
+    /// Number of flight lines, and of stops per line; every stop has a shot per heading.
     ///
     /// # Errors
-    /// [`SenseError`] for settings out of range, or more stops than a list may hold.
+    /// [`SenseError`] for settings out of range, or more stops than [`super::MAX_READINGS`].
     pub fn stops(&self, city: &City) -> Result<[u32; 2], SenseError> {
         let lens = pinhole(self.width, self.height, self.field_degrees)?;
         let height = check_range("height_metres", self.height_metres, 5.0, 2e4)?;
@@ -82,16 +82,16 @@ impl Survey {
         Ok([stops.x as u32, stops.y as u32])
     }
 
-    /// What is flown over.
+    /// Two opposite corners of the area.
     fn corners(&self, city: &City) -> [DVec2; 2] {
         self.area.unwrap_or([-0.5, 0.5].map(|side| DVec2::splat(side * city.extent_metres)))
     }
 }
 
-/// The pictures of a block, line by line, there and back.
+/// The shots of an aerial block, line by line in alternating direction.
 ///
 /// # Errors
-/// [`SenseError`] for settings out of range, or more pictures than a list may hold.
+/// [`SenseError`] for settings out of range, or more shots than [`super::MAX_READINGS`].
 pub fn survey(city: &City, settings: &Survey) -> Result<Vec<Shot>, SenseError> {
     let lens = pinhole(settings.width, settings.height, settings.field_degrees)?;
     let [lines, stops] = settings.stops(city)?;
@@ -125,7 +125,7 @@ pub fn survey(city: &City, settings: &Survey) -> Result<Vec<Shot>, SenseError> {
     Ok(shots)
 }
 
-/// Straight down, and four more ways that are tilted off it.
+/// The nadir direction, and four oblique ones if there is a tilt.
 fn headings_of(ahead: DVec3, tilt: f64) -> Vec<(&'static str, DVec3)> {
     let mut headings = vec![("nadir", DVec3::NEG_Z)];
     if tilt > 0.0 {
@@ -137,37 +137,37 @@ fn headings_of(ahead: DVec3, tilt: f64) -> Vec<(&'static str, DVec3)> {
     headings
 }
 
-/// The mean height of the streets' points.
+/// Mean height of the streets.
 fn ground(city: &City) -> f64 {
     let heights: Vec<f64> = city.streets.iter().flatten().map(|p| p.z).filter(|z| z.is_finite()).collect();
     heights.iter().sum::<f64>() / heights.len().max(1) as f64
 }
 
-/// Surveillance cameras: each stays, looks along its street and takes a picture every so often.
+/// Surveillance cameras: static cameras along streets that take images at a fixed interval.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Fixed {
-    /// How many cameras.
+    /// Number of cameras.
     pub cameras: u32,
-    /// Metres over the street.
+    /// Height over the street, metres.
     pub height_metres: f64,
-    /// Metres to the side of a line of [`City::streets`].
+    /// Lateral offset from a line of [`City::streets`], metres.
     pub side_metres: f64,
-    /// Degrees below the horizon.
+    /// Tilt below the horizon, degrees.
     pub tilt_degrees: f64,
-    /// Pixels in a row.
+    /// Image width, pixels.
     pub width: u32,
-    /// Rows.
+    /// Image height, pixels.
     pub height: u32,
     /// Horizontal field of view, degrees.
     pub field_degrees: f64,
-    /// Pictures of each.
+    /// Images per camera.
     pub pictures: u32,
-    /// Seconds from one to the next.
+    /// Interval between images, seconds.
     pub every_seconds: f64,
-    /// The city's clock at the first.
+    /// City time of the first image, seconds.
     pub start_seconds: f64,
-    /// Which places are drawn.
+    /// Seed of the camera positions.
     pub seed: u64,
 }
 
@@ -189,11 +189,11 @@ impl Default for Fixed {
     }
 }
 
-/// The pictures of surveillance cameras, camera by camera, where nothing stands between a camera and its street. Fewer
-/// cameras than asked for where no such place was found.
+/// The shots of surveillance cameras, camera by camera. Positions have a free line of sight to the street; there may be
+/// fewer cameras than requested if not enough such positions are found.
 ///
 /// # Errors
-/// [`SenseError`] for settings out of range, or more pictures than a list may hold.
+/// [`SenseError`] for settings out of range, or more shots than [`super::MAX_READINGS`].
 pub fn fixed(moment: &Moment, settings: &Fixed) -> Result<Vec<Shot>, SenseError> {
     let lens = pinhole(settings.width, settings.height, settings.field_degrees)?;
     let height = check_range("height_metres", settings.height_metres, 0.1, 200.0)?;
@@ -223,7 +223,7 @@ pub fn fixed(moment: &Moment, settings: &Fixed) -> Result<Vec<Shot>, SenseError>
     Ok(shots)
 }
 
-/// A camera beside a street, or none where something stands between it and the street.
+/// A camera beside a street; `None` if its line of sight is blocked.
 fn post_camera(
     moment: &Moment,
     line: &Polyline,
@@ -235,7 +235,7 @@ fn post_camera(
 ) -> Option<Camera> {
     let road = line.pose(way, 0.0);
     let place = line.pose(way, right).translation + DVec3::Z * height;
-    // back to the middle of what it is to see
+    // turned back to the middle of the street
     let ahead = road.rotation * DVec3::X;
     let seen = line.at((way + 15.0).min(line.length())) + DVec3::Z;
     let over = road.translation + DVec3::Z * height;
@@ -248,11 +248,11 @@ fn post_camera(
     (is_free(over, place) && is_free(place, seen)).then(|| camera_towards(lens, place, towards, ahead))
 }
 
-/// Pictures along a path of camera poses (`world_from_camera`, OpenCV axes), which it passes smoothly: Catmull and Rom's
-/// curve for places, slerp for rotations.
+/// Shots along a path of camera poses (`world_from_camera`, OpenCV axes): Catmull–Rom spline for positions, slerp for
+/// rotations.
 ///
 /// # Errors
-/// [`SenseError`] for settings out of range, or more pictures than a list may hold.
+/// [`SenseError`] for settings out of range, or more shots than [`super::MAX_READINGS`].
 pub fn free(sensor: &str, path: &[Waypoint], lens: Pinhole, every_seconds: f64) -> Result<Vec<Shot>, SenseError> {
     let every = check_range("every_seconds", every_seconds, 1e-4, 1e6)?;
     let sane = path.iter().all(|w| w.seconds.is_finite() && w.world_from_asset.is_sane());
@@ -279,7 +279,7 @@ pub fn free(sensor: &str, path: &[Waypoint], lens: Pinhole, every_seconds: f64) 
     Ok(shots)
 }
 
-/// A pose on the smooth curve through waypoints.
+/// The pose on a Catmull–Rom spline through waypoints at a time; `None` without waypoints.
 pub fn catmull_rom(path: &[Waypoint], seconds: f64) -> Option<scene::Rigid> {
     let straight = motion::between(path, seconds)?;
     let next = path.partition_point(|w| w.seconds <= seconds);
@@ -305,7 +305,7 @@ mod tests {
     use crate::{test_scene, trace::World};
 
     #[test]
-    fn neighbours_overlap_as_asked() {
+    fn neighbouring_images_have_the_requested_overlap() {
         let city = test_scene::city();
         let settings = Survey { height_metres: 50.0, forward_overlap: 0.8, side_overlap: 0.5, ..Survey::default() };
         let shots = survey(&city, &settings).unwrap();
@@ -330,7 +330,7 @@ mod tests {
     }
 
     #[test]
-    fn surveillance_cameras_stay_and_see_their_street() {
+    fn surveillance_cameras_are_static_and_face_down() {
         let city = test_scene::city();
         let world = World::new(&city).unwrap();
         let shots = fixed(&world.at(0.0), &Fixed { cameras: 3, pictures: 4, ..Fixed::default() }).unwrap();
@@ -340,7 +340,7 @@ mod tests {
     }
 
     #[test]
-    fn a_free_path_passes_its_waypoints() {
+    fn a_free_path_passes_through_its_waypoints() {
         let at = |seconds: f64, x: f64, y: f64| Waypoint {
             seconds,
             world_from_asset: test_scene::pose_at_point(DVec3::new(x, y, 2.0)),

@@ -25,7 +25,7 @@ fn take(shot: &Shot, faults: &[Fault]) -> Frame {
 }
 
 #[test]
-fn rays_meet_boxes_where_arithmetic_says() {
+fn rays_hit_boxes_at_the_computed_distance() {
     let city = test_scene::city();
     let world = World::new(&city).unwrap();
     let moment = world.at(0.0);
@@ -40,7 +40,7 @@ fn rays_meet_boxes_where_arithmetic_says() {
     let (roof, _) = cast(vec3(19.0, 0.0, 14.0), vec3(19.0, 12.0, 9.0)).unwrap();
     assert!((roof.distance - 13.0).abs() < 1e-4 && roof.normal == Vec3::Z);
     assert!(cast(vec3(0.0, 0.0, 5.0), vec3(0.0, 0.0, 9.0)).is_none());
-    // along an axis, whatever the sign of zero
+    // along an axis, for both signs of zero
     for direction in [-Vec3::Z, vec3(0.0, 0.0, -1.0), vec3(-0.0, 0.0, -1.0)] {
         let ray = Ray::new(vec3(20.5, 12.25, 14.0), direction);
         let hit = moment.cast(&ray, RayMask::All);
@@ -56,7 +56,7 @@ fn rays_meet_boxes_where_arithmetic_says() {
 }
 
 #[test]
-fn every_instruction_set_meets_the_same() {
+fn every_instruction_set_gives_the_same_hits() {
     let city = City::generate(&CitySettings { area_km2: 0.05, ..CitySettings::default() }).unwrap();
     let world = World::new(&city).unwrap();
     let moment = world.at(3.0);
@@ -77,7 +77,7 @@ fn every_instruction_set_meets_the_same() {
 }
 
 #[test]
-fn no_ray_slips_between_two_triangles() {
+fn no_ray_passes_between_two_triangles() {
     let city = test_scene::city();
     let world = World::new(&city).unwrap();
     let moment = world.at(0.0);
@@ -90,7 +90,7 @@ fn no_ray_slips_between_two_triangles() {
 }
 
 #[test]
-fn depth_of_one_view_lands_on_another() {
+fn depth_of_one_view_reprojects_into_another() {
     let (a, b) = (DVec3::new(-6.0, -9.0, 3.0), DVec3::new(-2.0, -8.0, 4.0));
     let (target, there) = (DVec3::new(6.0, 10.0, 2.0), shot(b, DVec3::new(6.0, 10.0, 2.0), 100.0));
     let first = take(&shot(a, target, 100.0), &[]);
@@ -162,7 +162,7 @@ fn shadows_fall_away_from_the_sun() {
 }
 
 #[test]
-fn corners_are_darker_only_where_something_is_near() {
+fn ambient_occlusion_darkens_only_near_occluders() {
     let shot = shot(DVec3::new(10.0, 0.0, 2.0), DVec3::new(14.0, 12.0, 0.0), 100.0);
     let city = test_scene::city();
     let world = World::new(&city).unwrap();
@@ -175,7 +175,7 @@ fn corners_are_darker_only_where_something_is_near() {
 }
 
 #[test]
-fn rolling_shutters_lean_and_blurs_smear() {
+fn rolling_shutter_skews_and_motion_blur_smears() {
     let still = shot(DVec3::new(-10.0, -12.0, 2.0), DVec3::new(-10.0, 0.0, 1.0), 2.0);
     let (sharp, mut rolling, mut blurred) = (take(&still, &[]), still.clone(), still);
     let first = |frame: &Frame, row: usize| (0..96).find(|x| frame.moves[row * 96 + x] == 1);
@@ -249,7 +249,7 @@ fn every_fault_changes_nothing_at_zero_and_something_at_one() {
 }
 
 #[test]
-fn broken_cities_and_shots_are_refused() {
+fn invalid_cities_and_shots_are_refused() {
     let broken = |change: &dyn Fn(&mut City)| {
         let mut city = test_scene::city();
         change(&mut city);
