@@ -1,11 +1,11 @@
-//! How much scheduling costs: a job of many tasks on many workers, in simulated time, without faults.
+//! Benchmark of the scheduler: a job of many tasks on many workers, in simulated time, without faults.
 //!
 //! ```text
 //! cargo run --release -p cluster --example scale -- --tasks 100000 --workers 10000 [--json]
 //! ```
-//! The job is a quadtree as plans make them: a block waits for its parent and for up to three neighbours of the parent. Tasks
-//! take about 30 seconds, half of the workers are twice as fast as the others, and every worker gives a sign of life four
-//! times a lease. All figures but the simulated times are of this machine, one thread.
+//! The job is a quadtree like those of plans: a block depends on its parent and on up to three neighbours of the parent. Tasks take
+//! about 30 seconds. Half of the workers are twice as fast as the others. Every worker sends four heartbeats per lease. All figures
+//! except simulated times are measured on this machine with one thread.
 
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
@@ -20,9 +20,9 @@ use scene::ArtefactId;
 use serde_json::json;
 
 const JOB: JobId = JobId(1);
-/// Milliseconds of a mean task on a worker of unit speed.
+/// Mean duration of a task on a worker of unit speed, milliseconds.
 const TASK_MILLIS: u64 = 30_000;
-/// A task that is asked about, for the share of scheduling in it: seconds.
+/// Reference task duration for the share of scheduling time, seconds.
 const TASK_SECONDS: f64 = 30.0;
 
 fn main() -> ExitCode {
@@ -40,34 +40,34 @@ fn main() -> ExitCode {
             _ => None,
         };
         if known.is_none() {
-            eprintln!("'{arg}' is not known or lacks a number; usage: scale [--tasks N] [--workers N] [--json]");
+            eprintln!("'{arg}' is unknown or has no number; usage: scale [--tasks N] [--workers N] [--json]");
             return ExitCode::from(2);
         }
     }
     match measure(tasks, workers) {
         Ok(figures) if as_json => println!("{figures}"),
         Ok(figures) => {
-            for (what, figure) in figures.as_object().into_iter().flatten() {
-                println!("{what:>28}  {figure}");
+            for (name, figure) in figures.as_object().into_iter().flatten() {
+                println!("{name:>28}  {figure}");
             }
         }
-        Err(what) => {
-            eprintln!("{what}");
+        Err(error) => {
+            eprintln!("{error}");
             return ExitCode::from(1);
         }
     }
     ExitCode::SUCCESS
 }
 
-/// What a worker does next, by when.
+/// The next action of a worker.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 enum Due {
-    Asks,
-    Beats { attempt: AttemptId, began: u64, ends: u64 },
-    Ends { attempt: AttemptId },
+    Request,
+    Heartbeat { attempt: AttemptId, began: u64, ends: u64 },
+    Completion { attempt: AttemptId },
 }
 
-/// Time that the scheduler took, and for how many events.
+/// Time spent in the scheduler and number of events.
 #[derive(Default)]
 struct Cost {
     spent: Duration,
@@ -103,51 +103,51 @@ fn measure(tasks: u32, workers: u32) -> Result<serde_json::Value, String> {
     for worker in 0..workers {
         let offer = Offer { backend: "cpu".into(), memory_bytes: 16 << 30, cached: Vec::new() };
         scheduler.step(0, Event::Joined { worker: WorkerId(worker), offer });
-        due.push(Reverse((random.between(0, 1000), worker, Due::Asks)));
+        due.push(Reverse((random.between(0, 1000), worker, Due::Request)));
     }
     let (mut granted, mut second, mut last) = (0u64, 0u64, 0u64);
-    // Of each worker, what it is at: alarms of attempts that were stopped are dropped.
+    // The current attempt of each worker. Timers of stopped attempts are ignored.
     let mut current: Vec<Option<AttemptId>> = vec![None; workers as usize];
     while let Some(Reverse((now, worker, what))) = due.pop() {
         let place = worker as usize;
         match what {
-            Due::Asks => {
+            Due::Request => {
                 for action in asking.step(&mut scheduler, now, Event::LeaseRequested { worker: WorkerId(worker) }) {
                     match action {
                         Action::Grant { attempt, .. } => {
                             granted += 1;
-                            let record = scheduler.record(JOB, attempt.task).ok_or("a grant of no task")?;
+                            let record = scheduler.record(JOB, attempt.task).ok_or("a grant of an unknown task")?;
                             second += u64::from(record.state.leases().len() > 1);
                             let work = nodes[attempt.task.0 as usize].work;
                             let takes = work * random.between(900, 1100) / 1000 / speed(worker) + 1;
                             let (began, ends) = (now, now + takes);
                             current[place] = Some(attempt);
-                            due.push(Reverse((ends, worker, Due::Ends { attempt })));
+                            due.push(Reverse((ends, worker, Due::Completion { attempt })));
                             let beat = now + settings.lease_millis / 4;
-                            due.push(Reverse((beat, worker, Due::Beats { attempt, began, ends })));
+                            due.push(Reverse((beat, worker, Due::Heartbeat { attempt, began, ends })));
                         }
                         Action::NothingYet { wait_millis, .. } if !scheduler.is_drained() => {
-                            due.push(Reverse((now + wait_millis, worker, Due::Asks)));
+                            due.push(Reverse((now + wait_millis, worker, Due::Request)));
                         }
                         _ => {}
                     }
                 }
             }
-            Due::Beats { attempt, began, ends } if current[place] == Some(attempt) && now < ends => {
+            Due::Heartbeat { attempt, began, ends } if current[place] == Some(attempt) && now < ends => {
                 let done_permille = Some(((now - began) * 1000 / (ends - began)) as u16);
                 let actions = beating.step(&mut scheduler, now, Event::Progressed { attempt, done_permille });
                 let [Action::Accepted { .. }] = &actions[..] else { return Err(format!("{actions:?}")) };
                 let beat = now + settings.lease_millis / 4;
-                due.push(Reverse((beat, worker, Due::Beats { attempt, began, ends })));
+                due.push(Reverse((beat, worker, Due::Heartbeat { attempt, began, ends })));
             }
-            Due::Ends { attempt } if current[place] == Some(attempt) => {
+            Due::Completion { attempt } if current[place] == Some(attempt) => {
                 let artefact = ArtefactId::of(&attempt.task.0.to_le_bytes());
-                let event = Event::Completed { attempt, artefact, followers: Vec::new() };
+                let event = Event::Completed { attempt, artefact, follow_ups: Vec::new() };
                 for action in ending.step(&mut scheduler, now, event) {
                     match action {
                         Action::Stop { worker, .. } => {
                             current[worker.0 as usize] = None;
-                            due.push(Reverse((now, worker.0, Due::Asks)));
+                            due.push(Reverse((now, worker.0, Due::Request)));
                         }
                         Action::JobFinished { outcome, .. } => {
                             last = now;
@@ -159,14 +159,14 @@ fn measure(tasks: u32, workers: u32) -> Result<serde_json::Value, String> {
                     }
                 }
                 current[place] = None;
-                due.push(Reverse((now, worker, Due::Asks)));
+                due.push(Reverse((now, worker, Due::Request)));
             }
             _ => {}
         }
     }
 
     let speeds: u64 = (0..workers).map(speed).sum();
-    let ideal = longest_chain(&nodes) / 2;
+    let ideal = critical_path_work(&nodes) / 2;
     let ideal = ideal.max(nodes.iter().map(|node| node.work).sum::<u64>() / speeds);
     let steps = [&submitting, &asking, &beating, &ending];
     let seconds: f64 = steps.iter().map(|cost| cost.spent.as_secs_f64()).sum();
@@ -191,7 +191,7 @@ fn measure(tasks: u32, workers: u32) -> Result<serde_json::Value, String> {
     }))
 }
 
-/// A quadtree in the order of its levels, its work between half and one and a half of the mean.
+/// A quadtree in level order. The work of tasks is between 0.5 and 1.5 of the mean.
 fn quadtree(count: u32, random: &mut Random) -> JobSpec {
     let mut tasks = Vec::with_capacity(count as usize);
     for task in 0..count {
@@ -199,7 +199,7 @@ fn quadtree(count: u32, random: &mut Random) -> JobSpec {
         if task > 0 {
             let parent = (task - 1) / 4;
             dependencies.push(TaskIndex(parent));
-            // Neighbours of the parent of its own level, roughly: what the context is cut from.
+            // Approximately the neighbours of the parent on its level, which provide the context.
             dependencies.extend((1..=3).map(|n| TaskIndex(parent.saturating_sub(n))));
         }
         let work = random.between(TASK_MILLIS / 2, TASK_MILLIS * 3 / 2);
@@ -208,8 +208,8 @@ fn quadtree(count: u32, random: &mut Random) -> JobSpec {
     JobSpec { backend: "cpu".into(), priority: 0, weight: 1, tasks }
 }
 
-/// The work on the longest chain; tasks come after those that they depend on.
-fn longest_chain(nodes: &[TaskNode]) -> u64 {
+/// The work on the critical path. Tasks are in topological order.
+fn critical_path_work(nodes: &[TaskNode]) -> u64 {
     let mut ends: Vec<u64> = Vec::with_capacity(nodes.len());
     for node in nodes {
         let begins = node.dependencies.iter().map(|task| ends[task.0 as usize]).max().unwrap_or(0);
@@ -218,7 +218,7 @@ fn longest_chain(nodes: &[TaskNode]) -> u64 {
     ends.into_iter().max().unwrap_or(0)
 }
 
-/// Of this process, bytes, where the system tells.
+/// Peak memory of this process, bytes, if the system reports it.
 fn peak_memory() -> Option<u64> {
     let status = std::fs::read_to_string("/proc/self/status").ok()?;
     let line = status.lines().find(|line| line.starts_with("VmHWM:"))?;

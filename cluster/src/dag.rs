@@ -1,58 +1,56 @@
-//! Whether a list of tasks is a directed acyclic graph, and how long the chains are that wait for each task.
+//! Validation of new tasks: their dependencies must form a directed acyclic graph.
 
-use crate::scheduler::Scheduler;
-use crate::words::{TaskIndex, TaskNode};
+use crate::types::{SIBLING_BASE, TaskIndex, TaskNode};
 
-/// Why tasks cannot become part of a job.
+/// Why tasks cannot be added to a job.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum DagError {
-    /// A dependency that is not there.
+    /// A dependency does not exist.
     #[error("task {task} depends on task {dependency}, but there are only {tasks} tasks")]
     OutOfRange {
         /// The task.
         task: u32,
-        /// What it names.
+        /// The dependency.
         dependency: u32,
-        /// How many tasks there are.
+        /// Number of tasks.
         tasks: usize,
     },
-    /// A task that waits for itself.
+    /// A task depends on itself.
     #[error("task {task} depends on itself, directly or through others")]
     Cycle {
-        /// A task on or behind the cycle.
+        /// A task on the cycle or dependent on it.
         task: u32,
     },
-    /// More tasks than a job may have.
+    /// The job would have too many tasks.
     #[error("{tasks} tasks are more than the limit of {limit}")]
     TooMany {
-        /// How many.
+        /// Number of tasks.
         tasks: usize,
-        /// How many there may be.
+        /// The limit.
         limit: u32,
     },
 }
 
-/// Tasks that may be added to a job which has `first` already: dependencies sorted, without repetitions, and counted as
-/// the job counts.
+/// Validated tasks for a job that has `first` tasks already. Dependencies are sorted, unique and use the job's indices.
 #[derive(Debug)]
 pub(crate) struct Addition {
     pub(crate) first: u32,
     pub(crate) nodes: Vec<TaskNode>,
-    /// Places in `nodes`, each after those that it depends on.
+    /// Indices into `nodes` in topological order.
     pub(crate) order: Vec<usize>,
 }
 
 impl Addition {
-    /// Checks the new tasks, in `O(tasks + dependencies · log)`.
+    /// Validates new tasks in `O(tasks + dependencies · log)`.
     pub(crate) fn new(mut nodes: Vec<TaskNode>, first: u32, limit: u32) -> Result<Self, DagError> {
         let tasks = (first as usize).saturating_add(nodes.len());
-        if tasks > limit.min(Scheduler::FOLLOWER) as usize {
+        if tasks > limit.min(SIBLING_BASE) as usize {
             return Err(DagError::TooMany { tasks, limit });
         }
         for (task, node) in (first..).zip(&mut nodes) {
             for dependency in &mut node.dependencies {
-                // A follower counts its siblings from FOLLOWER, as it cannot know how many tasks there will be.
-                let index = match dependency.0.checked_sub(Scheduler::FOLLOWER) {
+                // A follow-up task refers to its siblings relative to SIBLING_BASE.
+                let index = match dependency.0.checked_sub(SIBLING_BASE) {
                     Some(sibling) if first > 0 => sibling.saturating_add(first),
                     _ => dependency.0,
                 };
@@ -69,8 +67,8 @@ impl Addition {
     }
 }
 
-/// Kahn's algorithm among the new tasks; those that are there already depend on none of these. The first that no order of
-/// work reaches is the error.
+/// A topological order of the new tasks (Kahn's algorithm). Existing tasks depend on none of them. The error is the first task that is
+/// not reachable.
 fn order(nodes: &[TaskNode], first: u32) -> Result<Vec<usize>, usize> {
     let inner = |node: &TaskNode| -> Vec<usize> {
         node.dependencies.iter().filter_map(|task| task.0.checked_sub(first)).map(|place| place as usize).collect()
@@ -96,10 +94,10 @@ fn order(nodes: &[TaskNode], first: u32) -> Result<Vec<usize>, usize> {
     missing.iter().position(|&missing| missing > 0).map_or(Ok(reached), Err)
 }
 
-/// Half octaves of the work on the longest chain that begins with a task: tasks of the same class count as equal.
-pub(crate) fn class(chain: u64) -> u8 {
-    let octave = chain.max(1).ilog2();
-    let half = octave > 0 && chain >> (octave - 1) & 1 == 1;
+/// The class of a critical path in half octaves. Tasks of the same class count as equally urgent.
+pub(crate) fn urgency_class(critical_path: u64) -> u8 {
+    let octave = critical_path.max(1).ilog2();
+    let half = octave > 0 && critical_path >> (octave - 1) & 1 == 1;
     (2 * octave + u32::from(half)) as u8
 }
 
@@ -109,7 +107,7 @@ mod tests {
 
     #[test]
     fn classes_grow_by_half_octaves() {
-        let classes: Vec<u8> = [0, 1, 2, 3, 4, 5, 6, 7, 8, u64::MAX].into_iter().map(class).collect();
+        let classes: Vec<u8> = [0, 1, 2, 3, 4, 5, 6, 7, 8, u64::MAX].into_iter().map(urgency_class).collect();
         assert_eq!(classes, [0, 0, 2, 3, 4, 4, 5, 5, 6, 127]);
     }
 }

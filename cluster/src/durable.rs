@@ -1,24 +1,24 @@
-//! What a step makes durable: the one answer for the coordinator and for the simulation that checks it.
+//! The durable changes of a step. The coordinator and the simulation use the same code.
 
 use std::collections::BTreeMap;
 
 use crate::events::{Action, Event};
 use crate::scheduler::Scheduler;
 use crate::snapshot::JobHeader;
-use crate::words::{JobId, TaskIndex, TaskRecord};
+use crate::types::{JobId, TaskIndex, TaskRecord};
 
-/// What one or more steps write, all or nothing, before what they said is carried out.
+/// The changes of one or more steps. They must be written atomically before the actions of these steps are carried out.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Changes {
-    /// Jobs whose header changed; `None`: the job and its tasks are forgotten.
+    /// Headers that changed; `None`: the job and its tasks are deleted.
     pub headers: BTreeMap<JobId, Option<JobHeader>>,
-    /// Tasks whose record changed.
+    /// Task records that changed.
     pub records: BTreeMap<(JobId, TaskIndex), TaskRecord>,
 }
 
 impl Changes {
-    /// What must be durable before these actions, the scheduler's answer to this event, are carried out: what they name,
-    /// nothing else.
+    /// The changes that must be durable before these actions are carried out: the records and headers that they name. `actions` is the
+    /// scheduler's answer to `event`.
     pub fn of(scheduler: &Scheduler, event: &Event, actions: &[Action]) -> Self {
         let mut changes = Self::default();
         for action in actions {
@@ -40,7 +40,7 @@ impl Changes {
         changes
     }
 
-    /// Adds what a later step changed.
+    /// Adds the changes of a later step.
     pub fn absorb(&mut self, later: Self) {
         for (job, header) in later.headers {
             if header.is_none() {
@@ -51,7 +51,7 @@ impl Changes {
         self.records.extend(later.records);
     }
 
-    /// Whether there is nothing to write.
+    /// Whether there are no changes.
     pub fn is_empty(&self) -> bool {
         self.headers.is_empty() && self.records.is_empty()
     }

@@ -1,63 +1,62 @@
-//! What happens to the scheduler, and what it asks for. Both are plain values with a serde form: a journal of events is a
-//! file that the simulator replays.
+//! The scheduler's inputs (events) and outputs (actions). Both are serialisable values, so that a journal of events can be replayed.
 
 use scene::ArtefactId;
 use serde::{Deserialize, Serialize};
 
-use crate::words::{AttemptId, JobId, JobSpec, Offer, TaskIndex, TaskNode, WorkerId};
+use crate::types::{AttemptId, JobId, JobSpec, Offer, TaskIndex, TaskNode, WorkerId};
 
-/// Whose fault a failure is, which decides what comes next.
+/// The cause of a failure. It determines the retry policy.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub enum FailureKind {
-    /// The input's: no other worker would fare better, the task fails at once.
+    /// The input is invalid for every worker. The task fails at once.
     Input,
-    /// The work's (a panic, a full disk): another attempt may succeed, a few times.
+    /// The work failed (a panic, a full disk). Retried a few times.
     Work,
-    /// What is around it (the store is away): again after a pause.
+    /// The infrastructure failed (the store is unreachable). Retried after a backoff.
     Infrastructure,
-    /// It took more memory than the worker has: again where there is more.
+    /// The worker ran out of memory. Retried on a worker with more memory.
     OutOfMemory,
-    /// It diverged: once again, with a lower rate.
+    /// Training diverged. Retried once, with a lower learning rate.
     Numeric,
-    /// Nobody's: the worker is leaving and gives the task back.
+    /// No failure: the worker leaves and returns the task.
     GivenBack,
 }
 
 /// Why an attempt ended without a result.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Failure {
-    /// Whose fault it is.
+    /// The cause.
     pub kind: FailureKind,
-    /// One line for a person.
+    /// One line for the user.
     pub message: String,
 }
 
-/// What happened outside.
+/// An input of the scheduler.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Event {
     /// A new job.
     Submitted {
         /// Its number, not used before.
         job: JobId,
-        /// What is to be done.
+        /// Its tasks and settings.
         spec: JobSpec,
     },
-    /// A person wants the job to stop for good; what is done stays done.
+    /// A user cancels the job. Completed tasks keep their results.
     CancelRequested {
         /// The job.
         job: JobId,
     },
-    /// A person wants no further grants of this job; attempts under way go on.
+    /// A user pauses the job: no further grants. Running attempts continue.
     PauseRequested {
         /// The job.
         job: JobId,
     },
-    /// A person wants a paused job to go on.
+    /// A user resumes a paused job.
     ResumeRequested {
         /// The job.
         job: JobId,
     },
-    /// A person wants the job to go sooner or later than others.
+    /// A user changes the priority or weight of the job.
     ReprioritiseRequested {
         /// The job.
         job: JobId,
@@ -66,146 +65,148 @@ pub enum Event {
         /// As in [`JobSpec`].
         weight: u32,
     },
-    /// A person wants a task that failed or was quarantined to be tried again, its past forgiven.
+    /// A user retries a failed or quarantined task. Its failure counters are reset.
     RetryRequested {
         /// The job.
         job: JobId,
         /// The task.
         task: TaskIndex,
     },
-    /// A job that is over need not be remembered.
+    /// A user deletes a job that is over.
     ForgetRequested {
         /// The job.
         job: JobId,
     },
-    /// A worker is there, and this is what it can do now. Not answered.
+    /// A worker registers or updates its offer. Not answered.
     Joined {
-        /// Who.
+        /// The worker.
         worker: WorkerId,
-        /// What it can do.
+        /// Its backend, memory and cache.
         offer: Offer,
     },
-    /// A worker leaves: what it holds is given back. Not answered.
+    /// A worker leaves and returns its task. Not answered.
     Left {
-        /// Who.
+        /// The worker.
         worker: WorkerId,
     },
-    /// This worker is idle and wants a task; a lease it still held is lost (it restarted, or never heard of the grant).
+    /// An idle worker asks for a task. A lease that it still holds is lost (it restarted, or did not receive the grant).
     LeaseRequested {
-        /// Who asks.
+        /// The worker.
         worker: WorkerId,
     },
-    /// A sign of life, which extends the lease.
+    /// A heartbeat. It extends the lease.
     Progressed {
-        /// Of which attempt.
+        /// The attempt.
         attempt: AttemptId,
-        /// How much of the task is done in thousandths, where it says.
+        /// Progress in thousandths, if reported.
         done_permille: Option<u16>,
     },
-    /// The attempt has its result in the store.
+    /// The attempt completed; its result is in the store.
     Completed {
-        /// Which attempt.
+        /// The attempt.
         attempt: AttemptId,
         /// The result.
         artefact: ArtefactId,
-        /// Tasks that follow from it. Their dependencies may be any task of the job and each other; the first of them has
-        /// the index that is the number of tasks when the scheduler takes this in, so among themselves they are counted
-        /// from [`Scheduler::FOLLOWER`](crate::Scheduler::FOLLOWER).
-        followers: Vec<TaskNode>,
+        /// Follow-up tasks that the result adds to the job. They may depend on any task of the job, and on each other by
+        /// [`SIBLING_BASE`](crate::SIBLING_BASE) plus their position in this list.
+        #[serde(rename = "followers")]
+        follow_ups: Vec<TaskNode>,
     },
     /// The attempt ended without a result.
     Failed {
-        /// Which attempt.
+        /// The attempt.
         attempt: AttemptId,
-        /// Why.
+        /// The failure.
         failure: Failure,
     },
-    /// Nothing but time went by. (Every event looks at the clock; ticks are for when nothing else comes.)
+    /// Time passed without another event.
     Ticked,
 }
 
-/// What is to be done outside. Of each event that a person, a worker or an attempt sent, exactly one action is the
-/// answer: `Agreed` or `Declined` to a person; `Grant`, `NothingYet` or `Unknown` to a worker that asks; `Accepted` or
-/// `Refused` to an attempt.
+/// An output of the scheduler, to be carried out by the caller.
 ///
-/// What `Changed` and `Agreed` name must be durable before any action of the same step is carried out; nothing else need be.
+/// Each request gets exactly one answer: a user's command `Agreed` or `Declined`; a worker's request for a task `Grant`, `NothingYet` or
+/// `Unknown`; a report about an attempt `Accepted` or `Refused`.
+///
+/// The records and headers that `Changed` and `Agreed` name must be durable before any action of the same step is carried out.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Action {
-    /// The worker may start.
+    /// Grants a task to a worker.
     Grant {
-        /// Who.
+        /// The worker.
         worker: WorkerId,
-        /// What, under which fence.
+        /// The attempt, with its fencing token.
         attempt: AttemptId,
-        /// Until when, without a sign of life.
+        /// Expiry of the lease without a heartbeat.
         until_millis: u64,
-        /// The learning rate's factor, in thousandths.
+        /// Learning-rate factor, in thousandths.
         rate_permille: u16,
     },
-    /// Nothing is ready for this worker.
+    /// No task is available for this worker.
     NothingYet {
-        /// Who asked.
+        /// The worker.
         worker: WorkerId,
-        /// When to ask again.
+        /// Time until the next request, milliseconds.
         wait_millis: u64,
     },
-    /// The worker has to join before it asks: it was forgotten, or the scheduler is a new one.
+    /// The worker must join first: it timed out, or the scheduler was restarted.
     Unknown {
-        /// Who asked.
+        /// The worker.
         worker: WorkerId,
     },
-    /// The attempt holds its lease: the news counts, go on.
+    /// The report is accepted: the attempt holds its lease and may continue.
     Accepted {
-        /// Which attempt.
+        /// The attempt.
         attempt: AttemptId,
     },
-    /// The attempt does not hold a lease (any more): the news is void, stop.
+    /// The report is refused: the attempt holds no lease and must stop.
     Refused {
-        /// Which attempt.
+        /// The attempt.
         attempt: AttemptId,
     },
-    /// The attempt's work is no longer needed. It need not arrive: the next sign of life is refused.
+    /// The attempt must stop. Delivery is optional, because its next heartbeat is refused.
     Stop {
-        /// Whose.
+        /// The worker.
         worker: WorkerId,
-        /// Which attempt.
+        /// The attempt.
         attempt: AttemptId,
     },
-    /// What a person asked for is so.
+    /// The user's command is carried out.
     Agreed {
         /// The job.
         job: JobId,
     },
-    /// What a person asked for cannot be.
+    /// The user's command is rejected.
     Declined {
         /// The job.
         job: JobId,
-        /// Why, one line.
-        why: String,
+        /// The reason, one line.
+        #[serde(rename = "why")]
+        reason: String,
     },
-    /// The task's record changed: for the durable state and for whoever watches.
+    /// The task's record changed and must be made durable and published.
     Changed {
         /// The job.
         job: JobId,
         /// The task.
         task: TaskIndex,
     },
-    /// The job is over. Said once, and again after each retry.
+    /// The job is over. Emitted once, and again after a retry.
     JobFinished {
         /// The job.
         job: JobId,
-        /// How.
+        /// The outcome.
         outcome: Outcome,
     },
 }
 
-/// How a job ended.
+/// The outcome of a job.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Outcome {
     /// Every task is done.
     Done,
-    /// Tasks failed or were quarantined, and what depends on them was not started.
+    /// Some tasks failed or were quarantined; their dependents were not started.
     Incomplete,
-    /// A person stopped it.
+    /// A user cancelled it.
     Cancelled,
 }

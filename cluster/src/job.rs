@@ -1,52 +1,52 @@
-//! One job: the records of its tasks, and the indices that follow from them.
+//! One job: the records of its tasks, and the indices derived from them.
 //!
-//! Every index (here and in [`Indices`]) follows from the records alone. A record changes in one place, [`Job::alter`],
-//! which takes the task out of all indices and puts it back in where it belongs, so that none can be forgotten.
+//! Every index, here and in [`Indices`], is a function of the records. Records change only in [`Job::update_record`], which removes the
+//! task from all indices and inserts it again, so that no index can become stale.
 
 use std::collections::{BTreeMap, BTreeSet};
 
 use scene::ArtefactId;
 
-use crate::dag::{Addition, class};
+use crate::dag::{Addition, urgency_class};
 use crate::events::Outcome;
-use crate::queue::Queue;
-use crate::words::{AttemptId, JobId, Settings, TaskIndex, TaskRecord, TaskState, WorkerId};
+use crate::ready_queue::ReadyQueue;
+use crate::types::{AttemptId, JobId, Settings, TaskIndex, TaskRecord, TaskState, WorkerId};
 
-/// One task: what must be remembered, and what follows from it.
+/// One task: its durable record and derived data.
 #[derive(Debug, Clone)]
 pub(crate) struct Task {
     pub(crate) record: TaskRecord,
     pub(crate) dependents: Vec<TaskIndex>,
-    /// The work of the longest chain of unfinished tasks that begins here.
-    pub(crate) chain: u64,
+    /// The critical path: the work of the longest chain of unfinished tasks that starts with this one.
+    pub(crate) critical_path: u64,
 }
 
-/// Where the tasks of all jobs are found by time and by worker.
+/// Indices over the tasks of all jobs, by time and by worker.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub(crate) struct Indices {
-    /// Soonest to end first.
+    /// Leases by expiry.
     pub(crate) leases: BTreeSet<(u64, AttemptId)>,
     pub(crate) lease_of: BTreeMap<WorkerId, AttemptId>,
-    /// Soonest to be ready first.
+    /// Delayed tasks by end of the backoff.
     pub(crate) delays: BTreeSet<(u64, JobId, TaskIndex)>,
 }
 
-/// How many tasks there are of each state.
+/// The number of tasks in each state.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Counts {
-    /// Whose dependencies are not done.
+    /// With dependencies that are not done.
     pub waiting: u32,
-    /// That may be granted.
+    /// Ready to be granted.
     pub ready: u32,
-    /// In a pause before the next attempt.
+    /// In a backoff.
     pub delayed: u32,
-    /// With an attempt under way.
+    /// With a running attempt.
     pub leased: u32,
     /// With a result.
     pub done: u32,
-    /// Whose input is wrong.
+    /// With invalid input.
     pub failed: u32,
-    /// That reached a limit.
+    /// Quarantined.
     pub quarantined: u32,
 }
 
@@ -58,21 +58,21 @@ pub(crate) struct Job {
     pub(crate) weight: u32,
     pub(crate) paused: bool,
     pub(crate) cancelled: bool,
-    /// What it had of its share: worker milliseconds by weight.
+    /// Service received, for fair share: worker milliseconds divided by weight.
     pub(crate) served: u64,
-    pub(crate) said_finished: bool,
+    pub(crate) end_announced: bool,
     pub(crate) tasks: Vec<Task>,
     pub(crate) counts: Counts,
-    /// Ready tasks by the octave of their work.
-    pub(crate) shelves: BTreeMap<u8, Queue>,
-    /// Ready tasks by the results that they read: their keys.
+    /// Ready tasks by size class.
+    pub(crate) ready_queues: BTreeMap<u8, ReadyQueue>,
+    /// Keys of ready tasks by the artefacts that they read.
     pub(crate) wanted: BTreeMap<ArtefactId, BTreeSet<u64>>,
-    /// Tasks with one attempt under way, by when its result is expected.
+    /// Tasks with exactly one running attempt, by its expected completion.
     pub(crate) running: BTreeSet<(u64, TaskIndex)>,
-    /// Where it stands in its lane's turn.
-    pub(crate) seat: Option<(u8, u64)>,
-    /// When to look whether its ready tasks fit anyone.
-    pub(crate) strand_due: Option<u64>,
+    /// Its key in the pool's fair-share order, if it is listed: priority and service received.
+    pub(crate) position: Option<(u8, u64)>,
+    /// When to check whether its ready tasks fit any worker.
+    pub(crate) unschedulable_due: Option<u64>,
     plan_order: bool,
 }
 
@@ -86,14 +86,14 @@ impl Job {
             paused: false,
             cancelled: false,
             served: 0,
-            said_finished: false,
+            end_announced: false,
             tasks: Vec::new(),
             counts: Counts::default(),
-            shelves: BTreeMap::new(),
+            ready_queues: BTreeMap::new(),
             wanted: BTreeMap::new(),
             running: BTreeSet::new(),
-            seat: None,
-            strand_due: None,
+            position: None,
+            unschedulable_due: None,
             plan_order: settings.plan_order,
         }
     }
@@ -102,7 +102,7 @@ impl Job {
         self.tasks.get(task.0 as usize)
     }
 
-    /// The record of a task that is known to be there.
+    /// The record of a task that is known to exist.
     pub(crate) fn record(&self, task: TaskIndex) -> &TaskRecord {
         &self.tasks[task.0 as usize].record
     }
@@ -126,18 +126,18 @@ impl Job {
         }
     }
 
-    /// The key of a ready task: the longest chain first, then the plan's order.
+    /// The key of a ready task: longest critical path first (by urgency class), then the plan's order.
     pub(crate) fn key(&self, task: TaskIndex) -> u64 {
-        let class = if self.plan_order { 0 } else { class(self.tasks[task.0 as usize].chain) };
+        let class = if self.plan_order { 0 } else { urgency_class(self.tasks[task.0 as usize].critical_path) };
         u64::from(u8::MAX - class) << 32 | u64::from(task.0)
     }
 
-    /// The octave of a task's work.
-    pub(crate) fn shelf(&self, task: TaskIndex) -> u8 {
+    /// The size class of a task: the octave of its work.
+    pub(crate) fn size_class(&self, task: TaskIndex) -> u8 {
         if self.plan_order { 0 } else { self.record(task).work().ilog2() as u8 }
     }
 
-    /// The results of the tasks that this one depends on, as far as they are done.
+    /// The available results of the task's dependencies.
     pub(crate) fn inputs(&self, task: TaskIndex) -> impl Iterator<Item = (TaskIndex, ArtefactId)> + '_ {
         self.record(task).node.dependencies.iter().filter_map(|&dependency| match self.record(dependency).state {
             TaskState::Done { artefact, .. } => Some((dependency, artefact)),
@@ -145,8 +145,8 @@ impl Job {
         })
     }
 
-    /// Changes a record, and all indices with it.
-    pub(crate) fn alter<T>(
+    /// Changes a record and updates all indices.
+    pub(crate) fn update_record<T>(
         &mut self,
         task: TaskIndex,
         indices: &mut Indices,
@@ -158,7 +158,7 @@ impl Job {
         result
     }
 
-    /// Adds tasks, each after those it depends on being known.
+    /// Adds validated tasks.
     pub(crate) fn add(&mut self, addition: Addition, indices: &mut Indices, now: u64) {
         let Addition { first, nodes, order } = addition;
         for (index, node) in (first..).map(TaskIndex).zip(nodes) {
@@ -180,12 +180,12 @@ impl Job {
                 attempts: 0,
                 failures: 0,
                 losses: 0,
-                troubles: 0,
-                overflows: 0,
+                infrastructure_failures: 0,
+                memory_failures: 0,
                 divergences: 0,
-                culprits: Vec::new(),
+                failed_workers: Vec::new(),
             };
-            self.tasks.push(Task { chain: record.work(), record, dependents: Vec::new() });
+            self.tasks.push(Task { critical_path: record.work(), record, dependents: Vec::new() });
         }
         for place in first..self.tasks.len() as u32 {
             for dependency in self.tasks[place as usize].record.node.dependencies.clone() {
@@ -197,33 +197,34 @@ impl Job {
         self.index_from(first, &order, indices);
     }
 
-    /// Finds the chains of the tasks from `first` on, and puts them into the indices. `order` holds their places, each
-    /// after those it depends on.
+    /// Computes the critical paths of the tasks from `first` on and indexes them. `order` is a topological order of these tasks,
+    /// relative to `first`.
     pub(crate) fn index_from(&mut self, first: u32, order: &[usize], indices: &mut Indices) {
         for place in order.iter().rev() {
             let task = first as usize + place;
-            let longest = self.tasks[task].dependents.iter().map(|&task| self.tasks[task.0 as usize].chain).max();
-            self.tasks[task].chain = self.tasks[task].record.work().saturating_add(longest.unwrap_or(0));
+            let longest =
+                self.tasks[task].dependents.iter().map(|&task| self.tasks[task.0 as usize].critical_path).max();
+            self.tasks[task].critical_path = self.tasks[task].record.work().saturating_add(longest.unwrap_or(0));
         }
         for task in (first..self.tasks.len() as u32).map(TaskIndex) {
             self.index(task, indices, true);
         }
         for task in (first..self.tasks.len() as u32).map(TaskIndex) {
-            self.lengthen(task, first, indices);
+            self.propagate_critical_path(task, first, indices);
         }
     }
 
-    /// Passes the chain of a new task on to the older ones that it waits for.
-    fn lengthen(&mut self, task: TaskIndex, first: u32, indices: &mut Indices) {
+    /// Propagates the critical path of a new task to the older tasks that it depends on.
+    fn propagate_critical_path(&mut self, task: TaskIndex, first: u32, indices: &mut Indices) {
         let mut longer = vec![task];
         while let Some(task) = longer.pop() {
-            let chain = self.tasks[task.0 as usize].chain;
+            let critical_path = self.tasks[task.0 as usize].critical_path;
             for upper in self.record(task).node.dependencies.clone() {
-                let Task { record, chain: old, .. } = &self.tasks[upper.0 as usize];
-                let new = record.work().saturating_add(chain);
+                let Task { record, critical_path: old, .. } = &self.tasks[upper.0 as usize];
+                let new = record.work().saturating_add(critical_path);
                 if upper.0 < first && new > *old && !matches!(record.state, TaskState::Done { .. }) {
                     self.index(upper, indices, false);
-                    self.tasks[upper.0 as usize].chain = new;
+                    self.tasks[upper.0 as usize].critical_path = new;
                     self.index(upper, indices, true);
                     longer.push(upper);
                 }
@@ -231,29 +232,29 @@ impl Job {
         }
     }
 
-    /// Puts a task into the indices or takes it out, by what its record says.
-    pub(crate) fn index(&mut self, task: TaskIndex, indices: &mut Indices, put: bool) {
+    /// Inserts a task into the indices or removes it, according to its record.
+    pub(crate) fn index(&mut self, task: TaskIndex, indices: &mut Indices, insert: bool) {
         let id = self.id;
         let record = &self.tasks[task.0 as usize].record;
         let count = match &record.state {
             TaskState::Waiting { .. } => &mut self.counts.waiting,
             TaskState::Ready { .. } => &mut self.counts.ready,
             TaskState::Delayed { until_millis } => {
-                toggle(&mut indices.delays, (*until_millis, id, task), put);
+                toggle(&mut indices.delays, (*until_millis, id, task), insert);
                 &mut self.counts.delayed
             }
             TaskState::Leased { leases } => {
                 for lease in leases {
                     let attempt = AttemptId { job: id, task, fence: lease.fence };
-                    toggle(&mut indices.leases, (lease.until_millis, attempt), put);
-                    if put {
+                    toggle(&mut indices.leases, (lease.until_millis, attempt), insert);
+                    if insert {
                         indices.lease_of.insert(lease.worker, attempt);
                     } else {
                         indices.lease_of.remove(&lease.worker);
                     }
                 }
                 if let [lease] = &leases[..] {
-                    toggle(&mut self.running, (lease.expected_millis, task), put);
+                    toggle(&mut self.running, (lease.expected_millis, task), insert);
                 }
                 &mut self.counts.leased
             }
@@ -261,27 +262,27 @@ impl Job {
             TaskState::Failed { .. } => &mut self.counts.failed,
             TaskState::Quarantined { .. } => &mut self.counts.quarantined,
         };
-        *count = if put { *count + 1 } else { *count - 1 };
+        *count = if insert { *count + 1 } else { *count - 1 };
         if matches!(record.state, TaskState::Ready { .. }) {
-            self.shelve(task, put);
+            self.update_ready_queue(task, insert);
         }
     }
 
-    fn shelve(&mut self, task: TaskIndex, put: bool) {
-        let (key, shelf, memory) = (self.key(task), self.shelf(task), self.record(task).memory_bytes);
-        let queue = self.shelves.entry(shelf).or_default();
-        if put {
+    fn update_ready_queue(&mut self, task: TaskIndex, insert: bool) {
+        let (key, size_class, memory) = (self.key(task), self.size_class(task), self.record(task).memory_bytes);
+        let queue = self.ready_queues.entry(size_class).or_default();
+        if insert {
             queue.insert(key, memory);
         } else {
             queue.remove(key);
         }
         if queue.is_empty() {
-            self.shelves.remove(&shelf);
+            self.ready_queues.remove(&size_class);
         }
         let inputs: Vec<ArtefactId> = self.inputs(task).map(|(_, artefact)| artefact).collect();
         for artefact in inputs {
             let keys = self.wanted.entry(artefact).or_default();
-            toggle(keys, key, put);
+            toggle(keys, key, insert);
             if keys.is_empty() {
                 self.wanted.remove(&artefact);
             }
@@ -289,13 +290,13 @@ impl Job {
     }
 }
 
-/// The task of a key.
+/// The task of a ready key.
 pub(crate) fn task_of(key: u64) -> TaskIndex {
     TaskIndex(key as u32)
 }
 
-fn toggle<T: Ord>(set: &mut BTreeSet<T>, entry: T, put: bool) {
-    if put {
+fn toggle<T: Ord>(set: &mut BTreeSet<T>, entry: T, insert: bool) {
+    if insert {
         set.insert(entry);
     } else {
         set.remove(&entry);

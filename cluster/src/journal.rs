@@ -1,11 +1,10 @@
-//! What a scheduler heard and said, a JSON object a line: the first says how it began, the others are its steps.
+//! The journal of a scheduler: JSON lines with its initial state, its events and digests of its answers.
 //!
 //! ```text
 //! {"began":{"settings":{…},"snapshot":{…},"epoch":3,"now_millis":0}}
 //! {"step":{"now_millis":17,"event":{…},"said":1234}}
 //! ```
-//! Written beside a running coordinator and replayed by [`replay`], which is deterministic: the same events give the same
-//! actions, and `said` tells whether they did.
+//! A coordinator can write a journal while it runs. [`replay`] repeats the steps and compares the actions by their digests (`said`).
 
 use std::fmt;
 
@@ -17,67 +16,68 @@ use crate::events::{Action, Event};
 use crate::invariants::{check, check_step};
 use crate::scheduler::Scheduler;
 use crate::snapshot::Snapshot;
-use crate::words::Settings;
+use crate::types::Settings;
 
-/// The longest line that is read, in bytes.
+/// Maximum length of a line, bytes.
 pub const LINE_BYTES_LIMIT: usize = 256 << 20;
 
-/// The invariants are checked after each step while there are no more tasks than this.
-const CHECKED_TASKS: usize = 2000;
+/// The invariants are checked after each step up to this number of tasks.
+const MAX_CHECKED_TASKS: usize = 2000;
 
 /// A line of the journal.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Line {
-    /// How the scheduler began.
+    /// The initial state of the scheduler.
     Began {
-        /// Its limits.
+        /// Its settings.
         settings: Settings,
-        /// What it was restored from; empty for a new one.
+        /// The snapshot it was restored from; empty for a new one.
         snapshot: Snapshot,
         /// Its epoch.
         epoch: u64,
-        /// When.
+        /// Time, milliseconds.
         now_millis: u64,
     },
     /// One step.
     Step {
-        /// When.
+        /// Time, milliseconds.
         now_millis: u64,
-        /// What it heard.
+        /// The event.
         event: Event,
-        /// [`digest`] of what it answered.
-        said: u64,
+        /// [`digest`] of the actions.
+        #[serde(rename = "said")]
+        answer: u64,
     },
 }
 
-/// The first 64 bits of the hash of some actions.
+/// The first 64 bits of the hash of the actions' JSON.
 pub fn digest(actions: &[Action]) -> u64 {
     ArtefactId::of(&serde_json::to_vec(actions).unwrap_or_default()).seed()
 }
 
-/// A line as text, without the line break.
+/// Encodes a line as JSON, without the line break.
 pub fn to_text(line: &Line) -> String {
-    // Maps with keys that are no strings cannot occur in these types.
+    // These types contain no maps with non-string keys, so encoding cannot fail.
     serde_json::to_string(line).unwrap_or_default()
 }
 
-/// What came of a replay.
+/// The result of a replay.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Replayed {
-    /// Steps taken.
+    /// Number of steps.
     pub steps: u64,
-    /// Restarts within the journal.
+    /// Number of restarts in the journal.
     pub restarts: u64,
-    /// The state at the end.
+    /// The final state.
     pub last: Snapshot,
 }
 
-/// Takes all steps of a journal again, checks the invariants after each, and compares what is answered. A last line that
-/// was cut off is left out, as a killed process leaves one.
+/// Replays a journal: repeats all steps, checks the invariants after each and compares the actions. A truncated last line, as a killed
+/// process leaves it, is ignored.
 ///
 /// # Errors
-/// The line, and what is wrong with it: not a line of a journal, an invariant that does not hold, another answer.
+/// The line number and the problem: an invalid line, a violated invariant, or different actions.
 pub fn replay<'a>(
     lines: impl Iterator<Item = &'a str>,
     mut trace: impl FnMut(fmt::Arguments<'_>),
@@ -101,17 +101,17 @@ pub fn replay<'a>(
                 let restored = Scheduler::restore(snapshot, settings, epoch, now_millis);
                 *scheduler = Some(restored.map_err(|error| wrong(error.to_string()))?);
             }
-            (Line::Step { .. }, None) => return Err(wrong("a step before the journal says how it began".into())),
-            (Line::Step { now_millis, event, said }, Some(scheduler)) => {
-                let before = (scheduler.total() <= CHECKED_TASKS).then(|| scheduler.clone());
+            (Line::Step { .. }, None) => return Err(wrong("a step before the initial state".into())),
+            (Line::Step { now_millis, event, answer }, Some(scheduler)) => {
+                let before = (scheduler.total() <= MAX_CHECKED_TASKS).then(|| scheduler.clone());
                 let actions = scheduler.step(now_millis, event.clone());
                 trace(format_args!("{now_millis} {event:?} -> {actions:?}"));
                 if let Some(before) = before {
-                    let held = check(scheduler).and_then(|()| check_step(&before, scheduler, &event, &actions));
-                    held.map_err(|violation| wrong(violation.to_string()))?;
+                    let checked = check(scheduler).and_then(|()| check_step(&before, scheduler, &event, &actions));
+                    checked.map_err(|violation| wrong(violation.to_string()))?;
                 }
-                if digest(&actions) != said {
-                    return Err(wrong(format!("another answer than then: {actions:?}")));
+                if digest(&actions) != answer {
+                    return Err(wrong(format!("the actions differ from the journal: {actions:?}")));
                 }
                 steps += 1;
             }

@@ -1,12 +1,13 @@
-//! Who trains what, when: the scheduler of all jobs as a state machine, `step(now, event) -> actions`.
+//! The scheduler of all jobs as a sans-I/O state machine: `step(now, event) -> actions`.
 //!
-//! Architecture invariant: no I/O, no clock, no thread, no randomness. Time and events come in as values, and what is to
-//! be done goes out as values, so that a test can play years of faults in a second. It knows tasks and artefacts' names,
-//! never splats, files or sockets.
+//! Architecture invariant: no I/O, no clock, no thread, no randomness. Time and events are inputs, actions are outputs, so that a
+//! deterministic simulation can test years of faults in seconds. The scheduler knows tasks and artefact ids, but no splats, files or
+//! sockets.
 //!
-//! - [`Scheduler`] is the state machine; `job`, `dag`, `queue`, `lanes`, `placement` and `retry` are its parts.
-//! - [`Snapshot`] is what must be durable of it, [`Changes`] what a step changes of that, [`journal`] what it heard as lines of JSON.
-//! - [`check`] and [`check_step`] are the numbered invariants, [`sim`] plays faults by seed.
+//! - [`Scheduler`] is the state machine. Its parts are `job`, `dag`, `ready_queue`, `pools`, `placement`, `attempts`, `timers` and
+//!   `retry`.
+//! - [`Snapshot`] is its durable state, [`Changes`] the part that a step changes, [`journal`] the log of its events as lines of JSON.
+//! - [`check`] and [`check_step`] check the numbered invariants. [`sim`] is the deterministic simulation with fault injection.
 
 mod attempts;
 mod control;
@@ -16,16 +17,16 @@ mod events;
 mod invariants;
 mod job;
 pub mod journal;
-mod lanes;
 mod placement;
-mod queue;
+mod pools;
+mod ready_queue;
 mod retry;
 mod scheduler;
 pub mod sim;
 mod snapshot;
 mod tally;
-mod upkeep;
-mod words;
+mod timers;
+mod types;
 
 pub use dag::DagError;
 pub use durable::Changes;
@@ -35,7 +36,7 @@ pub use job::Counts;
 pub use scheduler::Scheduler;
 pub use snapshot::{JobHeader, JobSnapshot, RestoreError, Snapshot};
 pub use tally::Tally;
-pub use words::{
-    AttemptId, CACHED_LIMIT, FULL_RATE, Fence, JobId, JobSpec, Lease, Offer, Settings, TaskIndex, TaskNode, TaskRecord,
-    TaskState, WorkerId,
+pub use types::{
+    AttemptId, CACHED_LIMIT, FULL_RATE, Fence, JobId, JobSpec, Lease, Offer, SIBLING_BASE, Settings, TaskIndex,
+    TaskNode, TaskRecord, TaskState, WorkerId,
 };

@@ -1,29 +1,30 @@
-//! The ladder of a task:
+//! The scheduler's state and its entry point [`Scheduler::step`].
+//!
+//! The states of a task:
 //!
 //! ```text
-//!                               pause over
-//!                            ┌──────────────── Delayed ◀─┐ trouble that may pass
+//!                              backoff over
+//!                            ┌──────────────── Delayed ◀─┐ infrastructure failure, lost worker
 //!                            ▼                           │
 //! Waiting ──all done──▶ Ready ──────granted──────▶ Leased ──completed──▶ Done
 //!    ▲                   ▲ │                      │ │ ▲ │
-//!    │                   │ │ fits no worker       │ │ └─┘ late: a second attempt elsewhere, the first result wins
-//!  tasks that follow     │ ▼                      │ └──the input's fault──▶ Failed ─────┐
-//!  from a result         │ Quarantined ◀──────────┘ a limit is reached                  │
-//!                        ├──────┴──────────────────a person retries it─────────────────┘
+//!    │                   │ │ fits no worker       │ │ └─┘ straggler: a speculative attempt, the first result wins
+//!  follow-up tasks       │ ▼                      │ └──invalid input────▶ Failed ───────┐
+//!  of a result           │ Quarantined ◀──────────┘ a limit is reached                  │
+//!                        ├──────┴──────────────────retried by a user───────────────────┘
 //!                        └──given back, failed or lost below the limits── (Leased)
 //! ```
 //!
-//! Each grant is a new **attempt**, fenced by the scheduler's epoch and a number that grows per task. Whatever a worker
-//! says about an attempt that holds no lease is refused, so a zombie can waste work and never corrupt it. What depends on
-//! a task that failed stays `Waiting` (its branch is a hole, all other branches go on), and a job is over when nothing is
-//! ready, delayed or leased.
+//! Each grant is a new **attempt**, fenced by the scheduler's epoch and a number that grows per task. Reports about an attempt that
+//! holds no lease are refused, so a zombie worker can waste work but not corrupt results. Dependents of a failed task stay
+//! `Waiting`, all other branches continue. A job is over when no task is ready, delayed or leased.
 //!
-//! A restarted scheduler ([`Scheduler::restore`]) has a higher epoch. Attempts that the snapshot holds go on under the epoch
-//! that granted them, each with a whole new lease; attempts that it does not hold were never durable, so they were never
-//! announced, and are refused whatever their number.
+//! A restarted scheduler ([`Scheduler::restore`]) has a higher epoch. Attempts in the snapshot continue under the epoch that granted
+//! them, with a renewed lease. Attempts that are not in the snapshot were never durable, so their grants were never sent. Reports
+//! about them are refused.
 //!
-//! Costs: `O(log)` of tasks and workers per event, plus the dependents of a task when it is done and the tasks of a job
-//! when it is submitted, cancelled or stranded.
+//! Cost per event: `O(log)` of tasks and workers, plus the dependents of a task that completes, plus the tasks of a job that is
+//! submitted, cancelled or unschedulable.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -31,9 +32,9 @@ use scene::ArtefactId;
 
 use crate::events::{Action, Event, Outcome};
 use crate::job::{Counts, Indices, Job};
-use crate::lanes::{Lane, Worker};
+use crate::pools::{Pool, Worker};
 use crate::tally::Tally;
-use crate::words::{AttemptId, JobId, Offer, Settings, TaskIndex, TaskRecord, WorkerId};
+use crate::types::{AttemptId, JobId, Offer, Settings, TaskIndex, TaskRecord, WorkerId};
 
 /// The scheduler of all jobs.
 #[derive(Debug, Clone)]
@@ -43,24 +44,21 @@ pub struct Scheduler {
     pub(crate) now_millis: u64,
     pub(crate) jobs: BTreeMap<JobId, Job>,
     pub(crate) workers: BTreeMap<WorkerId, Worker>,
-    pub(crate) lanes: BTreeMap<String, Lane>,
+    pub(crate) pools: BTreeMap<String, Pool>,
     pub(crate) indices: Indices,
-    /// When to look whether a worker is silent.
-    pub(crate) silences: BTreeSet<(u64, WorkerId)>,
-    /// When to look whether a job's ready tasks fit anyone.
-    pub(crate) strands: BTreeSet<(u64, JobId)>,
-    /// Jobs whose end was not announced.
+    /// When to check workers for a timeout.
+    pub(crate) worker_timeouts: BTreeSet<(u64, WorkerId)>,
+    /// When to check jobs for ready tasks that fit no worker.
+    pub(crate) unschedulable_timeouts: BTreeSet<(u64, JobId)>,
+    /// Number of jobs that are not over.
     pub(crate) unfinished: usize,
-    /// Jobs that this step changed.
-    pub(crate) touched: BTreeSet<JobId>,
+    /// Jobs that the current step changed.
+    pub(crate) changed_jobs: BTreeSet<JobId>,
     pub(crate) tally: Tally,
 }
 
 impl Scheduler {
-    /// Followers count their siblings from here: see [`Event::Completed`].
-    pub const FOLLOWER: u32 = 1 << 31;
-
-    /// A scheduler without jobs. The epoch is higher than that of any scheduler of these workers before.
+    /// A scheduler without jobs. The epoch must be higher than that of every earlier scheduler of these workers.
     pub fn new(settings: Settings, epoch: u64) -> Self {
         Self {
             settings,
@@ -68,21 +66,22 @@ impl Scheduler {
             now_millis: 0,
             jobs: BTreeMap::new(),
             workers: BTreeMap::new(),
-            lanes: BTreeMap::new(),
+            pools: BTreeMap::new(),
             indices: Indices::default(),
-            silences: BTreeSet::new(),
-            strands: BTreeSet::new(),
+            worker_timeouts: BTreeSet::new(),
+            unschedulable_timeouts: BTreeSet::new(),
             unfinished: 0,
-            touched: BTreeSet::new(),
+            changed_jobs: BTreeSet::new(),
             tally: Tally::default(),
         }
     }
 
-    /// Takes in one event at this time and says what is to be done, in order. A clock that steps back stands still.
+    /// Processes one event at this time and returns the actions to carry out, in order. A time before the last one counts as the last
+    /// one.
     pub fn step(&mut self, now_millis: u64, event: Event) -> Vec<Action> {
         let mut actions = Vec::new();
         self.now_millis = self.now_millis.max(now_millis);
-        self.pass_time(&mut actions);
+        self.expire_timers(&mut actions);
         match event {
             Event::Submitted { job, spec } => self.submit(job, spec, &mut actions),
             Event::CancelRequested { job } => self.cancel(job, &mut actions),
@@ -97,97 +96,97 @@ impl Scheduler {
             Event::Left { worker } => self.leave(worker, &mut actions),
             Event::LeaseRequested { worker } => self.lease(worker, &mut actions),
             Event::Progressed { attempt, done_permille } => self.progress(attempt, done_permille, &mut actions),
-            Event::Completed { attempt, artefact, followers } => {
-                self.complete(attempt, artefact, followers, &mut actions);
+            Event::Completed { attempt, artefact, follow_ups } => {
+                self.complete(attempt, artefact, follow_ups, &mut actions);
             }
             Event::Failed { attempt, failure } => self.fail(attempt, failure, &mut actions),
             Event::Ticked => {}
         }
-        self.settle(&mut actions);
-        self.tally.note(&actions);
+        self.finish_step(&mut actions);
+        self.tally.record_step(&actions);
         actions
     }
 
-    /// Under which epoch it grants.
+    /// The epoch of its grants.
     pub fn epoch(&self) -> u64 {
         self.epoch
     }
 
-    /// All jobs, oldest number first.
+    /// All jobs in ascending order.
     pub fn jobs(&self) -> impl Iterator<Item = JobId> + '_ {
         self.jobs.keys().copied()
     }
 
-    /// Whether there are jobs, and all are over.
+    /// Whether there is at least one job and all jobs are over.
     pub fn is_drained(&self) -> bool {
         !self.jobs.is_empty() && self.unfinished == 0
     }
 
-    /// What a worker said of itself, if it is known.
+    /// The offer of a worker, if the worker is known.
     pub fn offer(&self, worker: WorkerId) -> Option<&Offer> {
         self.workers.get(&worker).map(|worker| &worker.offer)
     }
 
-    /// How many workers there are of each backend that has any.
+    /// The number of workers of each backend that has any.
     pub fn backends(&self) -> impl Iterator<Item = (&str, usize)> {
-        let lanes = self.lanes.iter().map(|(backend, lane)| (backend.as_str(), lane.memories.len()));
-        lanes.filter(|(_, workers)| *workers > 0)
+        let pools = self.pools.iter().map(|(backend, pool)| (backend.as_str(), pool.memories.len()));
+        pools.filter(|(_, workers)| *workers > 0)
     }
 
-    /// What it did since it began.
+    /// Activity counters since the start.
     pub fn tally(&self) -> Tally {
         self.tally
     }
 
-    /// How many tasks of a job are where; none if there is no such job.
+    /// The number of a job's tasks in each state; all zero for an unknown job.
     pub fn counts(&self, job: JobId) -> Counts {
         self.jobs.get(&job).map(|job| job.counts).unwrap_or_default()
     }
 
-    /// Whether a person paused the job.
+    /// Whether a user paused the job.
     pub fn is_paused(&self, job: JobId) -> bool {
         self.jobs.get(&job).is_some_and(|job| job.paused)
     }
 
-    /// Number of tasks of a job; 0 if there is no such job.
+    /// The number of tasks of a job; 0 for an unknown job.
     pub fn len(&self, job: JobId) -> usize {
         self.jobs.get(&job).map_or(0, |job| job.tasks.len())
     }
 
-    /// Number of tasks of all jobs.
+    /// The number of tasks of all jobs.
     pub fn total(&self) -> usize {
         self.jobs.values().map(|job| job.tasks.len()).sum()
     }
 
-    /// What is remembered of a task; `None` if there is no such.
+    /// The record of a task; `None` if it does not exist.
     pub fn record(&self, job: JobId, task: TaskIndex) -> Option<&TaskRecord> {
         self.jobs.get(&job)?.task(task).map(|task| &task.record)
     }
 
-    /// Whether an attempt holds its lease, so that what it says counts.
+    /// Whether an attempt holds its lease, so that its reports are accepted.
     pub fn holds(&self, attempt: AttemptId) -> bool {
-        self.holder(attempt).is_some()
+        self.find_lease(attempt).is_some()
     }
 
-    /// What is remembered of all tasks of a job, in their order.
+    /// The records of all tasks of a job, in order.
     pub fn records(&self, job: JobId) -> impl Iterator<Item = (TaskIndex, &TaskRecord)> {
         let tasks = self.jobs.get(&job).map_or(&[][..], |job| &job.tasks);
         (0..).map(TaskIndex).zip(tasks.iter().map(|task| &task.record))
     }
 
-    /// The results that this task builds on, by task: complete once the task is ready.
+    /// The results of the task's dependencies, by task. Complete once the task is ready.
     pub fn inputs(&self, job: JobId, task: TaskIndex) -> BTreeMap<TaskIndex, ArtefactId> {
         let job = self.jobs.get(&job).filter(|job| job.task(task).is_some());
         job.map(|job| job.inputs(task).collect()).unwrap_or_default()
     }
 
-    /// How the job ended, `None` while it runs or if there is none.
+    /// The outcome of a job; `None` while it runs or if it is unknown.
     pub fn finished(&self, job: JobId) -> Option<Outcome> {
         self.jobs.get(&job).filter(|job| job.is_over()).map(Job::outcome)
     }
 
-    /// Marks a job whose place and end this step has to look at.
-    pub(crate) fn touch(&mut self, job: JobId) {
-        self.touched.insert(job);
+    /// Marks a job for [`Scheduler::finish_step`].
+    pub(crate) fn mark_changed(&mut self, job: JobId) {
+        self.changed_jobs.insert(job);
     }
 }

@@ -1,31 +1,31 @@
-//! What a scheduler did since it began, counted for whoever watches it. Nothing is decided by it, and it is not durable.
+//! Counters of a scheduler's activity, for metrics. They influence no decision and are not durable.
 
 use crate::events::{Action, FailureKind};
-use crate::retry::Trouble;
+use crate::retry::FailureClass;
 
-/// Counts that only grow.
+/// Monotonic counters since the start of the scheduler.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Tally {
-    /// Events taken in.
+    /// Events processed.
     pub steps: u64,
     /// Attempts granted.
     pub grants: u64,
-    /// Of these, second attempts at stragglers.
-    pub duplicates: u64,
-    /// Results taken in; one that is told twice counts once.
+    /// Of these, speculative attempts.
+    pub speculative_attempts: u64,
+    /// Results accepted. A repeated report counts once.
     pub completions: u64,
-    /// News of attempts that hold no lease.
+    /// Reports refused because the attempt holds no lease.
     pub refusals: u64,
-    /// Attempts that ended without a result, as [`Tally::ENDS`] names them.
+    /// Attempts that ended without a result, in the order of [`Tally::ENDS`].
     pub ends: [u64; 7],
 }
 
 impl Tally {
-    /// How an attempt ends without a result: as its worker said, or `lost` where the worker vanished or hung.
+    /// Names of the classes of failure: as reported by the worker, or `lost` if the worker was lost or hung.
     pub const ENDS: [&str; 7] = ["input", "work", "infrastructure", "out_of_memory", "numeric", "given_back", "lost"];
 
-    /// Takes in what a step came to.
-    pub(crate) fn note(&mut self, actions: &[Action]) {
+    /// Counts a step and its actions.
+    pub(crate) fn record_step(&mut self, actions: &[Action]) {
         self.steps += 1;
         for action in actions {
             match action {
@@ -36,11 +36,11 @@ impl Tally {
         }
     }
 
-    /// An attempt ended without a result.
-    pub(crate) fn ended(&mut self, trouble: &Trouble) {
-        let place = match trouble {
-            Trouble::Lost => 6,
-            Trouble::Said(failure) => match failure.kind {
+    /// Counts an attempt that ended without a result.
+    pub(crate) fn record_end(&mut self, class: &FailureClass) {
+        let place = match class {
+            FailureClass::WorkerLost => 6,
+            FailureClass::Reported(failure) => match failure.kind {
                 FailureKind::Input => 0,
                 FailureKind::Work => 1,
                 FailureKind::Infrastructure => 2,

@@ -1,4 +1,4 @@
-//! What concerns many workers and several jobs: placement, second attempts, classes of trouble, shares, restarts.
+//! Scheduling of many workers and several jobs: placement, speculation, failure classes, fair share, restarts.
 
 use cluster::{
     Action, AttemptId, Event, FULL_RATE, Failure, FailureKind, JobId, JobSpec, Offer, Outcome, RestoreError, Scheduler,
@@ -50,17 +50,17 @@ impl Cluster {
         })
     }
 
-    /// The task's index that the worker is granted.
+    /// The index of the task that the worker is granted.
     fn task(&mut self, worker: u32) -> Option<u32> {
         self.ask(worker).map(|attempt| attempt.task.0)
     }
 
     fn complete(&mut self, attempt: AttemptId) -> Vec<Action> {
-        self.step(Event::Completed { attempt, artefact: result_of(attempt.task.0), followers: Vec::new() })
+        self.step(Event::Completed { attempt, artefact: result_of(attempt.task.0), follow_ups: Vec::new() })
     }
 
     fn fail(&mut self, attempt: AttemptId, kind: FailureKind) {
-        let actions = self.step(Event::Failed { attempt, failure: Failure { kind, message: "trouble".into() } });
+        let actions = self.step(Event::Failed { attempt, failure: Failure { kind, message: "failure".into() } });
         assert!(actions.contains(&Action::Accepted { attempt }));
     }
 
@@ -68,8 +68,8 @@ impl Cluster {
         self.scheduler.record(JobId(1), TaskIndex(task)).unwrap()
     }
 
-    /// Teaches the scheduler how fast a worker is by one task of a job of its own.
-    fn teach(&mut self, worker: u32, millis: u64) {
+    /// Lets the scheduler measure a worker's speed with one task of a separate job.
+    fn measure_speed(&mut self, worker: u32, millis: u64) {
         let job = 1000 + u64::from(worker);
         self.submit(job, 255, 1, vec![node(&[], 1000, 0)]);
         let attempt = self.ask(worker).unwrap();
@@ -88,9 +88,9 @@ fn result_of(task: u32) -> ArtefactId {
 }
 
 #[test]
-fn the_longest_chain_goes_first_then_the_plans_order() {
+fn the_longest_critical_path_goes_first_then_the_plans_order() {
     let mut cluster = Cluster::new();
-    // 3 heads a chain of 9; 1 and 2 are alike; 0 is small.
+    // Task 3 starts a path of 9. Tasks 1 and 2 are equal. Task 0 is small.
     cluster.submit(1, 0, 1, vec![node(&[], 1, 0), node(&[], 4, 0), node(&[], 4, 0), node(&[], 3, 0), node(&[3], 6, 0)]);
     cluster.join(1, 0, &[]);
     let mut order = Vec::new();
@@ -115,38 +115,42 @@ fn tasks_go_where_they_fit_and_where_their_inputs_are() {
     cluster.join(3, 8 * MIB, &[result_of(1)]);
     cluster.join(4, MIB, &[]);
     cluster.step(Event::Joined { worker: WorkerId(5), offer: Offer { backend: "gpu".into(), ..Offer::default() } });
-    assert_eq!(cluster.task(2), Some(3), "the first that fits");
-    assert_eq!(cluster.task(3), Some(4), "the first whose input it has");
-    assert_eq!(cluster.task(4), None, "too small for any");
+    assert_eq!(cluster.task(2), Some(3), "the first one that fits");
+    assert_eq!(cluster.task(3), Some(4), "the first one whose input is cached");
+    assert_eq!(cluster.task(4), None, "not enough memory for any task");
     assert_eq!(cluster.task(5), None, "another backend");
     assert_eq!(cluster.task(1), Some(2));
 }
 
 #[test]
-fn large_work_is_for_fast_workers() {
+fn large_tasks_are_reserved_for_fast_workers() {
     let mut cluster = Cluster::new();
     cluster.join(1, 0, &[]);
     cluster.join(2, 0, &[]);
-    cluster.teach(1, 1000);
-    cluster.teach(2, 8000);
+    cluster.measure_speed(1, 1000);
+    cluster.measure_speed(2, 8000);
     cluster.submit(1, 0, 1, vec![node(&[], 64_000, 0), node(&[], 1000, 0), node(&[], 32_000, 0), node(&[], 2000, 0)]);
-    assert_eq!(cluster.task(2), Some(3), "the largest that takes it no longer than the fast one's largest");
+    assert_eq!(
+        cluster.task(2),
+        Some(3),
+        "the largest task that takes it no longer than the largest takes the fast worker"
+    );
     assert_eq!(cluster.task(1), Some(0));
 }
 
 #[test]
-fn a_straggler_gets_a_second_attempt_and_the_first_result_wins() {
+fn a_straggler_gets_a_speculative_attempt_and_the_first_result_wins() {
     let mut cluster = Cluster::new();
     cluster.join(1, 0, &[]);
     cluster.join(2, 0, &[]);
-    cluster.teach(1, 8000);
-    cluster.teach(2, 1000);
+    cluster.measure_speed(1, 8000);
+    cluster.measure_speed(2, 1000);
     cluster.submit(1, 0, 1, vec![node(&[], 20_000, 0)]);
     let slow = cluster.ask(1).unwrap();
     let fast = cluster.ask(2).unwrap();
     assert_eq!((fast.task, fast.fence.number), (slow.task, 2));
     cluster.join(3, 0, &[]);
-    assert_eq!(cluster.ask(3), None, "two are enough");
+    assert_eq!(cluster.ask(3), None, "at most two attempts");
     cluster.now += 20_000;
     assert_eq!(cluster.step(Event::Progressed { attempt: slow, done_permille: Some(125) }).len(), 1);
     let actions = cluster.complete(fast);
@@ -156,24 +160,20 @@ fn a_straggler_gets_a_second_attempt_and_the_first_result_wins() {
 }
 
 #[test]
-fn two_attempts_that_diverge_at_once_are_one_divergence() {
+fn concurrent_attempts_that_diverge_count_as_one_divergence() {
     let mut cluster = Cluster::new();
     cluster.join(1, 0, &[]);
     cluster.join(2, 0, &[]);
-    cluster.teach(1, 8000);
-    cluster.teach(2, 1000);
+    cluster.measure_speed(1, 8000);
+    cluster.measure_speed(2, 1000);
     cluster.submit(1, 0, 1, vec![node(&[], 20_000, 0)]);
     let (slow, fast) = (cluster.ask(1).unwrap(), cluster.ask(2).unwrap());
-    assert_eq!(
-        (slow.task, fast.fence.number),
-        (fast.task, 2),
-        "a straggler's second attempt, at the full rate as well"
-    );
+    assert_eq!((slow.task, fast.fence.number), (fast.task, 2), "a speculative attempt, also at the full rate");
     let failure = Failure { kind: FailureKind::Numeric, message: "the loss is not finite".into() };
     let actions = cluster.step(Event::Failed { attempt: fast, failure: failure.clone() });
     assert!(actions.contains(&Action::Stop { worker: WorkerId(1), attempt: slow }), "{actions:?}");
     assert_eq!(cluster.step(Event::Failed { attempt: slow, failure }), [Action::Refused { attempt: slow }]);
-    // The next one has the lower rate, and only if that diverges, too, it is enough.
+    // The retry has the lower rate. Only a second divergence quarantines the task.
     assert_eq!((cluster.record(0).divergences, cluster.record(0).rate_permille()), (1, FULL_RATE / 2));
     let last = cluster.ask(2).unwrap();
     cluster.fail(last, FailureKind::Numeric);
@@ -181,22 +181,22 @@ fn two_attempts_that_diverge_at_once_are_one_divergence() {
 }
 
 #[test]
-fn each_class_of_trouble_has_its_way_on() {
+fn each_failure_class_has_its_retry_policy() {
     let mut cluster = Cluster::new();
     cluster.submit(1, 0, 1, vec![node(&[], 1, 2 * MIB)]);
     cluster.join(1, 4 * MIB, &[]);
     cluster.join(2, 16 * MIB, &[]);
-    // The store is away: a pause, then again.
+    // Infrastructure failure: retry after a backoff.
     let attempt = cluster.ask(1).unwrap();
     cluster.fail(attempt, FailureKind::Infrastructure);
     assert_eq!(cluster.ask(1), None);
     cluster.now += 1000;
-    // Out of memory: where there is more.
+    // Out of memory: retry on a worker with more.
     let attempt = cluster.ask(1).unwrap();
     cluster.fail(attempt, FailureKind::OutOfMemory);
     assert_eq!(cluster.ask(1), None);
     assert_eq!(cluster.record(0).memory_bytes, 4 * MIB + 1);
-    // It diverged: once more, at half the rate.
+    // Divergence: one retry at half the learning rate.
     let attempt = cluster.ask(2).unwrap();
     cluster.fail(attempt, FailureKind::Numeric);
     let actions = cluster.step(Event::LeaseRequested { worker: WorkerId(2) });
@@ -206,28 +206,28 @@ fn each_class_of_trouble_has_its_way_on() {
     });
     let (rate, attempt) = rates.unwrap();
     assert_eq!(rate, FULL_RATE / 2);
-    // Nobody has more than the largest.
+    // Out of memory on the largest worker: quarantined.
     cluster.fail(attempt, FailureKind::OutOfMemory);
     let TaskState::Quarantined { message, .. } = &cluster.record(0).state else { panic!("{:?}", cluster.record(0)) };
-    assert!(message.contains("it needs 17 MiB or more, the largest worker has 16"), "{message}");
-    // A person tries again: the past is forgiven, the job goes on.
+    assert!(message.contains("it needs at least 17 MiB, the largest worker has 16 MiB"), "{message}");
+    // A user's retry resets the counters and the job continues.
     cluster.agree(Event::RetryRequested { job: JobId(1), task: TaskIndex(0) });
     assert_eq!((cluster.record(0).memory_bytes, cluster.scheduler.finished(JobId(1))), (2 * MIB, None));
 }
 
 #[test]
-fn what_fails_on_three_workers_is_poison_and_a_failure_goes_elsewhere_first() {
+fn a_task_that_fails_on_three_workers_is_quarantined_and_is_retried_elsewhere_first() {
     let mut cluster = Cluster::new();
     cluster.scheduler = Scheduler::new(Settings { failures_limit: 9, ..Settings::default() }, 1);
     cluster.submit(1, 0, 1, vec![node(&[], 1, 0)]);
     (1..=3).for_each(|worker| cluster.join(worker, 0, &[]));
     let attempt = cluster.ask(1).unwrap();
     cluster.fail(attempt, FailureKind::Work);
-    assert_eq!(cluster.ask(1), None, "another one may fare better");
+    assert_eq!(cluster.ask(1), None, "excluded on this worker");
     let attempt = cluster.ask(2).unwrap();
     cluster.fail(attempt, FailureKind::Work);
-    cluster.now += Settings::default().patience_millis;
-    let attempt = cluster.ask(1).expect("the other one does not ask");
+    cluster.now += Settings::default().exclusion_millis;
+    let attempt = cluster.ask(1).expect("the exclusion is over");
     cluster.fail(attempt, FailureKind::Work);
     let attempt = cluster.ask(3).unwrap();
     cluster.fail(attempt, FailureKind::Work);
@@ -235,16 +235,16 @@ fn what_fails_on_three_workers_is_poison_and_a_failure_goes_elsewhere_first() {
 }
 
 #[test]
-fn what_fits_nobody_is_quarantined_after_a_while() {
+fn an_unschedulable_task_is_quarantined_after_a_while() {
     let mut cluster = Cluster::new();
     cluster.submit(1, 0, 1, vec![node(&[], 1, 8 * MIB)]);
-    let strand = Settings::default().strand_millis;
+    let strand = Settings::default().unschedulable_millis;
     cluster.now += strand;
     cluster.step(Event::Ticked);
     assert!(matches!(cluster.record(0).state, TaskState::Ready { .. }), "there is no worker yet");
     cluster.join(1, 4 * MIB, &[]);
     assert_eq!(cluster.ask(1), None);
-    let silence = Settings::default().silence_millis;
+    let silence = Settings::default().worker_timeout_millis;
     for _ in 0..=strand / silence {
         cluster.now += silence - 1;
         assert_eq!(cluster.ask(1), None);
@@ -268,7 +268,7 @@ fn jobs_share_by_weight_within_their_class() {
         cluster.complete(attempt);
     }
     assert_eq!(served, [0, 10, 30, 0]);
-    // A job that comes later has no claim on the past, and one that is paused gets nothing.
+    // A later job has no claim to past service. A paused job gets no grants.
     cluster.submit(4, 1, 1, tasks());
     cluster.agree(Event::PauseRequested { job: JobId(2) });
     let mut next = || {
@@ -289,16 +289,16 @@ fn jobs_share_by_weight_within_their_class() {
 }
 
 #[test]
-fn tasks_follow_from_results() {
+fn results_add_follow_up_tasks() {
     let mut cluster = Cluster::new();
     cluster.submit(1, 0, 1, vec![node(&[], 1, 0), node(&[0], 1, 0)]);
     cluster.join(1, 0, &[]);
     let attempt = cluster.ask(1).unwrap();
-    let sibling = Scheduler::FOLLOWER;
-    let followers = vec![node(&[0, sibling + 1], 1, 0), node(&[1], 1, 0)];
-    let event = Event::Completed { attempt, artefact: result_of(0), followers };
+    let sibling = cluster::SIBLING_BASE;
+    let follow_ups = vec![node(&[0, sibling + 1], 1, 0), node(&[1], 1, 0)];
+    let event = Event::Completed { attempt, artefact: result_of(0), follow_ups };
     cluster.step(event.clone());
-    assert_eq!(cluster.step(event), [Action::Accepted { attempt }], "twice is once");
+    assert_eq!(cluster.step(event), [Action::Accepted { attempt }], "a repeated report is accepted");
     assert_eq!(cluster.scheduler.len(JobId(1)), 4);
     let mut order = Vec::new();
     while let Some(attempt) = cluster.ask(1) {
@@ -306,17 +306,17 @@ fn tasks_follow_from_results() {
         cluster.complete(attempt);
     }
     assert_eq!(order, [1, 3, 2]);
-    // What makes no sense fails the task that said it.
+    // Invalid follow-up tasks fail the task that reported them.
     cluster.submit(2, 0, 1, vec![node(&[], 1, 0)]);
     let attempt = cluster.ask(1).unwrap();
-    let followers = vec![node(&[sibling], 1, 0)];
-    cluster.step(Event::Completed { attempt, artefact: result_of(0), followers });
+    let follow_ups = vec![node(&[sibling], 1, 0)];
+    cluster.step(Event::Completed { attempt, artefact: result_of(0), follow_ups });
     let record = cluster.scheduler.record(JobId(2), TaskIndex(0)).unwrap();
     assert!(matches!(&record.state, TaskState::Failed { message, .. } if message.contains("depends on itself")));
 }
 
 #[test]
-fn a_worker_that_leaves_gives_back_and_one_that_hangs_is_found() {
+fn a_leaving_worker_returns_its_task_and_a_hung_worker_is_detected() {
     let mut cluster = Cluster::new();
     cluster.submit(1, 0, 1, vec![node(&[], 1, 0)]);
     cluster.join(1, 0, &[]);
@@ -326,16 +326,16 @@ fn a_worker_that_leaves_gives_back_and_one_that_hangs_is_found() {
     assert_eq!((cluster.record(0).losses, cluster.record(0).failures), (0, 0));
     cluster.join(2, 0, &[]);
     let hung = cluster.ask(2).unwrap();
-    let mut told = Vec::new();
+    let mut actions = Vec::new();
     for _ in 0..=Settings::default().stall_millis / 20_000 {
         cluster.now += 20_000;
-        told = cluster.step(Event::Progressed { attempt: hung, done_permille: Some(0) });
+        actions = cluster.step(Event::Progressed { attempt: hung, done_permille: Some(0) });
     }
-    assert!(told.contains(&Action::Refused { attempt: hung }), "{told:?}");
+    assert!(actions.contains(&Action::Refused { attempt: hung }), "{actions:?}");
 }
 
 #[test]
-fn a_restarted_scheduler_keeps_what_it_knows_and_refuses_what_it_does_not() {
+fn a_restored_scheduler_keeps_durable_attempts_and_refuses_others() {
     let mut cluster = Cluster::new();
     cluster.submit(1, 3, 2, vec![node(&[], 1, 0), node(&[], 1, 0), node(&[0], 1, 0)]);
     cluster.join(1, 0, &[]);
@@ -347,7 +347,7 @@ fn a_restarted_scheduler_keeps_what_it_knows_and_refuses_what_it_does_not() {
     let snapshot: Snapshot = serde_json::from_str(&text).unwrap();
     let again = Scheduler::restore(snapshot.clone(), Settings::default(), 1, 0);
     assert!(matches!(again, Err(RestoreError::Epoch { epoch: 1, seen: 1 })));
-    // Another machine, another clock.
+    // The restored scheduler runs on another clock.
     cluster.scheduler = Scheduler::restore(snapshot.clone(), Settings::default(), 2, 7_000_000).unwrap();
     cluster.now = 7_000_000;
     check(&cluster.scheduler).unwrap();
@@ -357,18 +357,18 @@ fn a_restarted_scheduler_keeps_what_it_knows_and_refuses_what_it_does_not() {
     assert_eq!(cluster.complete(forgotten), [Action::Refused { attempt: forgotten }], "the same number, another epoch");
     cluster.now += Settings::default().lease_millis - 1;
     assert!(cluster.complete(known).contains(&Action::Accepted { attempt: known }));
-    // A snapshot that lies is refused.
+    // An inconsistent snapshot is refused.
     let broken = |change: &dyn Fn(&mut Vec<TaskRecord>)| {
         let mut snapshot = snapshot.clone();
         change(&mut snapshot.jobs[0].tasks);
         Scheduler::restore(snapshot, Settings::default(), 2, 0).map(|_| ()).unwrap_err().to_string()
     };
-    let lies = broken(&|tasks| tasks[2].state = tasks[0].state.clone());
-    assert!(lies.contains("dependencies are not done"), "{lies}");
-    let lies = broken(&|tasks| tasks[1].state = tasks[0].state.clone());
-    assert!(lies.contains("cannot be"), "{lies}");
-    let lies = broken(&|tasks| tasks[1].node.dependencies = vec![TaskIndex(9)]);
-    assert!(lies.contains("there are only 3 tasks"), "{lies}");
-    let lies = broken(&|tasks| tasks[0].node.dependencies = vec![TaskIndex(2)]);
-    assert!(lies.contains("depends on itself"), "{lies}");
+    let error = broken(&|tasks| tasks[2].state = tasks[0].state.clone());
+    assert!(error.contains("dependencies are not done"), "{error}");
+    let error = broken(&|tasks| tasks[1].state = tasks[0].state.clone());
+    assert!(error.contains("cannot exist"), "{error}");
+    let error = broken(&|tasks| tasks[1].node.dependencies = vec![TaskIndex(9)]);
+    assert!(error.contains("there are only 3 tasks"), "{error}");
+    let error = broken(&|tasks| tasks[0].node.dependencies = vec![TaskIndex(2)]);
+    assert!(error.contains("depends on itself"), "{error}");
 }

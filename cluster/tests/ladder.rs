@@ -1,5 +1,5 @@
-//! The scheduler's ladder step by step, and random histories in which messages are lost, doubled and late. The
-//! invariants are checked after every step of both.
+//! The state transitions of tasks, and random histories with lost, duplicated and late messages. The invariants are checked after
+//! every step.
 
 use cluster::{
     Action, AttemptId, Event, Failure, FailureKind, Fence, JobId, JobSpec, Offer, Outcome, Scheduler, Settings,
@@ -11,11 +11,11 @@ use scene::ArtefactId;
 const JOB: JobId = JobId(1);
 
 fn settings() -> Settings {
-    let limits = Settings { failures_limit: 3, losses_limit: 4, culprits_limit: 100, ..Settings::default() };
-    Settings { lease_millis: 1000, backoff_millis: 0, patience_millis: 0, ..limits }
+    let limits = Settings { failures_limit: 3, losses_limit: 4, failed_workers_limit: 100, ..Settings::default() };
+    Settings { lease_millis: 1000, backoff_millis: 0, exclusion_millis: 0, ..limits }
 }
 
-/// A scheduler of one job whose every step is checked.
+/// A scheduler with one job that checks the invariants after every step.
 struct Checked(Scheduler);
 
 impl Checked {
@@ -34,7 +34,7 @@ impl Checked {
         actions
     }
 
-    /// Grants the worker a task.
+    /// Requests a task for the worker.
     fn lease(&mut self, now: u64, worker: u32) -> Option<(u32, u32)> {
         let worker = WorkerId(worker);
         if self.0.offer(worker).is_none() {
@@ -86,7 +86,7 @@ fn result_of(task: u32, attempt: u32) -> ArtefactId {
 }
 
 fn completed(task: u32, number: u32) -> Event {
-    Event::Completed { attempt: attempt(task, number), artefact: result_of(task, number), followers: Vec::new() }
+    Event::Completed { attempt: attempt(task, number), artefact: result_of(task, number), follow_ups: Vec::new() }
 }
 
 fn failed(task: u32, number: u32, kind: FailureKind) -> Event {
@@ -121,11 +121,11 @@ fn tasks_are_granted_in_the_plans_order_once_their_dependencies_are_done() {
 fn an_expired_lease_goes_to_another_and_the_zombie_is_refused() {
     let mut job = Checked::new(&[&[]]);
     assert_eq!(job.lease(0, 1), Some((0, 1)));
-    // A sign of life extends the lease.
+    // A heartbeat extends the lease.
     assert!(accepted(&job.step(900, progressed(0, 1))));
     assert_eq!(job.lease(1899, 2), None);
     assert_eq!(job.lease(1900, 2), Some((0, 2)));
-    // A clock that steps back stands still (C13).
+    // Time does not go backwards (C17).
     job.step(0, Event::Ticked);
     assert!(!accepted(&job.step(1901, progressed(0, 1))));
     assert!(!job.complete(1901, 0, 1), "a stale attempt");
@@ -133,14 +133,14 @@ fn an_expired_lease_goes_to_another_and_the_zombie_is_refused() {
     assert!(!job.complete(1901, 7, 1), "a task that is not there");
     assert!(!job.fail(1901, 0, 1, FailureKind::Input), "a stale attempt");
     assert!(job.complete(1902, 0, 2));
-    assert!(job.complete(1903, 0, 2), "the same news twice is the same news");
-    let other = Event::Completed { attempt: attempt(0, 2), artefact: result_of(9, 9), followers: Vec::new() };
+    assert!(job.complete(1903, 0, 2), "a repeated report is accepted");
+    let other = Event::Completed { attempt: attempt(0, 2), artefact: result_of(9, 9), follow_ups: Vec::new() };
     assert!(!accepted(&job.step(1904, other)), "a second result");
     assert_eq!(job.state(0), TaskState::Done { fence: Fence { epoch: 1, number: 2 }, artefact: result_of(0, 2) });
 }
 
 #[test]
-fn a_poison_task_is_quarantined_and_leaves_a_hole() {
+fn a_poison_task_is_quarantined_and_its_dependents_wait() {
     let mut job = Checked::new(&[&[], &[0], &[]]);
     for attempt in 1..=3 {
         assert_eq!(job.lease(0, attempt), Some((0, attempt)));
@@ -150,14 +150,14 @@ fn a_poison_task_is_quarantined_and_leaves_a_hole() {
         job.state(0),
         TaskState::Quarantined { fence: Fence { epoch: 1, number: 3 }, message: "it broke".into() }
     );
-    assert_eq!(job.lease(0, 1), Some((2, 1)), "the rest goes on");
+    assert_eq!(job.lease(0, 1), Some((2, 1)), "other branches continue");
     let last = job.step(1, completed(2, 1));
     assert!(last.contains(&Action::JobFinished { job: JOB, outcome: Outcome::Incomplete }));
     assert_eq!(job.state(1), TaskState::Waiting { missing: 1 });
 }
 
 #[test]
-fn wrong_input_fails_at_once_a_task_given_back_costs_nothing_and_lost_workers_count() {
+fn invalid_input_fails_at_once_returned_tasks_are_free_and_lost_workers_count() {
     let mut job = Checked::new(&[&[], &[]]);
     assert_eq!(job.lease(0, 1), Some((0, 1)));
     assert!(job.fail(0, 0, 1, FailureKind::Input));
@@ -166,7 +166,7 @@ fn wrong_input_fails_at_once_a_task_given_back_costs_nothing_and_lost_workers_co
         assert_eq!(job.lease(0, 1), Some((1, attempt)));
         assert!(job.fail(0, 1, attempt, FailureKind::GivenBack));
     }
-    // A worker that asks while it holds a lease has lost it.
+    // A worker that requests a task loses the lease that it holds.
     for attempt in 21..=24 {
         assert_eq!(job.lease(0, 1), Some((1, attempt)));
     }
@@ -186,13 +186,13 @@ fn a_cancelled_job_stops_its_workers() {
 }
 
 #[test]
-fn what_is_no_dag_is_refused_and_no_task_is_done_at_once() {
+fn a_cyclic_graph_is_refused_and_an_empty_job_is_done_at_once() {
     let refused = |lists: &[&[u32]]| {
         let mut scheduler = Scheduler::new(settings(), 1);
         let actions = scheduler.step(0, Event::Submitted { job: JOB, spec: spec(lists) });
         check(&scheduler).unwrap();
         actions.iter().find_map(|action| match action {
-            Action::Declined { why, .. } => Some(why.clone()),
+            Action::Declined { reason, .. } => Some(reason.clone()),
             _ => None,
         })
     };
@@ -209,14 +209,14 @@ fn what_is_no_dag_is_refused_and_no_task_is_done_at_once() {
     assert!(actions.contains(&Action::JobFinished { job: JOB, outcome: Outcome::Done }));
 }
 
-/// One thing that may happen in a random history.
+/// One event of a random history.
 #[derive(Debug, Clone)]
-enum Happening {
-    Ask {
+enum HistoryEvent {
+    Request {
         worker: u32,
     },
-    /// Deliver a message about the n-th grant so far, however old: so messages come late, twice, out of order or never.
-    Say {
+    /// Delivers a message about the n-th grant so far, so that messages are late, duplicated, reordered or lost.
+    Report {
         grant: usize,
         what: u8,
     },
@@ -225,11 +225,11 @@ enum Happening {
     },
 }
 
-fn happenings() -> impl Strategy<Value = Vec<Happening>> {
+fn histories() -> impl Strategy<Value = Vec<HistoryEvent>> {
     let one = prop_oneof![
-        4 => (0..4u32).prop_map(|worker| Happening::Ask { worker }),
-        6 => (any::<usize>(), 0..12u8).prop_map(|(grant, what)| Happening::Say { grant, what }),
-        1 => (0..1500u64).prop_map(|millis| Happening::Wait { millis }),
+        4 => (0..4u32).prop_map(|worker| HistoryEvent::Request { worker }),
+        6 => (any::<usize>(), 0..12u8).prop_map(|(grant, what)| HistoryEvent::Report { grant, what }),
+        1 => (0..1500u64).prop_map(|millis| HistoryEvent::Wait { millis }),
     ];
     prop::collection::vec(one, 0..200)
 }
@@ -246,18 +246,18 @@ fn dags() -> impl Strategy<Value = Vec<Vec<u32>>> {
 
 proptest! {
     #[test]
-    fn any_history_keeps_the_invariants_and_honest_workers_finish_the_job(dag in dags(), history in happenings()) {
+    fn any_history_keeps_the_invariants_and_a_correct_worker_finishes_the_job(dag in dags(), history in histories()) {
         let lists: Vec<&[u32]> = dag.iter().map(Vec::as_slice).collect();
         let mut job = Checked::new(&lists);
         let (mut now, mut grants) = (0, Vec::new());
-        for happening in history {
-            match happening {
-                Happening::Ask { worker } => grants.extend(job.lease(now, worker)),
-                Happening::Wait { millis } => {
+        for event in history {
+            match event {
+                HistoryEvent::Request { worker } => grants.extend(job.lease(now, worker)),
+                HistoryEvent::Wait { millis } => {
                     now += millis;
                     job.step(now, Event::Ticked);
                 }
-                Happening::Say { grant, what } if !grants.is_empty() => {
+                HistoryEvent::Report { grant, what } if !grants.is_empty() => {
                     let (task, attempt) = grants[grant % grants.len()];
                     let event = match what {
                         0..=4 => completed(task, attempt),
@@ -268,10 +268,10 @@ proptest! {
                     };
                     job.step(now, event);
                 }
-                Happening::Say { .. } => {}
+                HistoryEvent::Report { .. } => {}
             }
         }
-        // From here one honest worker does what can be done.
+        // From here a correct worker completes all remaining tasks.
         now += 10_000;
         for _ in 0..dag.len() {
             if let Some((task, attempt)) = job.lease(now, 99) {

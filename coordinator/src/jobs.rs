@@ -111,7 +111,7 @@ impl Jobs {
     }
 
     fn settings(options: &Options) -> Settings {
-        Settings { ask_millis: options.wait_millis.into(), ..options.settings }
+        Settings { poll_millis: options.wait_millis.into(), ..options.settings }
     }
 
     /// Under which epoch they are handed out.
@@ -232,7 +232,7 @@ impl Jobs {
 
     pub(crate) fn complete(&mut self, now: u64, of: proto::Attempt, artefact: ArtefactId) -> Result<bool, Status> {
         // Plans are whole when they are submitted: the wire has no tasks that follow from a result.
-        let event = Event::Completed { attempt: self.attempt(of)?, artefact, followers: Vec::new() };
+        let event = Event::Completed { attempt: self.attempt(of)?, artefact, follow_ups: Vec::new() };
         Ok(accepted(&self.step(now, event)))
     }
 
@@ -291,7 +291,7 @@ impl Jobs {
         let mut left = Leftovers { artefacts: self.results(of).chain([plan]).collect(), ..Leftovers::default() };
         for (task, _) in self.scheduler.records(of) {
             let inputs = self.scheduler.inputs(of, task).into_iter().map(|(task, id)| (task.0, id)).collect();
-            left.keys.insert(proto::memory_key(plan, task.0, &inputs));
+            left.keys.insert(proto::result_key(plan, task.0, &inputs));
         }
         for (other, job) in self.jobs.iter().filter(|(other, _)| **other != of) {
             for id in self.results(*other).chain([job.origin.plan]) {
@@ -410,7 +410,7 @@ impl Jobs {
         let small = cfg!(debug_assertions) && self.scheduler.total() <= CHECKED_TASKS;
         let before = small.then(|| self.scheduler.clone());
         let actions = self.scheduler.step(now, event.clone());
-        self.write(|| Line::Step { now_millis: now, event: event.clone(), said: digest(&actions) });
+        self.write(|| Line::Step { now_millis: now, event: event.clone(), answer: digest(&actions) });
         if let Some(before) = before {
             let held = cluster::check(&self.scheduler);
             let held = held.and_then(|()| cluster::check_step(&before, &self.scheduler, &event, &actions));
@@ -517,11 +517,11 @@ fn accepted(actions: &[Action]) -> bool {
 
 /// The answer to a person.
 fn agreed(actions: &[Action], refuse: impl Fn(String) -> Status) -> Result<(), Status> {
-    let why = actions.iter().find_map(|action| match action {
-        Action::Declined { why, .. } => Some(why.clone()),
+    let reason = actions.iter().find_map(|action| match action {
+        Action::Declined { reason, .. } => Some(reason.clone()),
         _ => None,
     });
-    why.map_or(Ok(()), |why| Err(refuse(why)))
+    reason.map_or(Ok(()), |reason| Err(refuse(reason)))
 }
 
 /// What a person asked for, for the log.

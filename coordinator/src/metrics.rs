@@ -176,7 +176,7 @@ impl<'a> Leads<'a> {
         let (now, seen, metrics) = (scheduler.tally(), self.seen, self.metrics);
         metrics.steps.inc_by(now.steps - seen.steps);
         metrics.grants.inc_by(now.grants - seen.grants);
-        metrics.duplicates.inc_by(now.duplicates - seen.duplicates);
+        metrics.duplicates.inc_by(now.speculative_attempts - seen.speculative_attempts);
         metrics.completions.inc_by(now.completions - seen.completions);
         metrics.refusals.inc_by(now.refusals - seen.refusals);
         for (place, kind) in Tally::ENDS.into_iter().enumerate() {

@@ -360,7 +360,7 @@ mod tests {
                 _ => None,
             });
             let done =
-                Event::Completed { attempt: attempt.unwrap(), artefact: ArtefactId([result; 32]), followers: vec![] };
+                Event::Completed { attempt: attempt.unwrap(), artefact: ArtefactId([result; 32]), follow_ups: vec![] };
             step(&mut scheduler, &state, done).await;
         }
         step(&mut scheduler, &state, Event::CancelRequested { job: JobId(2) }).await;

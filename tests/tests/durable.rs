@@ -92,7 +92,7 @@ impl Host {
         let address = format!("http://{}", listener.local_addr().unwrap());
         let durable = Durable { beat, patience, ..Durable::new(&address).unwrap() };
         // No second attempts: here each task is to be worked on once.
-        let settings = Settings { duplicates: false, ..Settings::default() };
+        let settings = Settings { speculation: false, ..Settings::default() };
         let options =
             Options { settings, wait_millis: 5, durable: Some(durable), journal, ..Options::new(store.clone()) };
         let stop = CancellationToken::new();

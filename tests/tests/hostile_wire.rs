@@ -409,9 +409,9 @@ async fn hostile_traffic_changes_nothing() {
     let hour = 3_600_000;
     let settings = Settings {
         lease_millis: hour,
-        silence_millis: 2 * hour,
+        worker_timeout_millis: 2 * hour,
         stall_millis: 2 * hour,
-        duplicates: false,
+        speculation: false,
         ..Settings::default()
     };
     let security = Security { token: Token::new(TOKEN).ok(), ..Security::default() };

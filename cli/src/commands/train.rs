@@ -16,10 +16,10 @@ use serde::Serialize;
 use store::Store;
 use store::file::save;
 use tokio_util::sync::CancellationToken;
-use worker::cap::Cap;
+use worker::time_limit::TimeLimit;
 use worker::estimate::Estimate;
-use worker::execute::{BlockTrainer, Shared, TrainerOptions};
-use worker::merged::is_measured;
+use worker::{BlockTrainer, Shared, TrainerOptions};
+use worker::merged_eval::is_evaluated;
 
 use crate::args::{Backend, TrainArgs};
 use crate::captures::ingest_photos;
@@ -176,7 +176,7 @@ fn prepare(args: &TrainArgs, clock: &Stopwatch, output: &Output) -> Result<Prepa
 /// Trains the plan's blocks on workers in this process; `clock` has run since the command started.
 fn train_plan(args: &TrainArgs, prepared: &Prepared, clock: Stopwatch, output: &Output) -> Result<Finished, Failure> {
     let Prepared { plan, plan_id, backend, store, .. } = prepared;
-    if plan.settings.test_every > 0 && !is_measured(plan) {
+    if plan.settings.test_every > 0 && !is_evaluated(plan) {
         output.note("the model is too large to be measured during training; plat eval measures it afterwards");
     }
     let progress = output.progress("training", plan.tasks.iter().map(|task| u64::from(task.steps)).sum());
@@ -204,7 +204,7 @@ fn train_plan(args: &TrainArgs, prepared: &Prepared, clock: Stopwatch, output: &
         let tasks = plan.tasks.len();
         output.note(format!("{resumed} of {tasks} tasks were resumed from an earlier run; --fresh starts over"));
     }
-    let capped = shared.cap.as_ref().is_some_and(Cap::shortened);
+    let capped = shared.cap.as_ref().is_some_and(TimeLimit::shortened);
     if capped {
         output.note("--minutes left fewer steps than planned: another run may give other bytes");
     }
@@ -219,12 +219,12 @@ fn train_plan(args: &TrainArgs, prepared: &Prepared, clock: Stopwatch, output: &
 }
 
 /// The time limit of training for a job that shall end after this many minutes, writing the model included.
-fn cap_of(minutes: f64, clock: Stopwatch, plan: &Plan, workers: u32) -> Cap {
+fn cap_of(minutes: f64, clock: Stopwatch, plan: &Plan, workers: u32) -> TimeLimit {
     /// Wall seconds of merging and writing a splat.
     const SECONDS_PER_SPLAT: f64 = 2e-6;
     let seconds = 60.0 * minutes;
     let writing = SECONDS_PER_SPLAT * f64::from(plan.settings.budget);
-    Cap::new(clock, seconds - writing.min(0.1 * seconds), workers)
+    TimeLimit::new(clock, seconds - writing.min(0.1 * seconds), workers)
 }
 
 /// The backend that trains.

@@ -1,4 +1,4 @@
-//! A simulated coordinator: hears an event, steps its scheduler, makes what changed durable, and only then answers.
+//! A simulated coordinator: it steps its scheduler, makes the changes durable, and only then answers.
 
 use crate::durable::Changes;
 use crate::events::{Action, Event};
@@ -8,35 +8,35 @@ use crate::scheduler::Scheduler;
 use crate::sim::random::Random;
 use crate::sim::store::Store;
 use crate::snapshot::RestoreError;
-use crate::words::{Settings, TaskState};
+use crate::types::{Settings, TaskState};
 
-/// A coordinator's place: a life of it may be running there.
+/// A node on which a coordinator may run.
 #[derive(Debug, Default)]
 pub(crate) struct Node {
     pub(crate) scheduler: Option<Scheduler>,
-    /// Grows with every start, so that what was meant for an earlier life is dropped.
-    pub(crate) life: u64,
-    /// How far its clock is ahead, milliseconds.
+    /// The incarnation; grows with every start, so that messages to an earlier incarnation are dropped.
+    pub(crate) incarnation: u64,
+    /// Clock skew, milliseconds ahead.
     skew_millis: u64,
-    /// Lines of the journal of the present life.
+    /// The journal of the current incarnation.
     journal: Option<String>,
 }
 
-/// How a coordinator's step went.
+/// The outcome of a coordinator's step.
 #[derive(Debug)]
-pub(crate) enum Heard {
-    /// Carry these out.
-    Said(Vec<Action>),
-    /// The store failed or fenced it, in these words: it does not know what is durable, so it is dead and has said nothing.
-    Dead(&'static str),
+pub(crate) enum StepOutcome {
+    /// The actions to carry out.
+    Actions(Vec<Action>),
+    /// The store failed or fenced it, for this reason. Its durable state is unknown, so it stops without an answer.
+    Crashed(&'static str),
 }
 
-/// How often the store fails, in thousandths of writes, before and after it wrote.
+/// Failure rate of store writes, per mille, each before and after the write.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct StoreFaults(pub(crate) u64);
 
 impl Node {
-    /// Takes over from whoever wrote last.
+    /// Starts a coordinator from the store, under a new epoch.
     pub(crate) fn start(
         &mut self,
         store: &mut Store,
@@ -46,7 +46,7 @@ impl Node {
         journals: bool,
     ) -> Result<(), RestoreError> {
         let (epoch, snapshot) = store.take_over();
-        self.life += 1;
+        self.incarnation += 1;
         self.skew_millis = skew_millis;
         let now_millis = now + skew_millis;
         let began = || to_text(&Line::Began { settings, snapshot: snapshot.clone(), epoch, now_millis }) + "\n";
@@ -55,51 +55,51 @@ impl Node {
         Ok(())
     }
 
-    /// Ends its life, and returns the journal of it.
-    pub(crate) fn die(&mut self) -> Option<String> {
+    /// Stops the coordinator and returns its journal.
+    pub(crate) fn stop(&mut self) -> Option<String> {
         self.scheduler = None;
         self.journal.take()
     }
 
-    /// Hears an event. The error is an invariant that does not hold.
-    pub(crate) fn hear(
+    /// Processes an event. The error is a violated invariant.
+    pub(crate) fn step(
         &mut self,
         now: u64,
         event: Event,
         store: &mut Store,
         faults: StoreFaults,
         random: &mut Random,
-    ) -> Result<Heard, String> {
-        let Some(scheduler) = &mut self.scheduler else { return Ok(Heard::Dead("it is down")) };
+    ) -> Result<StepOutcome, String> {
+        let Some(scheduler) = &mut self.scheduler else { return Ok(StepOutcome::Crashed("it is down")) };
         let now_millis = now + self.skew_millis;
         let before = scheduler.clone();
         let actions = scheduler.step(now_millis, event.clone());
         if let Some(journal) = &mut self.journal {
-            let line = Line::Step { now_millis, event: event.clone(), said: digest(&actions) };
+            let line = Line::Step { now_millis, event: event.clone(), answer: digest(&actions) };
             journal.push_str(&(to_text(&line) + "\n"));
         }
-        let wrong = |violation| format!("{violation} after {event:?}, which was answered by {actions:?}");
-        check(scheduler).map_err(wrong)?;
-        check_step(&before, scheduler, &event, &actions).map_err(wrong)?;
+        let describe = |violation| format!("{violation} after {event:?}, which returned {actions:?}");
+        check(scheduler).map_err(describe)?;
+        check_step(&before, scheduler, &event, &actions).map_err(describe)?;
 
         let changes = Changes::of(scheduler, &event, &actions);
         if !changes.is_empty() {
             if random.chance(faults.0) {
-                return Ok(Heard::Dead("store failed before"));
+                return Ok(StepOutcome::Crashed("store failed before"));
             }
             if store.write(scheduler.epoch(), changes)?.is_err() {
-                return Ok(Heard::Dead("store fenced"));
+                return Ok(StepOutcome::Crashed("store fenced"));
             }
             if random.chance(faults.0) {
-                return Ok(Heard::Dead("store failed after"));
+                return Ok(StepOutcome::Crashed("store failed after"));
             }
             check_durable(scheduler, store)?;
         }
-        Ok(Heard::Said(actions))
+        Ok(StepOutcome::Actions(actions))
     }
 }
 
-/// Whether a coordinator that starts from the store now would know what this one knows.
+/// Checks that the store agrees with the scheduler, so that a coordinator that starts from the store now has the same state.
 fn check_durable(scheduler: &Scheduler, store: &Store) -> Result<(), String> {
     for job in scheduler.jobs() {
         for (task, live) in scheduler.records(job) {

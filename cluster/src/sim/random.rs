@@ -1,11 +1,11 @@
-//! Numbers that look random and follow from a seed.
+//! A seeded pseudorandom number generator.
 
 /// SplitMix64 (Steele, Lea and Flood, "Fast splittable pseudorandom number generators", 2014).
 #[derive(Debug, Clone)]
 pub struct Random(u64);
 
 impl Random {
-    /// The sequence of a seed.
+    /// A generator with this seed.
     pub fn new(seed: u64) -> Self {
         Self(seed)
     }
@@ -19,12 +19,12 @@ impl Random {
         z ^ (z >> 31)
     }
 
-    /// A number from `from` to below `to`, which is larger.
+    /// A number in `from..to`; `to` must be larger than `from`.
     pub fn between(&mut self, from: u64, to: u64) -> u64 {
         from + self.number() % (to - from)
     }
 
-    /// Whether something happens that happens so many times in a thousand.
+    /// True with this probability, per mille.
     pub fn chance(&mut self, permille: u64) -> bool {
         self.number() % 1000 < permille
     }

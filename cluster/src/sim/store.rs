@@ -1,12 +1,12 @@
-//! The durable state of the simulated cluster: records that one coordinator after another writes, fenced by epoch.
+//! The simulated durable store, with writers fenced by epoch.
 
 use std::collections::BTreeMap;
 
 use crate::durable::Changes;
 use crate::snapshot::{JobHeader, JobSnapshot, Snapshot};
-use crate::words::{JobId, TaskIndex, TaskRecord, TaskState};
+use crate::types::{JobId, TaskIndex, TaskRecord, TaskState};
 
-/// A writer of an older epoch than the newest.
+/// The writer's epoch is older than the newest one.
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) struct Fenced;
 
@@ -18,7 +18,7 @@ pub(crate) struct Store {
 }
 
 impl Store {
-    /// Takes over: writers of older epochs are refused from now on. Returns the new epoch and what is there.
+    /// Starts a new epoch and fences writers of older ones. Returns the new epoch and the stored snapshot.
     pub(crate) fn take_over(&mut self) -> (u64, Snapshot) {
         let epoch = self.epoch;
         self.epoch += 1;
@@ -32,7 +32,7 @@ impl Store {
 
     /// Writes the changes of a step under an epoch.
     ///
-    /// The outer error is a broken promise: a committed result that would change.
+    /// The outer error is a safety violation: the write would change a committed result.
     pub(crate) fn write(&mut self, epoch: u64, changes: Changes) -> Result<Result<(), Fenced>, String> {
         if epoch < self.epoch {
             return Ok(Err(Fenced));
@@ -64,7 +64,7 @@ impl Store {
         self.records.get(&(job, task))
     }
 
-    /// How many tasks a job has.
+    /// The number of tasks of a job.
     pub(crate) fn len(&self, job: JobId) -> usize {
         self.records.range((job, TaskIndex(0))..=(job, TaskIndex(u32::MAX))).count()
     }

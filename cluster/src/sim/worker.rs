@@ -1,54 +1,55 @@
-//! A simulated worker: asks, works, gives signs of life, says its last word until it is heard; and all that can befall it.
+//! A simulated worker: requests tasks, sends heartbeats, and reports the end of its attempt until it is acknowledged. It can be slow,
+//! hang, crash or leave.
 
 use crate::events::{Event, Failure, FailureKind};
+use crate::sim::ground_truth::{Behaviour, JobGroundTruth, result_of};
 use crate::sim::random::Random;
-use crate::sim::truth::{JobTruth, Nature, result_of};
-use crate::words::{AttemptId, FULL_RATE, Offer, WorkerId};
+use crate::types::{AttemptId, FULL_RATE, Offer, WorkerId};
 
-/// A machine.
+/// A simulated worker.
 #[derive(Debug)]
 pub(crate) struct SimWorker {
     pub(crate) id: WorkerId,
     pub(crate) offer: Offer,
-    /// Thousandths of work per millisecond.
+    /// Speed, thousandths of work per millisecond.
     pub(crate) speed: u64,
-    /// Grows with every crash, so that replies to an earlier life are dropped.
-    pub(crate) life: u64,
-    /// Which alarm counts.
-    pub(crate) alarm: u64,
+    /// The incarnation; grows with every crash, so that replies to an earlier one are dropped.
+    pub(crate) incarnation: u64,
+    /// Number of the current timer; earlier ones are void.
+    pub(crate) timer: u64,
     pub(crate) up: bool,
-    /// Does nothing before then, and knows nothing of it afterwards.
+    /// Until then it hangs. It does not notice that it hung.
     pub(crate) hangs_until: u64,
-    /// Which coordinator it talks to.
+    /// The coordinator node that it calls.
     pub(crate) node: usize,
-    /// Of its last call; the answer to any other is too late.
+    /// Number of its last call. Replies to earlier calls are ignored.
     pub(crate) call: u64,
     pub(crate) unanswered: u32,
-    pub(crate) doing: Option<Doing>,
+    pub(crate) running: Option<RunningAttempt>,
 }
 
-/// The attempt in hand.
+/// The running attempt of a worker.
 #[derive(Debug, Clone)]
-pub(crate) struct Doing {
+pub(crate) struct RunningAttempt {
     pub(crate) attempt: AttemptId,
     pub(crate) began: u64,
     pub(crate) ends: u64,
-    /// How it will end.
-    pub(crate) end: End,
-    /// Times the last word was said.
-    pub(crate) said: u32,
+    /// Its predetermined end.
+    pub(crate) end: AttemptEnd,
+    /// Number of times the end was reported.
+    pub(crate) reports_sent: u32,
 }
 
-/// How an attempt ends.
+/// The end of an attempt.
 #[derive(Debug, Clone)]
-pub(crate) enum End {
-    /// The worker says this.
-    Says(Event),
-    /// It takes the worker with it.
-    Kills,
+pub(crate) enum AttemptEnd {
+    /// The worker reports this event.
+    Reports(Event),
+    /// The worker crashes.
+    CrashesWorker,
 }
 
-/// How often what goes wrong on a worker, in thousandths of attempts.
+/// Fault rates of workers, per mille of attempts.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct WorkFaults {
     pub(crate) slow: u64,
@@ -60,83 +61,87 @@ impl SimWorker {
         self.up && self.hangs_until <= now
     }
 
-    /// Begins an attempt, and notes what is worth counting.
+    /// Starts an attempt and counts the injected faults.
     pub(crate) fn begin(
         &mut self,
         now: u64,
         attempt: AttemptId,
         rate_permille: u16,
-        job: &JobTruth,
+        job: &JobGroundTruth,
         work: u64,
         faults: WorkFaults,
         random: &mut Random,
-        note: &mut dyn FnMut(&'static str),
+        count: &mut dyn FnMut(&'static str),
     ) {
-        let truth = job.of(attempt.task);
+        let truth = job.task(attempt.task);
         let mut takes = (work * 1000 / self.speed).max(1) * random.between(700, 1300) / 1000;
         if random.chance(faults.slow) {
-            note("worker slow");
+            count("worker slow");
             takes *= 12;
         }
         let fails = |kind| {
             let message = format!("{kind:?}");
-            End::Says(Event::Failed { attempt, failure: Failure { kind, message } })
+            AttemptEnd::Reports(Event::Failed { attempt, failure: Failure { kind, message } })
         };
-        let diverges = match truth.nature {
-            Nature::Diverges => rate_permille == FULL_RATE,
-            Nature::Hopeless => true,
+        let diverges = match truth.behaviour {
+            Behaviour::Diverges => rate_permille == FULL_RATE,
+            Behaviour::AlwaysDiverges => true,
             _ => false,
         };
         if rate_permille < FULL_RATE {
-            note("half rate");
+            count("half rate");
         }
-        let end = if truth.nature == Nature::Poison {
-            End::Kills
-        } else if truth.nature == Nature::BadInput {
-            note("input failed");
+        let end = if truth.behaviour == Behaviour::CrashesWorker {
+            AttemptEnd::CrashesWorker
+        } else if truth.behaviour == Behaviour::BadInput {
+            count("input failed");
             fails(FailureKind::Input)
         } else if truth.memory_bytes > self.offer.memory_bytes {
-            note("out of memory");
+            count("out of memory");
             fails(FailureKind::OutOfMemory)
         } else if diverges {
-            note("diverged");
+            count("diverged");
             fails(FailureKind::Numeric)
         } else if random.chance(faults.fails) {
-            note("infrastructure");
+            count("infrastructure");
             fails(FailureKind::Infrastructure)
         } else if random.chance(faults.fails) {
-            note("work failed");
+            count("work failed");
             fails(FailureKind::Work)
         } else {
-            End::Says(Event::Completed { attempt, artefact: result_of(attempt), followers: truth.followers })
+            AttemptEnd::Reports(Event::Completed {
+                attempt,
+                artefact: result_of(attempt),
+                follow_ups: truth.follow_ups,
+            })
         };
-        if matches!(end, End::Kills) || matches!(&end, End::Says(Event::Failed { .. })) {
+        if matches!(end, AttemptEnd::CrashesWorker) || matches!(&end, AttemptEnd::Reports(Event::Failed { .. })) {
             takes = takes / 2 + 1;
         }
-        self.doing = Some(Doing { attempt, began: now, ends: now + takes, end, said: 0 });
+        self.running = Some(RunningAttempt { attempt, began: now, ends: now + takes, end, reports_sent: 0 });
     }
 
-    /// What it says when it wakes: that it is idle, that it is alive, or how its attempt ended.
-    pub(crate) fn says(&mut self, now: u64) -> Option<Event> {
-        let Some(doing) = &mut self.doing else { return Some(Event::LeaseRequested { worker: self.id }) };
-        if now < doing.ends {
-            let done = (now - doing.began) * 1000 / (doing.ends - doing.began);
-            return Some(Event::Progressed { attempt: doing.attempt, done_permille: Some(done as u16) });
+    /// The next request when its timer fires: for a task, a heartbeat, or the report of the end. `None`: the worker crashes.
+    pub(crate) fn next_request(&mut self, now: u64) -> Option<Event> {
+        let Some(running) = &mut self.running else { return Some(Event::LeaseRequested { worker: self.id }) };
+        if now < running.ends {
+            let done = (now - running.began) * 1000 / (running.ends - running.began);
+            return Some(Event::Progressed { attempt: running.attempt, done_permille: Some(done as u16) });
         }
-        match &doing.end {
-            End::Kills => None,
-            End::Says(event) => {
-                doing.said += 1;
+        match &running.end {
+            AttemptEnd::CrashesWorker => None,
+            AttemptEnd::Reports(event) => {
+                running.reports_sent += 1;
                 Some(event.clone())
             }
         }
     }
 
-    /// Its process ends, and with it what it was doing.
+    /// The worker crashes and loses its attempt.
     pub(crate) fn crash(&mut self) {
-        self.life += 1;
+        self.incarnation += 1;
         self.up = false;
-        self.doing = None;
+        self.running = None;
         self.unanswered = 0;
     }
 }

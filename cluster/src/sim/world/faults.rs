@@ -1,28 +1,28 @@
-//! What goes wrong and when, what people want meanwhile, and how it ends.
+//! Fault injection, user commands, and the end of the faults.
 
 use crate::events::{Event, Failure, FailureKind};
 use crate::sim::coordinator::StoreFaults;
 use crate::sim::worker::WorkFaults;
-use crate::words::{TaskIndex, TaskState};
+use crate::types::{TaskIndex, TaskState};
 
-use super::{Happening, NODES, World};
+use super::{NODES, TraceEvent, World};
 
-/// A person looks after failed tasks this often once the faults have stopped.
+/// Interval at which a user retries failed tasks after the faults have stopped.
 const REVIEW_MILLIS: u64 = 60_000;
 
 impl World {
-    /// What is to happen of itself.
-    pub(super) fn plan(&mut self) {
-        self.after(0, Happening::NodeStarts { node: 0 });
+    /// Schedules starts, user commands, faults and their end.
+    pub(super) fn schedule_initial_events(&mut self) {
+        self.after(0, TraceEvent::NodeStarts { node: 0 });
         for worker in 0..self.workers.len() {
             let when = self.random.between(0, 5000);
-            self.after(when, Happening::WorkerStarts { worker });
+            self.after(when, TraceEvent::WorkerStarts { worker });
         }
         for job in self.jobs.values().cloned().collect::<Vec<_>>() {
             let when = self.random.between(0, 20_000);
-            self.after(when, Happening::Asks { event: Event::Submitted { job: job.id, spec: job.spec } });
+            self.after(when, TraceEvent::UserRequest { event: Event::Submitted { job: job.id, spec: job.spec } });
             for _ in 0..self.random.between(0, 4) {
-                let when = self.random.between(when, self.ends.max(when + 1));
+                let when = self.random.between(when, self.faults_end.max(when + 1));
                 let event = match self.random.between(0, 10) {
                     0 => Event::CancelRequested { job: job.id },
                     1..4 => Event::PauseRequested { job: job.id },
@@ -34,15 +34,15 @@ impl World {
                         weight: self.random.between(0, 9) as u32,
                     },
                 };
-                self.after(when, Happening::Asks { event });
+                self.after(when, TraceEvent::UserRequest { event });
             }
         }
-        self.after(1000, Happening::Fault);
-        self.after(self.ends, Happening::Peace);
+        self.after(1000, TraceEvent::Fault);
+        self.after(self.faults_end, TraceEvent::FaultsEnd);
     }
 
-    /// Something goes wrong, and something else will soon.
-    pub(super) fn fault(&mut self) {
+    /// Injects a random fault and schedules the next one.
+    pub(super) fn inject_fault(&mut self) {
         let place = self.random.between(0, self.workers.len() as u64) as usize;
         let node = self.random.between(0, NODES as u64) as usize;
         match self.random.between(0, 12) {
@@ -52,83 +52,83 @@ impl World {
                 }
             }
             2..5 => {
-                self.note("worker hung");
+                self.count("worker hung");
                 let long = self.random.between(500, 20_000);
                 self.workers[place].hangs_until = self.now + long;
             }
             5..7 => {
-                self.note("partition");
-                self.cuts.insert((place, node));
+                self.count("partition");
+                self.partitions.insert((place, node));
             }
-            7 => self.cuts.clear(),
+            7 => self.partitions.clear(),
             8 => {
                 if self.nodes[node].scheduler.is_some() {
-                    self.note("coordinator crashed");
-                    self.node_dies(node);
+                    self.count("coordinator crashed");
+                    self.node_stops(node);
                 }
             }
-            9 => self.after(0, Happening::NodeStarts { node }),
+            9 => self.after(0, TraceEvent::NodeStarts { node }),
             10 => self.worker_leaves(place),
-            _ => self.lossy = self.random.between(0, 250),
+            _ => self.loss_permille = self.random.between(0, 250),
         }
         let soon = self.random.between(100, 6000);
-        self.after(soon, Happening::Fault);
+        self.after(soon, TraceEvent::Fault);
     }
 
     pub(super) fn worker_crashes(&mut self, place: usize) {
-        self.note("worker crashed");
+        self.count("worker crashed");
         self.workers[place].crash();
         let later = self.random.between(100, 15_000);
-        self.after(later, Happening::WorkerStarts { worker: place });
+        self.after(later, TraceEvent::WorkerStarts { worker: place });
     }
 
-    /// A worker gives back what it has, says that it leaves, and comes back after a while.
+    /// A worker returns its task, leaves, and restarts after a while.
     pub(super) fn worker_leaves(&mut self, place: usize) {
         if !self.workers[place].is_awake(self.now) {
             return;
         }
-        self.note("worker left");
+        self.count("worker left");
         let worker = &mut self.workers[place];
-        let (node, call, life, id) = (worker.node, worker.call, worker.life, worker.id);
-        let doing = worker.doing.clone();
+        let (node, call, incarnation, id) = (worker.node, worker.call, worker.incarnation, worker.id);
+        let running = worker.running.clone();
         worker.crash();
-        if let Some(doing) = doing {
+        if let Some(running) = running {
             let failure = Failure { kind: FailureKind::GivenBack, message: "leaving".into() };
-            let event = Event::Failed { attempt: doing.attempt, failure };
-            self.send(place, node, Happening::Arrives { node, worker: place, life, call, event });
+            let event = Event::Failed { attempt: running.attempt, failure };
+            self.send(place, node, TraceEvent::RequestArrives { node, worker: place, incarnation, call, event });
         }
         let event = Event::Left { worker: id };
-        self.send(place, node, Happening::Arrives { node, worker: place, life, call, event });
+        self.send(place, node, TraceEvent::RequestArrives { node, worker: place, incarnation, call, event });
         let later = self.random.between(1000, 20_000);
-        self.after(later, Happening::WorkerStarts { worker: place });
+        self.after(later, TraceEvent::WorkerStarts { worker: place });
     }
 
-    pub(super) fn make_peace(&mut self) {
-        self.peace = true;
-        (self.lossy, self.store_faults) = (0, StoreFaults(0));
+    pub(super) fn end_faults(&mut self) {
+        self.faults_ended = true;
+        (self.loss_permille, self.store_faults) = (0, StoreFaults(0));
         self.work_faults = WorkFaults { slow: 0, fails: 0 };
-        self.cuts.clear();
+        self.partitions.clear();
         for place in 0..self.workers.len() {
             self.workers[place].hangs_until = self.workers[place].hangs_until.min(self.now);
         }
-        self.after(100, Happening::NodeStarts { node: 0 });
+        self.after(100, TraceEvent::NodeStarts { node: 0 });
         for id in self.jobs.keys().copied().collect::<Vec<_>>() {
-            self.after(10_000, Happening::Asks { event: Event::ResumeRequested { job: id } });
+            self.after(10_000, TraceEvent::UserRequest { event: Event::ResumeRequested { job: id } });
         }
-        self.after(REVIEW_MILLIS, Happening::Review);
+        self.after(REVIEW_MILLIS, TraceEvent::Review);
     }
 
-    /// Retries what failed and can be done.
+    /// Retries failed tasks that can complete.
     pub(super) fn review(&mut self) {
         for (id, job) in self.jobs.clone() {
             for task in (0..self.store.len(id) as u32).map(TaskIndex) {
                 let state = self.store.record(id, task).map(|record| &record.state);
                 let failed = matches!(state, Some(TaskState::Failed { .. } | TaskState::Quarantined { .. }));
-                if failed && job.can_be_done(task) {
-                    self.after(0, Happening::Asks { event: Event::RetryRequested { job: id, task } });
+                if failed && job.can_complete(task) {
+                    self.after(0, TraceEvent::UserRequest { event: Event::RetryRequested { job: id, task } });
                 }
             }
         }
-        self.after(REVIEW_MILLIS, Happening::Review);
+        self.after(REVIEW_MILLIS, TraceEvent::Review);
     }
 }

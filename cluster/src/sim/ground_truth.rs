@@ -1,45 +1,44 @@
-//! What the tasks of the simulated jobs truly are, which the scheduler does not know.
+//! The ground truth about the tasks of the simulated jobs, which the scheduler does not know.
 
 use scene::ArtefactId;
 
-use crate::scheduler::Scheduler;
 use crate::sim::random::Random;
-use crate::words::{AttemptId, JobId, JobSpec, TaskIndex, TaskNode};
+use crate::types::{AttemptId, JobId, JobSpec, SIBLING_BASE, TaskIndex, TaskNode};
 
-/// The most memory that any task truly takes, bytes; some worker has it.
+/// The maximum memory of a task, bytes. Some worker has it.
 pub(crate) const LARGEST_BYTES: u64 = 16 << 20;
 
-/// How a task behaves wherever it runs.
+/// The behaviour of a task, independent of the worker.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Nature {
-    Honest,
-    /// Its input is wrong.
+pub(crate) enum Behaviour {
+    Succeeds,
+    /// Its input is invalid.
     BadInput,
-    /// It kills its worker.
-    Poison,
-    /// It diverges at the full rate.
+    /// It crashes its worker.
+    CrashesWorker,
+    /// It diverges at the full learning rate.
     Diverges,
-    /// It diverges at any rate.
-    Hopeless,
+    /// It diverges at every learning rate.
+    AlwaysDiverges,
 }
 
-/// A task as it is.
+/// The ground truth about a task.
 #[derive(Debug, Clone)]
-pub(crate) struct Truth {
-    pub(crate) nature: Nature,
+pub(crate) struct GroundTruth {
+    pub(crate) behaviour: Behaviour,
     pub(crate) memory_bytes: u64,
-    pub(crate) followers: Vec<TaskNode>,
+    pub(crate) follow_ups: Vec<TaskNode>,
 }
 
-/// A job as it is.
+/// The ground truth about a job.
 #[derive(Debug, Clone)]
-pub(crate) struct JobTruth {
+pub(crate) struct JobGroundTruth {
     pub(crate) id: JobId,
     pub(crate) spec: JobSpec,
     seed: u64,
 }
 
-impl JobTruth {
+impl JobGroundTruth {
     pub(crate) fn new(id: JobId, backend: &str, random: &mut Random) -> Self {
         let count = random.between(1, 14);
         let tasks = (0..count).map(|task| node(task, random)).collect();
@@ -48,18 +47,18 @@ impl JobTruth {
         Self { id, spec, seed: random.number() }
     }
 
-    /// What a task truly is: the same whenever it is asked. Followers are honest and have no followers.
-    pub(crate) fn of(&self, task: TaskIndex) -> Truth {
+    /// The ground truth about a task; the same for every call. Follow-up tasks succeed and have no follow-up tasks.
+    pub(crate) fn task(&self, task: TaskIndex) -> GroundTruth {
         let mut random = Random::new(self.seed ^ u64::from(task.0).wrapping_mul(0x5851_f42d_4c95_7f2d));
         let first = self.spec.tasks.len() as u64;
         let is_follower = u64::from(task.0) >= first;
-        let nature = match random.between(0, 60) {
-            _ if is_follower => Nature::Honest,
-            0 => Nature::BadInput,
-            1 => Nature::Poison,
-            2..5 => Nature::Diverges,
-            5 => Nature::Hopeless,
-            _ => Nature::Honest,
+        let behaviour = match random.between(0, 60) {
+            _ if is_follower => Behaviour::Succeeds,
+            0 => Behaviour::BadInput,
+            1 => Behaviour::CrashesWorker,
+            2..5 => Behaviour::Diverges,
+            5 => Behaviour::AlwaysDiverges,
+            _ => Behaviour::Succeeds,
         };
         let memory_bytes = random.between(1 << 20, LARGEST_BYTES);
         let count = if is_follower || !random.chance(150) { 0 } else { random.between(1, 4) };
@@ -67,26 +66,26 @@ impl JobTruth {
             let mut follower = node(u64::from(task.0), random);
             if sibling > 0 && random.chance(500) {
                 let sibling = random.between(0, sibling) as u32;
-                follower.dependencies.push(TaskIndex(Scheduler::FOLLOWER + sibling));
+                follower.dependencies.push(TaskIndex(SIBLING_BASE + sibling));
             }
             follower
         };
-        let followers = (0..count).map(|sibling| follower(sibling, &mut random)).collect();
-        Truth { nature, memory_bytes, followers }
+        let follow_ups = (0..count).map(|sibling| follower(sibling, &mut random)).collect();
+        GroundTruth { behaviour, memory_bytes, follow_ups }
     }
 
-    /// Whether the task can be done at all.
-    pub(crate) fn can_be_done(&self, task: TaskIndex) -> bool {
-        matches!(self.of(task).nature, Nature::Honest | Nature::Diverges)
+    /// Whether the task can complete at all.
+    pub(crate) fn can_complete(&self, task: TaskIndex) -> bool {
+        matches!(self.task(task).behaviour, Behaviour::Succeeds | Behaviour::Diverges)
     }
 }
 
-/// What an attempt makes. (Real results are the same for every attempt; here they differ, so that it shows whose was taken.)
+/// The result of an attempt. Real results are identical for every attempt. Here they differ, to detect which one was accepted.
 pub(crate) fn result_of(attempt: AttemptId) -> ArtefactId {
     ArtefactId::of(attempt.to_string().as_bytes())
 }
 
-/// A task that depends on up to three of the first `task` ones.
+/// A task that depends on up to three of the first `task` tasks.
 fn node(task: u64, random: &mut Random) -> TaskNode {
     let count = if task == 0 { 0 } else { random.between(0, 4) };
     let dependencies = (0..count).map(|_| TaskIndex(random.between(0, task) as u32)).collect();

@@ -1,8 +1,8 @@
-//! Ready tasks in the order in which they are to be granted, and the first of them that fits a worker's memory.
+//! The ready queue: ready tasks in grant order, with a search for the first one that fits a worker's memory.
 //!
-//! A treap over the keys in which every node knows the least memory below it (Seidel and Aragon, "Randomized search trees",
-//! 1996); the heat of a node is a hash of its key, so that the same keys give the same tree. All operations take
-//! `O(log tasks)` expected.
+//! A treap over the keys in which every node stores the minimum memory of its subtree (Seidel and Aragon, "Randomized search trees",
+//! 1996). The priority of a node is a hash of its key, so that equal keys give equal trees. All operations take expected
+//! `O(log tasks)` time.
 
 const NIL: u32 = u32::MAX;
 
@@ -10,39 +10,39 @@ const NIL: u32 = u32::MAX;
 struct Node {
     key: u64,
     memory: u64,
-    /// The least memory of this node and all below.
-    least: u64,
+    /// The minimum memory in the subtree of this node.
+    min_below: u64,
     left: u32,
     right: u32,
 }
 
-/// Keys with the memory that each needs.
+/// An ordered set of keys with the memory that each task needs.
 #[derive(Debug, Clone)]
-pub(crate) struct Queue {
+pub(crate) struct ReadyQueue {
     nodes: Vec<Node>,
     free: Vec<u32>,
     root: u32,
 }
 
-impl Default for Queue {
+impl Default for ReadyQueue {
     fn default() -> Self {
         Self { nodes: Vec::new(), free: Vec::new(), root: NIL }
     }
 }
 
-impl Queue {
+impl ReadyQueue {
     pub(crate) fn is_empty(&self) -> bool {
         self.root == NIL
     }
 
-    /// The least memory that any of them needs.
-    pub(crate) fn least_memory(&self) -> Option<u64> {
-        self.at(self.root).map(|node| node.least)
+    /// The minimum memory of all entries.
+    pub(crate) fn min_memory(&self) -> Option<u64> {
+        self.at(self.root).map(|node| node.min_below)
     }
 
-    /// Adds a key that is not there yet; keys are below `u64::MAX`.
+    /// Inserts a key that is not present. Keys are below `u64::MAX`.
     pub(crate) fn insert(&mut self, key: u64, memory: u64) {
-        let node = Node { key, memory, least: memory, left: NIL, right: NIL };
+        let node = Node { key, memory, min_below: memory, left: NIL, right: NIL };
         let place = match self.free.pop() {
             Some(place) => {
                 self.nodes[place as usize] = node;
@@ -58,7 +58,7 @@ impl Queue {
         self.root = self.join(front, after);
     }
 
-    /// Takes a key out, if it is there.
+    /// Removes a key, if present.
     pub(crate) fn remove(&mut self, key: u64) {
         let (before, rest) = self.split(self.root, key);
         let (found, after) = self.split(rest, key + 1);
@@ -68,7 +68,7 @@ impl Queue {
         self.root = self.join(before, after);
     }
 
-    /// The first key from `from` on that needs no more than this memory.
+    /// The first key from `from` on that needs at most this memory.
     pub(crate) fn next_within(&self, from: u64, memory: u64) -> Option<u64> {
         self.find(self.root, from, memory)
     }
@@ -88,7 +88,7 @@ impl Queue {
     }
 
     fn find(&self, at: u32, from: u64, memory: u64) -> Option<u64> {
-        let node = self.at(at).filter(|node| node.least <= memory)?;
+        let node = self.at(at).filter(|node| node.min_below <= memory)?;
         if node.key < from {
             return self.find(node.right, from, memory);
         }
@@ -100,7 +100,7 @@ impl Queue {
         self.nodes.get(place as usize)
     }
 
-    /// Parts the tree into keys below `key` and the rest.
+    /// Splits the tree into keys below `key` and the rest.
     fn split(&mut self, at: u32, key: u64) -> (u32, u32) {
         let Some(node) = self.at(at) else { return (NIL, NIL) };
         if node.key < key {
@@ -116,12 +116,12 @@ impl Queue {
         }
     }
 
-    /// Makes one tree of two, all keys of the first being smaller.
+    /// Joins two trees; all keys of the first are smaller.
     fn join(&mut self, first: u32, second: u32) -> u32 {
         let (Some(a), Some(b)) = (self.at(first), self.at(second)) else {
             return if first == NIL { second } else { first };
         };
-        if heat(a.key) > heat(b.key) {
+        if priority(a.key) > priority(b.key) {
             self.nodes[first as usize].right = self.join(a.right, second);
             self.refresh(first);
             first
@@ -134,13 +134,13 @@ impl Queue {
 
     fn refresh(&mut self, at: u32) {
         let node = &self.nodes[at as usize];
-        let below = |place: u32| self.at(place).map_or(u64::MAX, |node| node.least);
-        self.nodes[at as usize].least = node.memory.min(below(node.left)).min(below(node.right));
+        let below = |place: u32| self.at(place).map_or(u64::MAX, |node| node.min_below);
+        self.nodes[at as usize].min_below = node.memory.min(below(node.left)).min(below(node.right));
     }
 }
 
-/// SplitMix64's last mix.
-fn heat(key: u64) -> u64 {
+/// The treap priority of a key: the finaliser of SplitMix64.
+fn priority(key: u64) -> u64 {
     let mut z = key.wrapping_add(0x9e37_79b9_7f4a_7c15);
     z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
     z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
@@ -155,8 +155,8 @@ mod tests {
 
     proptest! {
         #[test]
-        fn it_is_a_map_that_finds_what_fits(steps in prop::collection::vec((0u64..40, 0u64..20, any::<bool>()), 0..200)) {
-            let (mut queue, mut map) = (Queue::default(), BTreeMap::new());
+        fn behaves_like_a_map_with_a_search_by_memory(steps in prop::collection::vec((0u64..40, 0u64..20, any::<bool>()), 0..200)) {
+            let (mut queue, mut map) = (ReadyQueue::default(), BTreeMap::new());
             for (key, memory, insert) in steps {
                 if insert && !map.contains_key(&key) {
                     queue.insert(key, memory);
@@ -167,7 +167,7 @@ mod tests {
                 }
                 prop_assert_eq!(queue.entries(), map.clone().into_iter().collect::<Vec<_>>());
                 prop_assert_eq!(queue.is_empty(), map.is_empty());
-                prop_assert_eq!(queue.least_memory(), map.values().min().copied());
+                prop_assert_eq!(queue.min_memory(), map.values().min().copied());
                 let expected = map.range(key..).find(|(_, m)| **m <= memory).map(|(k, _)| *k);
                 prop_assert_eq!(queue.next_within(key, memory), expected);
             }
