@@ -97,8 +97,8 @@ impl Camera {
         (DVec2::new(k.fx * p.x / p.z + k.cx, k.fy * p.y / p.z + k.cy), p.z)
     }
 
-    /// The camera of mip `m`. A pixel covers `2^m × 2^m` pixels of mip 0, a remainder at the right and bottom is dropped, and
-    /// each side is at least one pixel.
+    /// The camera of mip `m`. A pixel covers `2^m × 2^m` pixels of mip 0, a remainder at the right and bottom is
+    /// dropped, and each side is at least one pixel.
     pub fn mip(&self, m: u8) -> Self {
         let k = &self.pinhole;
         let scale = 1.0 / f64::from(1u32 << m);
@@ -170,8 +170,8 @@ impl CameraModel {
         }
     }
 
-    /// k1, k2, p1, p2, k3, k4, k5, k6 of the OpenCV rational model, which contains the other perspective models. For a fisheye
-    /// k1, k2, k3, k4 and zeros.
+    /// k1, k2, p1, p2, k3, k4, k5, k6 of the OpenCV rational model, which contains the other perspective models. For a
+    /// fisheye k1, k2, k3, k4 and zeros.
     pub fn distortion(&self) -> [f64; 8] {
         match *self {
             Self::SimplePinhole(_) | Self::Pinhole(_) => [0.0; 8],

@@ -38,8 +38,8 @@ pub struct SparsePoints {
     pub positions: Vec<DVec3>,
     /// sRGB colours, one per position.
     pub colours: Vec<[u8; 3]>,
-    /// Offsets into `seen_by`: point `i` was observed in `seen_by[track_start[i] .. track_start[i + 1]]`. One longer than `positions`,
-    /// or empty if the capture has no tracks.
+    /// Offsets into `seen_by`: point `i` was observed in `seen_by[track_start[i] .. track_start[i + 1]]`. One longer
+    /// than `positions`, or empty if the capture has no tracks.
     pub track_start: Vec<u32>,
     /// Indices of views, for all tracks.
     pub seen_by: Vec<u32>,

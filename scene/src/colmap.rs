@@ -1,8 +1,8 @@
 //! Reads and writes COLMAP sparse models: `cameras`, `images` and `points3D`, in binary and text.
 //!
-//! Format: COLMAP's documentation ("Output Format") and its `scene/reconstruction_io*.cc`. The 2D observations of images are skipped, as
-//! training does not need them; [`read_keypoints_bin`] reads them on their own. The `rigs` and `frames` files of COLMAP 4 are not
-//! read, as `images` contains all poses.
+//! Format: COLMAP's documentation ("Output Format") and its `scene/reconstruction_io*.cc`. The 2D observations of
+//! images are skipped, as training does not need them; [`read_keypoints_bin`] reads them on their own. The `rigs` and
+//! `frames` files of COLMAP 4 are not read, as `images` contains all poses.
 
 mod binary;
 mod model;

@@ -25,8 +25,8 @@ pub struct BadInput {
 }
 
 impl BadInput {
-    /// An error for this file or flag. The texts may contain names from untrusted files, so line breaks and other control characters are
-    /// escaped and each text is limited to 4096 characters.
+    /// An error for this file or flag. The texts may contain names from untrusted files, so line breaks and other
+    /// control characters are escaped and each text is limited to 4096 characters.
     pub fn new(subject: impl Into<String>, problem: impl Into<String>, advice: impl Into<String>) -> Self {
         let [subject, problem, advice] = [subject.into(), problem.into(), advice.into()].map(one_line);
         Self { subject, problem, advice }

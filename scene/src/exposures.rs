@@ -1,7 +1,8 @@
 //! Per-view exposures: an affine colour transform from the mean exposure to that of each photo.
 //!
-//! Photos of one place differ in exposure and white balance. Without this transform splats fit the differences with view-dependent colour
-//! (H3DGS, Kerbl et al. 2024, uses the same transform). Exposures are for training only: viewers render without them.
+//! Photos of one place differ in exposure and white balance. Without this transform splats fit the differences with
+//! view-dependent colour (H3DGS, Kerbl et al. 2024, uses the same transform). Exposures are for training only: viewers
+//! render without them.
 
 use std::collections::BTreeMap;
 
@@ -10,13 +11,14 @@ use serde::{Deserialize, Serialize};
 use crate::error::CodecError;
 use crate::frame::{self, Kind};
 
-/// Exposures. The header is their number. The bulk has, for each view in ascending order, the view (u32) and twelve f32, little endian.
+/// Exposures. The header is their number. The bulk has, for each view in ascending order, the view (u32) and twelve
+/// f32, little endian.
 pub const EXPOSURES: Kind = Kind(*b"expo", 1);
 
 const BYTES: usize = 4 + 12 * 4;
 
-/// The affine transform from a rendered colour to the photo's: one row per channel of the photo, with a column per rendered channel
-/// and one for the offset. Colours are sRGB values in 0..1.
+/// The affine transform from a rendered colour to the photo's: one row per channel of the photo, with a column per
+/// rendered channel and one for the offset. Colours are sRGB values in 0..1.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Exposure(pub [[f32; 4]; 3]);
 

@@ -70,8 +70,8 @@ pub fn decode<T: DeserializeOwned>(kind: Kind, bytes: &[u8]) -> Result<(T, &[u8]
 
 /// The header's value and the number of bytes it took.
 ///
-/// bincode allocates the announced length of a string or vector, up to a limit that must be a compile-time constant. This picks the
-/// smallest sufficient one of a few limits: no value claims more than eight bytes for each encoded byte.
+/// bincode allocates the announced length of a string or vector, up to a limit that must be a compile-time constant.
+/// This picks the smallest sufficient one of a few limits: no value claims more than eight bytes for each encoded byte.
 fn decode_header<T: DeserializeOwned>(header: &[u8]) -> Result<(T, usize), bincode::error::DecodeError> {
     fn within<const LIMIT: usize, T: DeserializeOwned>(
         header: &[u8],

@@ -1,8 +1,8 @@
 //! Reads KITTI-360 calibration, poses and Velodyne scans.
 //!
-//! The vehicle's pose is world_from_imu. `calib_cam_to_pose.txt` has imu_from_camera for each camera before rectification.
-//! `R_rect` rotates that camera to the rectified one, whose intrinsics are the left 3×3 part of `P_rect`. Only the rectified perspective
-//! cameras 00 and 01 are supported; 02 and 03 are fisheyes of another model.
+//! The vehicle's pose is world_from_imu. `calib_cam_to_pose.txt` has imu_from_camera for each camera before
+//! rectification. `R_rect` rotates that camera to the rectified one, whose intrinsics are the left 3×3 part of
+//! `P_rect`. Only the rectified perspective cameras 00 and 01 are supported; 02 and 03 are fisheyes of another model.
 //!
 //! Source: the data set's documentation, "Raw data", and its scripts (`loadCalibration.py`).
 
@@ -112,7 +112,8 @@ pub fn read_poses(bytes: &[u8]) -> Result<BTreeMap<u32, Rigid>, CodecError> {
     Ok(poses)
 }
 
-/// Reads every `step`-th point of a Velodyne scan: x, y, z in the scanner's frame, metres. Points that are not finite are dropped.
+/// Reads every `step`-th point of a Velodyne scan: x, y, z in the scanner's frame, metres. Points that are not finite
+/// are dropped.
 ///
 /// # Errors
 /// A length that is not a multiple of 16 bytes, the size of a point.

@@ -1,7 +1,7 @@
 //! The data types of plat (splats, cameras, captures, ids) and the codecs between them and bytes.
 //!
-//! Architecture invariant: no files, no network, no clock, no threads. A codec maps a byte slice to a value or a [`CodecError`]; the
-//! caller that opened the file adds its name.
+//! Architecture invariant: no files, no network, no clock, no threads. A codec maps a byte slice to a value or a
+//! [`CodecError`]; the caller that opened the file adds its name.
 //!
 //! Conventions: the world is metres, right-handed; cameras are OpenCV (x right, y down, z forward); pixel centres
 //! lie at `+0.5`; quaternions are stored `wxyz` for splats (as INRIA's PLY does) and normalised on use.

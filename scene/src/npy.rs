@@ -58,8 +58,8 @@ pub fn write_f32(shape: &[usize], data: &[f32]) -> Vec<u8> {
     write(shape, data)
 }
 
-/// Decodes the shape and data of an array of `<f4` (bit exact) or `<f8` (rounded to f32) in C order. NaN and infinity are kept, as depth
-/// maps use them for missing values.
+/// Decodes the shape and data of an array of `<f4` (bit exact) or `<f8` (rounded to f32) in C order. NaN and infinity
+/// are kept, as depth maps use them for missing values.
 ///
 /// # Errors
 /// Not npy, another element type or order, or a body that does not match the shape.

@@ -1,7 +1,7 @@
 //! Reads the `reconstruction.json` of OpenSfM and OpenDroneMap: cameras, shots and points.
 //!
-//! Image coordinates are in units of the longer side, from the image's centre. A shot's rotation is an axis-angle vector,
-//! and its pose is camera_from_world in OpenCV axes. The world is metres east, north and up of `reference_lla`.
+//! Image coordinates are in units of the longer side, from the image's centre. A shot's rotation is an axis-angle
+//! vector, and its pose is camera_from_world in OpenCV axes. The world is metres east, north and up of `reference_lla`.
 //! A file may hold several reconstructions in different worlds; the one with the most shots is read.
 //!
 //! Sources: OpenSfM, "Reconstruction format" and `opensfm/src/geometry/camera_*.h`.

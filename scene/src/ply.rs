@@ -1,10 +1,10 @@
 //! Reads and writes splats as PLY in the layout of INRIA's 3D Gaussian Splatting, and reads point clouds.
 //!
 //! The INRIA convention: one `vertex` element with `x y z nx ny nz f_dc_0..2 f_rest_* opacity scale_0..2 rot_0..3`;
-//! `f_rest` is channel-major (all of red, then green, then blue), opacity is a logit, scales are logarithms and
-//! `rot` is wxyz. The reader accepts any order of properties, any scalar types and all three encodings of PLY (Turk 1994).
-//! Values are bit exact, including NaN; the caller checks their range.
-//! PlayCanvas' `.compressed.ply` is read too; see [`packed`].
+//! `f_rest` is channel-major (all of red, then green, then blue), opacity is a logit, scales are logarithms and `rot`
+//! is wxyz. The reader accepts any order of properties, any scalar types and all three encodings of PLY (Turk 1994).
+//! Values are bit exact, including NaN; the caller checks their range. PlayCanvas' `.compressed.ply` is read too; see
+//! [`packed`].
 
 mod header;
 mod packed;
@@ -19,8 +19,8 @@ use crate::splats::{Splats, column, sh_coefficients};
 /// Rows transposed at a time, few enough to stay in cache.
 const ROWS: usize = 128;
 
-/// Decodes splats of SH degree 0 to 3 (0, 9, 24 or 45 `f_rest` properties). Other properties and elements are ignored. PlayCanvas'
-/// packed splats are unpacked.
+/// Decodes splats of SH degree 0 to 3 (0, 9, 24 or 45 `f_rest` properties). Other properties and elements are ignored.
+/// PlayCanvas' packed splats are unpacked.
 ///
 /// # Errors
 /// A malformed header, a missing property, another number of `f_rest` properties, or a body that is too short.
@@ -48,7 +48,8 @@ pub fn write(splats: &Splats, comments: &[&str]) -> Vec<u8> {
     bytes
 }
 
-/// The header of [`write`] for this number of splats. The [`rows`] of that many splats follow it, in any number of parts.
+/// The header of [`write`] for this number of splats. The [`rows`] of that many splats follow it, in any number of
+/// parts.
 pub fn header(splats: usize, sh_degree: u8, comments: &[&str]) -> Vec<u8> {
     let mut header = String::from("ply\nformat binary_little_endian 1.0\n");
     for comment in comments {
@@ -97,8 +98,8 @@ pub fn comments(bytes: &[u8]) -> Vec<String> {
     Header::parse(bytes).map(|header| header.comments).unwrap_or_default()
 }
 
-/// Decodes a point cloud: positions `x y z` of any scalar type and sRGB colours `red green blue` as `uchar`. Without such colours
-/// points are grey (128).
+/// Decodes a point cloud: positions `x y z` of any scalar type and sRGB colours `red green blue` as `uchar`. Without
+/// such colours points are grey (128).
 ///
 /// # Errors
 /// As [`read`], or a coordinate that is not finite.

@@ -1,5 +1,5 @@
-//! The counter-based hash behind all random numbers of plat: a value is a pure function of key and counter, so the order of execution
-//! does not matter.
+//! The counter-based hash behind all random numbers of plat: a value is a pure function of key and counter, so the
+//! order of execution does not matter.
 
 /// A 64-bit hash of a key and a counter (SplitMix64's finaliser, Steele et al. 2014, twice).
 pub fn bits(key: u64, counter: u64) -> u64 {

@@ -1,4 +1,5 @@
-//! Splats as structure of arrays: one `Vec<f32>` per scalar, so that SIMD, optimiser and codecs read memory sequentially.
+//! Splats as structure of arrays: one `Vec<f32>` per scalar, so that SIMD, optimiser and codecs read memory
+//! sequentially.
 
 use glam::Vec3;
 
@@ -63,7 +64,8 @@ impl Splats {
         Self { sh_degree, columns: vec![Vec::new(); column::SH + 3 * sh_coefficients(sh_degree)] }
     }
 
-    /// Splats from columns in the order of [`column`]. `None` unless there are 14, 23, 38 or 59 columns of equal length.
+    /// Splats from columns in the order of [`column`]. `None` unless there are 14, 23, 38 or 59 columns of equal
+    /// length.
     pub fn from_columns(columns: Vec<Vec<f32>>) -> Option<Self> {
         let sh_degree = (0..=3).find(|&d| columns.len() == column::SH + 3 * sh_coefficients(d))?;
         let n = columns[0].len();

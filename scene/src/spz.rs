@@ -1,11 +1,12 @@
 //! Reads and writes SPZ, Niantic's compressed splat format: reads versions 2 to 4, writes 2 and 3.
 //!
-//! Versions 2 and 3 are one gzip stream: a header of 16 bytes, then one plane per attribute: positions (24-bit fixed point),
-//! opacities, colours, log scales, rotations (version 2: x, y, z with 8 bits; version 3: the three smaller components with
-//! 10 bits) and SH coefficients. Version 4 has an uncompressed header and one zstd stream per attribute.
+//! Versions 2 and 3 are one gzip stream: a header of 16 bytes, then one plane per attribute: positions (24-bit fixed
+//! point), opacities, colours, log scales, rotations (version 2: x, y, z with 8 bits; version 3: the three smaller
+//! components with 10 bits) and SH coefficients. Version 4 has an uncompressed header and one zstd stream per
+//! attribute.
 //!
-//! SPZ's axes are right, up, back; those of an INRIA PLY right, down, forward. y and z therefore change sign, as in Niantic's
-//! converter, so that a viewer shows both formats the same way up.
+//! SPZ's axes are right, up, back; those of an INRIA PLY right, down, forward. y and z therefore change sign, as in
+//! Niantic's converter, so that a viewer shows both formats the same way up.
 //!
 //! Source: `load-spz.cc` and `splat-types.h` of the SPZ library.
 
@@ -25,8 +26,8 @@ const ANTIALIASED: u8 = 1;
 const EXTENSIONS: u8 = 2;
 /// Fractional bits of written positions where their range allows it: steps of a quarter of a millimetre.
 const FRACTIONAL_BITS: u8 = 12;
-/// Largest decoded size: this many bytes plus this factor times the file's size. Trained splats take at most 12 times the file's size; more
-/// is a decompression bomb.
+/// Largest decoded size: this many bytes plus this factor times the file's size. Trained splats take at most 12 times
+/// the file's size; more is a decompression bomb.
 const MEMORY_BYTES: u64 = 32 << 20;
 const MEMORY_FACTOR: u64 = 20;
 /// Largest SH degree of the format. Coefficients above degree 3 are dropped.
@@ -298,8 +299,8 @@ impl Read for Streams<'_> {
                 None => {
                     let Some((stream, length)) = self.rest.pop() else { return Ok(0) };
                     let mut decoder = zstd::stream::read::Decoder::with_buffer(stream)?;
-                    // The frame's content size was checked. Limit the window to it, but to no less than the 8 MiB that decoders
-                    // should accept (RFC 8878, 3.1.1.1.2).
+                    // The frame's content size was checked. Limit the window to it, but to no less than the 8 MiB that
+                    // decoders should accept (RFC 8878, 3.1.1.1.2).
                     decoder.window_log_max(length.max(8 << 20).next_power_of_two().ilog2().min(31))?;
                     self.current = Some((decoder, length));
                 }

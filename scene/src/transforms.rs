@@ -1,4 +1,5 @@
-//! Reads and writes the `transforms.json` of nerfstudio and instant-ngp: posed images of perspective and fisheye cameras.
+//! Reads and writes the `transforms.json` of nerfstudio and instant-ngp: posed images of perspective and fisheye
+//! cameras.
 //!
 //! A frame's `transform_matrix` is world_from_camera in OpenGL axes (x right, y up, z backward); plat uses OpenCV
 //! camera_from_world. `applied_transform` is ignored: nerfstudio has applied it to both the frames and the points of
@@ -86,8 +87,8 @@ impl Intrinsics {
         }
     }
 
-    /// The camera model for an image of this width and height in pixels, which should equal [`Intrinsics::size`] if that is given:
-    /// nothing is scaled.
+    /// The camera model for an image of this width and height in pixels, which should equal [`Intrinsics::size`] if
+    /// that is given: nothing is scaled.
     pub fn model(&self, width: u32, height: u32) -> CameraModel {
         let [fx, fy] = [self.focal[0].map(|f| f.pixels(width)), self.focal[1].map(|f| f.pixels(height))];
         // `read` refuses files without any focal length; intrinsics built by hand get NaN.
@@ -108,8 +109,8 @@ impl Intrinsics {
 /// Decodes a `transforms.json`.
 ///
 /// # Errors
-/// Malformed JSON, no frames, an unsupported lens model, intrinsics without a focal length or out of range, or a `transform_matrix` whose
-/// 3×3 part is not a rotation times a scale. The scale is dropped.
+/// Malformed JSON, no frames, an unsupported lens model, intrinsics without a focal length or out of range, or a
+/// `transform_matrix` whose 3×3 part is not a rotation times a scale. The scale is dropped.
 pub fn read(bytes: &[u8]) -> Result<Transforms, CodecError> {
     let file: File = serde_json::from_slice(bytes).map_err(|e| CodecError::new(format!("transforms.json: {e}")))?;
     if file.frames.is_empty() {
@@ -129,8 +130,8 @@ pub fn read(bytes: &[u8]) -> Result<Transforms, CodecError> {
     Ok(Transforms { frames, ply_file_path: file.ply_file_path })
 }
 
-/// Encodes a `transforms.json` with all intrinsics in the frames. Numbers that are not finite become `null`, which [`read`] refuses or
-/// treats as missing.
+/// Encodes a `transforms.json` with all intrinsics in the frames. Numbers that are not finite become `null`, which
+/// [`read`] refuses or treats as missing.
 pub fn write(transforms: &Transforms) -> Vec<u8> {
     let frames = transforms.frames.iter().map(|frame| {
         let (file_path, mask_path) = (frame.file_path.clone(), frame.mask_path.clone());
@@ -176,8 +177,8 @@ fn matrix(camera_from_world: &Rigid) -> Vec<[f64; 4]> {
     rows
 }
 
-/// Defines the JSON objects of the file and of its frames, which share the keys of [`Lens`]. `serde(flatten)` would buffer every unknown
-/// value, at many times its size in the file.
+/// Defines the JSON objects of the file and of its frames, which share the keys of [`Lens`]. `serde(flatten)` would
+/// buffer every unknown value, at many times its size in the file.
 macro_rules! lens {
     ($($field:ident: $type:ty),* $(,)?) => {
         /// The file as JSON.
@@ -314,7 +315,8 @@ impl Lens {
         }
         let mut distortion =
             [self.k1, self.k2, self.p1, self.p2, self.k3, self.k4, self.k5, self.k6].map(Option::unwrap_or_default);
-        // k4 is the coefficient of r⁸ in nerfstudio and of the denominator in OpenCV. Without a model name it is ambiguous.
+        // k4 is the coefficient of r⁸ in nerfstudio and of the denominator in OpenCV. Without a model name it is
+        // ambiguous.
         if fisheye {
             let [k1, k2, _, _, k3, k4, ..] = distortion;
             distortion = [k1, k2, k3, k4, 0.0, 0.0, 0.0, 0.0];

@@ -2,9 +2,10 @@
 //!
 //! The mean absolute error of an epoch (every view once) is a by-product of training. Two rules use it:
 //!
-//! - **Coarse to fine.** While the error at a coarse mip exceeds the detail that the mip lacks, the finer photos add little
-//!   information for four times the pixels. Training goes to the next finer mip once the error is down to a multiple of that detail
-//!   ([`Recipe::detail_factor`](crate::Recipe::detail_factor)), or when the recipe's share of the steps is used.
+//! - **Coarse to fine.** While the error at a coarse mip exceeds the detail that the mip lacks, the finer photos add
+//!   little information for four times the pixels. Training goes to the next finer mip once the error is down to a
+//!   multiple of that detail ([`Recipe::detail_factor`](crate::Recipe::detail_factor)), or when the recipe's share of
+//!   the steps is used.
 //! - **End of growth.** Growth ends early when its last epochs gained less than
 //!   [`Growth::worth_db`](crate::growth::Growth::worth_db) for each five percent of splats.
 
@@ -20,8 +21,8 @@ const DETAIL_VIEWS: usize = 16;
 /// Smallest growth factor of the number of splats over which the gain is measured.
 const MIN_MEASURED_GROWTH: f64 = 1.3;
 
-/// Mean absolute difference, 0 to 1, between the photos `coarser` mips up and those one mip finer. Infinite where no window has
-/// such a coarse mip, so that the stage ends after its first epoch.
+/// Mean absolute difference, 0 to 1, between the photos `coarser` mips up and those one mip finer. Infinite where no
+/// window has such a coarse mip, so that the stage ends after its first epoch.
 ///
 /// # Errors
 /// A window that cannot be read.

@@ -1,8 +1,9 @@
 //! Applies per-view exposures to renders, computes their gradients and trains them with Adam.
 //!
-//! Exposures are trained once, in the block that covers the whole scene (the root of the tree), and stay fixed in all others, so that
-//! neighbouring blocks agree on colours. Splats and exposures determine colours only up to a common transform. That freedom is removed by
-//! keeping the mean of all exposures at the identity. A held-out view is rendered without one and shows the mean exposure.
+//! Exposures are trained once, in the block that covers the whole scene (the root of the tree), and stay fixed in all
+//! others, so that neighbouring blocks agree on colours. Splats and exposures determine colours only up to a common
+//! transform. That freedom is removed by keeping the mean of all exposures at the identity. A held-out view is rendered
+//! without one and shows the mean exposure.
 
 use std::collections::BTreeSet;
 
@@ -29,8 +30,8 @@ pub fn expose(exposure: &Exposure, colour: &[f32], out: &mut Vec<f32>) {
     }
 }
 
-/// ViewOrder the loss's gradient by the exposed picture into that by the drawn `colour`, in place, and returns that by the
-/// exposure. Pixels that do not count have no gradient, and so no say.
+/// ViewOrder the loss's gradient by the exposed picture into that by the drawn `colour`, in place, and returns that by
+/// the exposure. Pixels that do not count have no gradient, and so no say.
 pub fn expose_backward(exposure: &Exposure, colour: &[f32], gradient: &mut [f32]) -> [[f32; 4]; 3] {
     let [red, green, blue] = planes(colour);
     let (by_red, rest) = gradient.split_at_mut(red.len());
@@ -87,7 +88,8 @@ pub(crate) fn square_gain(exposure: &Exposure) -> f32 {
     exposure.0.iter().flat_map(|row| &row[..3]).map(|value| value * value).sum::<f32>() / 3.0
 }
 
-/// Exposures in training, each with its own Adam state. A view's step count is the number of times that it was rendered.
+/// Exposures in training, each with its own Adam state. A view's step count is the number of times that it was
+/// rendered.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ExposureTraining {
     /// Ascending.
@@ -117,8 +119,8 @@ impl ExposureTraining {
         self.views.iter().zip(&self.values[0]).map(|(&view, row)| (view, Exposure(rows(row)))).collect()
     }
 
-    /// One Adam step with learning rate `rate` on the exposure of one view. Then shifts all exposures so that their mean stays
-    /// the identity.
+    /// One Adam step with learning rate `rate` on the exposure of one view. Then shifts all exposures so that their
+    /// mean stays the identity.
     pub fn step(&mut self, view: u32, gradient: &[[f32; 4]; 3], rate: f32) {
         let (Ok(at), true) =
             (self.views.binary_search(&view), gradient.iter().flatten().all(|value| value.is_finite()))

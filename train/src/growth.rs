@@ -1,8 +1,9 @@
 //! Densification under a budget: removes splats that contribute nothing and splits those with the largest error.
 //!
-//! Splats are ranked by the absolute screen-space gradient (AbsGS, Ye et al. 2024), summed over all views since the last refinement.
-//! A split halves a splat along its longest axis, which covers both "clone" and "split" of 3DGS. The number of splats
-//! follows a schedule instead of a gradient threshold, so the budget is reached and not only respected.
+//! Splats are ranked by the absolute screen-space gradient (AbsGS, Ye et al. 2024), summed over all views since the
+//! last refinement. A split halves a splat along its longest axis, which covers both "clone" and "split" of 3DGS. The
+//! number of splats follows a schedule instead of a gradient threshold, so the budget is reached and not only
+//! respected.
 
 use glam::{Mat3, Quat, Vec3};
 use render::Gradients;
@@ -68,8 +69,8 @@ impl Growth {
         (steps / MIN_REFINEMENTS).clamp(MIN_INTERVAL.min(self.every), self.every).max(1)
     }
 
-    /// Number of splats to reach at `step`, between `start` and `budget`. The schedule is geometric, as the error per splat falls with
-    /// their number.
+    /// Number of splats to reach at `step`, between `start` and `budget`. The schedule is geometric, as the error per
+    /// splat falls with their number.
     pub fn target(&self, step: u32, steps: u32, start: usize, budget: usize) -> usize {
         let at = f64::from(step) / f64::from(steps.max(1));
         let (from, until) = (f64::from(self.from), f64::from(self.until));
@@ -91,7 +92,8 @@ pub struct DensificationStats {
 }
 
 impl DensificationStats {
-    /// Adds a view. `pixels`, the number of pixels in the view, undoes the mean of the loss, so that every pixel counts alike.
+    /// Adds a view. `pixels`, the number of pixels in the view, undoes the mean of the loss, so that every pixel counts
+    /// alike.
     pub fn add(&mut self, gradients: &Gradients, pixels: f32) {
         let n = gradients.screen_gradient_abs.len();
         self.resize(n);
@@ -128,10 +130,11 @@ pub struct Refined {
     pub added: usize,
 }
 
-/// Densifies: removes splats that contribute nothing or lie where `keeps` is false, and splits the `target - owned` splats
-/// with the largest error, where `owned` are the kept splats for which `counts` is true. The other splats (the halo) do not count
-/// against the target and grow in proportion. The result is in Morton order, for memory locality. Returns the new splats,
-/// the old row of each whose Adam moments it keeps (`None` for both halves of a split), and the counts.
+/// Densifies: removes splats that contribute nothing or lie where `keeps` is false, and splits the `target - owned`
+/// splats with the largest error, where `owned` are the kept splats for which `counts` is true. The other splats (the
+/// halo) do not count against the target and grow in proportion. The result is in Morton order, for memory locality.
+/// Returns the new splats, the old row of each whose Adam moments it keeps (`None` for both halves of a split), and the
+/// counts.
 pub fn refine(
     splats: &Splats,
     stats: &mut DensificationStats,

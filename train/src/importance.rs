@@ -16,8 +16,9 @@ use crate::view::TrainView;
 
 /// An importance measure by which splats are ordered for pruning.
 ///
-/// Opacity, opacity times volume, Σ αT, largest αT (RadSplat), Σ αT times a power of the volume (LightGaussian), the determinant of
-/// the Fisher information (PUP 3D-GS) and the exact error of removing each splat alone gave worse results; see ARCHITECTURE.
+/// Opacity, opacity times volume, Σ αT, largest αT (RadSplat), Σ αT times a power of the volume (LightGaussian), the
+/// determinant of the Fisher information (PUP 3D-GS) and the exact error of removing each splat alone gave worse
+/// results; see ARCHITECTURE.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Order {
@@ -25,7 +26,8 @@ pub enum Order {
     Surface,
     /// Σ (dI/dg)² over pixels and views, where g is the splat's projected value (Speedy-Splat, Hanson et al. 2025).
     Squared,
-    /// Σ δ² over pixels and views, in units of each view's squared error, where δ is the change of the render without the splat.
+    /// Σ δ² over pixels and views, in units of each view's squared error, where δ is the change of the render without
+    /// the splat.
     Energy,
 }
 
@@ -85,8 +87,8 @@ struct Comparison<'a> {
     square_gain: f64,
 }
 
-/// Fixed pixel weights of a set of views, 0 to 255; empty where all are 1. Recomputing them after pruning would give a hole
-/// in front of the context no weight and so hide it.
+/// Fixed pixel weights of a set of views, 0 to 255; empty where all are 1. Recomputing them after pruning would give a
+/// hole in front of the context no weight and so hide it.
 #[derive(Debug, Clone, Default)]
 pub struct OwnershipWeights(Vec<Vec<u8>>);
 
@@ -123,7 +125,8 @@ impl<'a> EvaluationViews<'a> {
         Ok(sum / count.max(1.0))
     }
 
-    /// Root of the weighted mean squared error over all views, 0 to 1; `None` where the weights sum to less than 64 pixels.
+    /// Root of the weighted mean squared error over all views, 0 to 1; `None` where the weights sum to less than 64
+    /// pixels.
     ///
     /// # Errors
     /// A window that cannot be read.

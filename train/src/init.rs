@@ -55,9 +55,10 @@ pub fn backdrop_size_metres(radius_metres: f64) -> f64 {
     radius_metres * (4.0 * std::f64::consts::PI / BACKDROP as f64).sqrt() * 0.6
 }
 
-/// A sphere of opaque splats around the scene, coloured by the mean of what the views show in each direction: the sky and
-/// everything without sparse points. Every ray then ends at a splat, so near splats are not stretched to fill the distance.
-/// The sphere of `centre` and `radius_metres` must enclose all cameras and points. Directions that no view covers get no splats.
+/// A sphere of opaque splats around the scene, coloured by the mean of what the views show in each direction: the sky
+/// and everything without sparse points. Every ray then ends at a splat, so near splats are not stretched to fill the
+/// distance. The sphere of `centre` and `radius_metres` must enclose all cameras and points. Directions that no view
+/// covers get no splats.
 ///
 /// # Errors
 /// A view that cannot be read.
@@ -105,7 +106,8 @@ pub fn backdrop(
         t.iter_mut().zip(s).for_each(|(t, s)| *t += s);
         t
     });
-    // Neighbours on the lattice are 3.5 / sqrt(n) apart. Directions without a visible one within 1.5 times that get no splat.
+    // Neighbours on the lattice are 3.5 / sqrt(n) apart. Directions without a visible one within 1.5 times that get no
+    // splat.
     let min_cosine = (1.5 * 3.5 / (BACKDROP as f64).sqrt()).cos();
     let cosine = |a: &[f64; 3], b: &[f64; 3]| a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
     let visible: Vec<&[f64; 3]> =

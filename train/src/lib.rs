@@ -1,7 +1,7 @@
 //! Trains the splats of one block: losses, optimiser, densification, pruning and image metrics.
 //!
-//! Architecture invariant: no files, no network, no clock. Pixels come through [`WindowSource`]. Random numbers are counter-based
-//! ([`random`]), so a job gives the same splats for any number of threads.
+//! Architecture invariant: no files, no network, no clock. Pixels come through [`WindowSource`]. Random numbers are
+//! counter-based ([`random`]), so a job gives the same splats for any number of threads.
 
 pub mod checkpoint;
 pub mod coarse_to_fine;

@@ -1,8 +1,8 @@
 //! The photometric loss (1-λ)·L1 + λ·D-SSIM, with D-SSIM = 1 - SSIM, of a frame against a photo, and its gradient.
 //!
-//! SSIM (Wang et al. 2004) with an 11×11 Gaussian window of σ = 1.5 and zero padding, as 3DGS computes it. The window is
-//! separable. Both passes stream rows through a ring buffer of eleven rows, which stays in cache: the forward pass smooths
-//! (x, y, x², y², xy), the backward pass the three derivatives of SSIM.
+//! SSIM (Wang et al. 2004) with an 11×11 Gaussian window of σ = 1.5 and zero padding, as 3DGS computes it. The window
+//! is separable. Both passes stream rows through a ring buffer of eleven rows, which stays in cache: the forward pass
+//! smooths (x, y, x², y², xy), the backward pass the three derivatives of SSIM.
 
 use rayon::prelude::*;
 use render::cpu::Isa;
@@ -50,9 +50,10 @@ impl PhotometricLoss {
         Self { isa, lambda, partials: Default::default() }
     }
 
-    /// Computes the loss of `colour` (three planes) against `photo` and writes its gradient with respect to `colour` to `gradient`
-    /// (three planes). `weights` (one plane, or empty for all ones) are the pixel weights. Photo pixels under the mask are treated as
-    /// outside the image. The loss is a weighted mean, so its scale does not depend on the size of the window.
+    /// Computes the loss of `colour` (three planes) against `photo` and writes its gradient with respect to `colour` to
+    /// `gradient` (three planes). `weights` (one plane, or empty for all ones) are the pixel weights. Photo pixels
+    /// under the mask are treated as outside the image. The loss is a weighted mean, so its scale does not depend on
+    /// the size of the window.
     pub fn evaluate(&mut self, colour: &[f32], photo: &Pixels, weights: &[f32], gradient: &mut Vec<f32>) -> LossValue {
         let (width, height) = (photo.width as usize, photo.height as usize);
         let area = width * height;
@@ -179,7 +180,8 @@ fn lanes<L: Lanes>(slice: &[f32], at: usize) -> L {
 }
 
 kernel!(
-    /// SSIM's derivatives (times the weights) for the rows that `partials` cover, from `first_row` on; adds Σ w|x-y| and Σ w·SSIM to `sums`.
+    /// SSIM's derivatives (times the weights) for the rows that `partials` cover, from `first_row` on; adds Σ w|x-y|
+    /// and Σ w·SSIM to `sums`.
     fn ssim_rows(
         x: &[f32], y: &[u8], weights: &[f32], mask: &[u8], width: usize, first_row: usize, partials: [&mut [f32]; 3], sums: &mut [f64; 2],
     ) = ssim_rows_lanes

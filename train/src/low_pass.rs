@@ -1,11 +1,11 @@
 //! Carries splats between resolutions by compensating for the renderer's low-pass filter.
 //!
-//! The renderer adds 0.3 px² to the variance of every projected splat (EWA's low-pass filter, as in 3DGS). In metres the filter is
-//! wider at a coarse mip, so splats trained there come out too thin when rendered at full resolution: two mips cost 0.6 dB, and
-//! a coarse block shows holes next to a fine one. A block therefore publishes its splats for full resolution, widened by the filter of
-//! its own mips ([`to_full_resolution`]), and training on coarser mips starts by removing that width again
-//! ([`from_full_resolution`]). At mip 0 both change nothing.
-//! (Mip-Splatting, Yu et al. 2024, bounds scales by the finest sampling rate during training.)
+//! The renderer adds 0.3 px² to the variance of every projected splat (EWA's low-pass filter, as in 3DGS). In metres
+//! the filter is wider at a coarse mip, so splats trained there come out too thin when rendered at full resolution: two
+//! mips cost 0.6 dB, and a coarse block shows holes next to a fine one. A block therefore publishes its splats for full
+//! resolution, widened by the filter of its own mips ([`to_full_resolution`]), and training on coarser mips starts by
+//! removing that width again ([`from_full_resolution`]). At mip 0 both change nothing. (Mip-Splatting, Yu et al. 2024,
+//! bounds scales by the finest sampling rate during training.)
 
 use scene::{Splats, column};
 
@@ -22,8 +22,8 @@ pub fn to_full_resolution(splats: &mut Splats, views: &[TrainView]) {
     shift(splats, views, 1.0);
 }
 
-/// Narrows splats of mip 0 so that they render alike in these windows. The inverse of [`to_full_resolution`], except for splats much
-/// narrower than a pixel, whose width is lost.
+/// Narrows splats of mip 0 so that they render alike in these windows. The inverse of [`to_full_resolution`], except
+/// for splats much narrower than a pixel, whose width is lost.
 pub fn from_full_resolution(splats: &mut Splats, views: &[TrainView]) {
     shift(splats, views, -1.0);
 }

@@ -39,12 +39,13 @@ pub fn psnr(a: &[f32], b: &[f32], mask: Option<&[u8]>) -> Option<f64> {
 }
 
 /// Colour-corrected PSNR in dB: [`psnr`] after the affine colour transform of the render (3×3 matrix and offset) that
-/// minimises the squared error to the photo over the pixels that the mask leaves. The corrected render is clamped to 0..1.
-/// This removes one exposure and white balance per view and nothing else, as papers with appearance models report it.
+/// minimises the squared error to the photo over the pixels that the mask leaves. The corrected render is clamped to
+/// 0..1. This removes one exposure and white balance per view and nothing else, as papers with appearance models report
+/// it.
 ///
-/// The fit starts from the identity: colour directions in which the render does not vary (grey or single-colour images, a few
-/// pixels) keep it. The clamped render without a fit is taken where it is nearer to the photo, so for photos in 0..1 the
-/// result is never below [`psnr`] of the same pixels, clamped or not.
+/// The fit starts from the identity: colour directions in which the render does not vary (grey or single-colour images,
+/// a few pixels) keep it. The clamped render without a fit is taken where it is nearer to the photo, so for photos in
+/// 0..1 the result is never below [`psnr`] of the same pixels, clamped or not.
 ///
 /// # Panics
 /// As [`psnr`].
@@ -78,8 +79,8 @@ pub fn colour_corrected_psnr(render: &[f32], photo: &[f32], mask: Option<&[u8]>)
     Some(psnr(&corrected, photo, mask)?.max(psnr(&clamped, photo, mask)?))
 }
 
-/// Eigenvalues of a colour covariance below this share of its trace count as zero. Rounding to f32 leaves about 1e-14 in a
-/// direction without variation.
+/// Eigenvalues of a colour covariance below this share of its trace count as zero. Rounding to f32 leaves about 1e-14
+/// in a direction without variation.
 const MIN_EIGENVALUE_SHARE: f64 = 1e-10;
 
 /// Moore-Penrose inverse of a symmetric positive semidefinite matrix.
@@ -118,8 +119,8 @@ fn symmetric_eigen(matrix: DMat3) -> ([f64; 3], DMat3) {
     ([0, 1, 2].map(|k| diagonal.col(k)[k]), vectors)
 }
 
-/// Structural similarity (Wang et al. 2004): 11×11 Gaussian window with σ = 1.5, K1 = 0.01, K2 = 0.03, range 1, the mean
-/// over all pixels and channels. At borders the window reaches into zeros and keeps its weights, as the padded
+/// Structural similarity (Wang et al. 2004): 11×11 Gaussian window with σ = 1.5, K1 = 0.01, K2 = 0.03, range 1, the
+/// mean over all pixels and channels. At borders the window reaches into zeros and keeps its weights, as the padded
 /// convolution of the 3DGS code does; figures of papers that train with that code are comparable.
 ///
 /// # Panics
@@ -178,9 +179,9 @@ fn blur(plane: &[f64], width: usize, height: usize) -> Vec<f64> {
     both
 }
 
-/// SSIMULACRA2 of a render against its photo: a perceptual metric without a neural network. 100 is identical, 90 hard to
-/// tell apart, 70 high, 50 medium, 30 low quality, below 0 very bad. `None` where a side is under [`SSIMULACRA2_MIN_SIDE`].
-/// Source: Sneyers, "SSIMULACRA 2" (Cloudinary, 2023), as ported by the rust-av project.
+/// SSIMULACRA2 of a render against its photo: a perceptual metric without a neural network. 100 is identical, 90 hard
+/// to tell apart, 70 high, 50 medium, 30 low quality, below 0 very bad. `None` where a side is under
+/// [`SSIMULACRA2_MIN_SIDE`]. Source: Sneyers, "SSIMULACRA 2" (Cloudinary, 2023), as ported by the rust-av project.
 ///
 /// # Panics
 /// If a length is not `3 · width · height`.

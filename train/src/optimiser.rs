@@ -1,8 +1,8 @@
 //! Sparse Adam over splat columns: updates only the splats that are visible in the step's views.
 //!
-//! An invisible splat keeps its parameters and Adam moments, because its gradient is unknown rather than zero (Taming-3DGS). The
-//! regularisers are part of the same pass and therefore act on visible splats only. Global ones would shrink the splats of a large scene,
-//! each of which few views see.
+//! An invisible splat keeps its parameters and Adam moments, because its gradient is unknown rather than zero
+//! (Taming-3DGS). The regularisers are part of the same pass and therefore act on visible splats only. Global ones
+//! would shrink the splats of a large scene, each of which few views see.
 
 use rayon::prelude::*;
 use render::Gradients;
@@ -18,8 +18,8 @@ const EPSILON: f32 = 1e-15;
 /// Learning rates and regulariser weights of one step.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LearningRates {
-    /// Learning rate of the mean, in units of the splat's size (geometric mean of its three scales), so that it does not depend on
-    /// the scene's scale.
+    /// Learning rate of the mean, in units of the splat's size (geometric mean of its three scales), so that it does
+    /// not depend on the scene's scale.
     pub mean: f32,
     /// Learning rate of ln(scale).
     pub log_scale: f32,
@@ -111,7 +111,8 @@ impl Adam {
         work.par_iter_mut().with_max_len(1).for_each(|chunk| update(isa, chunk, &rates, correction));
     }
 
-    /// Reorders the moments after densification: new row `i` takes the moments of old row `rows[i]`, or zeros for `None`.
+    /// Reorders the moments after densification: new row `i` takes the moments of old row `rows[i]`, or zeros for
+    /// `None`.
     pub fn rearrange(&mut self, rows: &[Option<u32>]) {
         let pick = |column: &Vec<f32>| rows.iter().map(|row| row.map_or(0.0, |i| column[i as usize])).collect();
         self.first = self.first.iter().map(pick).collect();
@@ -121,8 +122,9 @@ impl Adam {
 
 kernel!(fn update(chunk: &mut Chunk, rates: &LearningRates, correction: [f32; 2]) = update_lanes);
 
-/// Updates one column at a time. A column with its moments and gradient is four memory streams already, and hardware prefetchers follow
-/// only a few. Means precede scales because their learning rate depends on the scales before the update.
+/// Updates one column at a time. A column with its moments and gradient is four memory streams already, and hardware
+/// prefetchers follow only a few. Means precede scales because their learning rate depends on the scales before the
+/// update.
 #[inline(always)]
 fn update_lanes<L: Lanes>(chunk: &mut Chunk, rates: &LearningRates, correction: [f32; 2]) {
     let step = Step::<L> { beta2: L::splat(rates.beta2), correction: correction.map(|c| 1.0 / c) };

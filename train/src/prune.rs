@@ -2,19 +2,24 @@
 //!
 //!
 //! ```text
-//! recovery → importance → prune to `drop_db` below the floor (bisection) → recovery: train without densification ── PSNR at the floor? ── yes → next round
-//!                                                                                                          └ no → revert, halve the drop
-//! at the end: prune to the floor itself, recovery once more
+//! recovery without a cut → floor
+//! repeat: importance → cut to `drop_db` below the floor (bisection) → recovery: train without densification
+//!         PSNR at the floor or above: keep the cut; else revert it and halve `drop_db`
+//! at the end: cut to the floor itself → recovery
 //! ```
-//! The floor is the PSNR after a recovery without pruning, minus the tolerance. A model that was not trained to convergence improves by
-//! recovery alone. Spending that gain on pruning cost held-out views two to three times the tolerance. Recovery regains most of
-//! what a cut costs at first, so each cut goes deeper than the tolerance. No result is below the floor.
+//! The floor is the PSNR after a recovery without pruning, minus the tolerance. A model that was not trained to
+//! convergence improves by recovery alone. Spending that gain on pruning cost held-out views two to three times the
+//! tolerance. Recovery regains most of what a cut costs at first, so each cut goes deeper than the tolerance. No result
+//! is below the floor.
+
+mod search;
 
 use std::mem;
 
 use glam::Vec3;
 use scene::Splats;
 
+use self::search::Search;
 use crate::error::TrainError;
 use crate::importance::{EvaluationViews, Order, OwnershipWeights};
 use crate::job::{Flow, Job};
@@ -29,12 +34,11 @@ const MEASURED_VIEWS: ViewCount = ViewCount { min: 8, max: 32, per_step: 0.5 };
 const PROBE_VIEWS: ViewCount = ViewCount { min: 4, max: 8, per_step: 0.125 };
 /// Views from which importance is computed.
 const IMPORTANCE_VIEWS: ViewCount = ViewCount { min: 24, max: 128, per_step: 1.0 };
-/// The search ends once a cut uses this share of the allowed error.
-const SUFFICIENT_DEPTH: f64 = 0.9;
 /// Pruning ends when a round removes a smaller share of the splats.
 const MIN_CUT: f64 = 0.01;
 
-/// Smallest number of recovery steps in a round. Shorter rounds cost more in evaluations than they remove (see ARCHITECTURE).
+/// Smallest number of recovery steps in a round. Shorter rounds cost more in evaluations than they remove (see
+/// ARCHITECTURE).
 const MIN_ROUND_STEPS: f32 = 80.0;
 
 /// Share of a job's steps that is spent on pruning where pruning is part of training.
@@ -54,8 +58,8 @@ pub struct Pruning {
     pub order: Order,
     /// Recovery rounds before the first cut.
     pub warm_up: u32,
-    /// Largest number of rounds of cut and recovery before the last one. Fewer and longer rounds are used where they would have under
-    /// 80 steps.
+    /// Largest number of rounds of cut and recovery before the last one. Fewer and longer rounds are used where they
+    /// would have under 80 steps.
     pub rounds: u32,
     /// Recovery steps of a round, as a share of the job's steps.
     pub recovery_share: f32,
@@ -64,7 +68,8 @@ pub struct Pruning {
 }
 
 impl Pruning {
-    /// The measure and rounds that gave the best results, with this tolerance. Fewer and longer rounds beat many short ones.
+    /// The measure and rounds that gave the best results, with this tolerance. Fewer and longer rounds beat many short
+    /// ones.
     pub fn within(tolerance_db: f64) -> Self {
         let (warm_up, rounds) = (1, 5);
         let recovery_share = SHARE / (warm_up + rounds + 1) as f32;
@@ -72,8 +77,8 @@ impl Pruning {
     }
 }
 
-/// The number of views of an evaluation. It grows with the recovery steps, so that evaluating takes no longer than the recovery between
-/// two evaluations.
+/// The number of views of an evaluation. It grows with the recovery steps, so that evaluating takes no longer than the
+/// recovery between two evaluations.
 #[derive(Clone, Copy)]
 struct ViewCount {
     min: usize,
@@ -148,9 +153,9 @@ pub struct PruneProgress<'a> {
 /// Called after every recovery step. It may stop pruning; the result is then the last one that was kept.
 pub type Report<'a> = &'a mut dyn FnMut(PruneProgress) -> Flow;
 
-/// Prunes the splats that a job has trained, which are its `initial`. Only counted splats are removed; all take part in recovery. The job has
-/// the steps and recipe that it was trained with; recovery starts from the recipe's last learning rates. Exposures are
-/// fixed or absent.
+/// Prunes the splats that a job has trained, which are its `initial`. Only counted splats are removed; all take part in
+/// recovery. The job has the steps and recipe that it was trained with; recovery starts from the recipe's last learning
+/// rates. Exposures are fixed or absent.
 ///
 /// # Errors
 /// See [`TrainError`].
@@ -235,65 +240,6 @@ fn without(splats: &Splats, rows: &[u32]) -> Splats {
     splats.filter(|i| !removed[i])
 }
 
-/// Searches for the largest number of splats to remove, least important first. It assumes that the error grows by a factor times
-/// the removed importance and updates the factor with every trial. Where a trial does not halve the interval, the next one bisects.
-struct Search {
-    /// Prefix sums of the importance.
-    removed: Vec<f64>,
-    /// Allowed relative increase of the error.
-    allowed: f64,
-    /// Largest number of removed splats known to be within the allowed error.
-    low: usize,
-    /// Smallest number known to exceed it.
-    high: usize,
-    /// Relative increase of the error per unit of importance.
-    factor: Option<f64>,
-    /// The next step bisects.
-    bisect: bool,
-}
-
-impl Search {
-    fn new(importance: impl Iterator<Item = f64>, allowed: f64, factor: Option<f64>) -> Self {
-        let sums = importance.scan(0.0, |sum, value| {
-            *sum += value;
-            Some(*sum)
-        });
-        let removed: Vec<f64> = [0.0].into_iter().chain(sums).collect();
-        Self { high: removed.len() - 1, removed, allowed, low: 0, factor, bisect: false }
-    }
-
-    /// The next number of splats to remove on trial; `None` when the search is finished.
-    fn next(&mut self) -> Option<usize> {
-        if self.high - self.low <= 1 + self.removed.len() / 100 {
-            return None;
-        }
-        let middle = (self.low + self.high) / 2;
-        let Some(factor) = self.factor.filter(|_| !self.bisect) else { return Some(middle) };
-        // Slightly below the limit, so that the trial is likely within it.
-        let aim = 0.5 * (1.0 + SUFFICIENT_DEPTH) * self.allowed / factor;
-        let count = self.removed.partition_point(|removed| *removed <= aim);
-        let margin = (self.high - self.low) / 16;
-        Some(count.clamp(self.low + 1 + margin, (self.high - 1 - margin).max(self.low + 1)))
-    }
-
-    /// Records the relative increase of the error for a trial. Returns true if it is within the limit.
-    fn record(&mut self, count: usize, growth: f64) -> bool {
-        let width = self.high - self.low;
-        let is_within = growth <= self.allowed;
-        if is_within {
-            self.low = count;
-            if growth >= SUFFICIENT_DEPTH * self.allowed {
-                self.high = count;
-            }
-        } else {
-            self.high = count;
-        }
-        self.factor = (growth > 0.0 && self.removed[count] > 0.0).then(|| growth / self.removed[count]);
-        self.bisect = !self.bisect && self.high - self.low > width / 2;
-        is_within
-    }
-}
-
 /// A job whose splats are pruned.
 struct Pruner<'a> {
     /// Without its splats, and with the steps of one recovery.
@@ -347,8 +293,8 @@ impl<'a> Pruner<'a> {
         self.measured.psnr(&self.all, splats)
     }
 
-    /// The fewest splats that lose at most `loss_db` on the evaluator's views, within one percent of the number or a tenth of
-    /// the loss.
+    /// The fewest splats that lose at most `loss_db` on the evaluator's views, within one percent of the number or a
+    /// tenth of the loss.
     fn cut(&self, splats: &Splats, loss_db: f64, evaluator: &Evaluator) -> Result<Splats, TrainError> {
         let before = evaluator.psnr(&self.all, splats)?;
         let views = self.all.some(IMPORTANCE_VIEWS.for_steps(self.job.steps));
@@ -409,36 +355,6 @@ fn recovery_recipe(recipe: &Recipe) -> Recipe {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    /// The result of a search and its number of trials, where `growth` is the increase of the error by the number of removed splats.
-    fn run_search(count: usize, allowed: f64, factor: Option<f64>, growth: impl Fn(usize) -> f64) -> (usize, usize) {
-        let mut search = Search::new((0..count).map(|i| 1e-6 * i as f64), allowed, factor);
-        let (mut best, mut trials) = (0, 0);
-        while let Some(tried) = search.next() {
-            assert!(tried > 0 && tried < count, "{tried} of {count}");
-            trials += 1;
-            if search.record(tried, growth(tried)) {
-                assert!(growth(tried) <= allowed);
-                best = tried;
-            }
-        }
-        (best, trials)
-    }
-
-    #[test]
-    fn searches_are_short_if_importance_predicts_the_error_and_always_end() {
-        let sum = |n: usize| 0.5e-6 * (n * n) as f64;
-        let (best, trials) = run_search(10_000, 2.0, Some(1.0), |n| 3.0 * sum(n));
-        assert!(trials <= 4 && (0.9..=1.0).contains(&(3.0 * sum(best) / 2.0)), "{best} {trials}");
-        // A cliff; no effect; no splat removable; one splat; none; an error that falls with the number removed.
-        let (best, trials) = run_search(10_000, 2.0, Some(1.0), |n| if n > 7_000 { 1e9 } else { 0.0 });
-        assert!((6_890..=7_000).contains(&best) && trials <= 14, "{best} {trials}");
-        assert!(run_search(10_000, 2.0, None, |_| 0.0).0 >= 9_890);
-        assert_eq!(run_search(10_000, 2.0, None, |_| 1e9).0, 0);
-        assert_eq!((run_search(1, 2.0, None, |_| 0.0), run_search(0, 2.0, None, |_| 0.0)), ((0, 0), (0, 0)));
-        assert!(run_search(5_000, 2.0, Some(1e9), |n| 4.0 / (1 + n) as f64).1 <= 20);
-        assert!(run_search(5_000, 0.0, Some(f64::NAN), |_| f64::NAN).1 <= 20);
-    }
 
     #[test]
     fn rounds_have_enough_steps() {

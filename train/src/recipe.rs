@@ -4,8 +4,8 @@ use serde::{Deserialize, Serialize};
 
 use crate::growth::Growth;
 
-/// The hyperparameters of training a block. Shares are of the number of steps. Learning rates are of Adam with one view per step,
-/// given as `[first, last]` and interpolated geometrically.
+/// The hyperparameters of training a block. Shares are of the number of steps. Learning rates are of Adam with one view
+/// per step, given as `[first, last]` and interpolated geometrically.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Recipe {
     /// Weight λ of D-SSIM (1 - SSIM) in the loss.
@@ -22,12 +22,12 @@ pub struct Recipe {
     pub sh_dc: [f32; 2],
     /// Learning rate of the other SH coefficients, relative to `sh_dc`.
     pub sh_rest: f32,
-    /// Learning rate of exposures, multiplied by the number of times that a view is drawn. A view is drawn 7 times at the root of
-    /// a tree and 60 times in a job of one block, and its exposure has to move as far.
+    /// Learning rate of exposures, multiplied by the number of times that a view is drawn. A view is drawn 7 times at
+    /// the root of a tree and 60 times in a job of one block, and its exposure has to move as far.
     pub exposure: [f32; 2],
-    /// Decay β₂ of Adam's second moment. A splat that few of many views see gets few updates, but the bias correction counts
-    /// all steps. At 0.999 its updates were up to seven times the learning rate, and the root of a city of 1.2 km² lost 26,000
-    /// of its 27,700 splats.
+    /// Decay β₂ of Adam's second moment. A splat that few of many views see gets few updates, but the bias correction
+    /// counts all steps. At 0.999 its updates were up to seven times the learning rate, and the root of a city of 1.2
+    /// km² lost 26,000 of its 27,700 splats.
     pub beta2: f32,
     /// Weight of the opacity regulariser, see [`LearningRates`](crate::optimiser::LearningRates).
     pub opacity_reg: f32,
@@ -35,14 +35,16 @@ pub struct Recipe {
     pub needle_reg: f32,
     /// Shares of the steps after which SH degrees 1, 2 and 3 are trained.
     pub sh_from: [f32; 3],
-    /// Largest share of the steps that is trained at each coarse mip, coarsest first; each is one mip coarser than the next.
+    /// Largest share of the steps that is trained at each coarse mip, coarsest first; each is one mip coarser than the
+    /// next.
     pub coarse: Vec<f32>,
-    /// Training goes to the next finer mip once the error is at most this many times the detail that the coarse photos lack (see
-    /// [`coarse_to_fine`](crate::coarse_to_fine)). With 0 only the shares in `coarse` decide.
+    /// Training goes to the next finer mip once the error is at most this many times the detail that the coarse photos
+    /// lack (see [`coarse_to_fine`](crate::coarse_to_fine)). With 0 only the shares in `coarse` decide.
     pub detail_factor: f32,
-    /// Views per optimiser step, at most [`MAX_VIEWS_PER_STEP`](crate::MAX_VIEWS_PER_STEP). With n views the learning rate is √n
-    /// times as high, as the noise of the summed gradient is √n times smaller relative to it (as in gsplat; Granziol et al. 2022). It keeps
-    /// a large device busy where one window has too few tiles. It saves no arithmetic, so a CPU gains nothing.
+    /// Views per optimiser step, at most [`MAX_VIEWS_PER_STEP`](crate::MAX_VIEWS_PER_STEP). With n views the learning
+    /// rate is √n times as high, as the noise of the summed gradient is √n times smaller relative to it (as in gsplat;
+    /// Granziol et al. 2022). It keeps a large device busy where one window has too few tiles. It saves no arithmetic,
+    /// so a CPU gains nothing.
     pub views_per_step: u32,
     /// Opacity of the initial splats.
     pub initial_opacity: f32,
@@ -75,8 +77,8 @@ impl Default for Recipe {
 }
 
 impl Recipe {
-    /// For splats that already fit one mip coarser: full SH degree from the start and higher first learning rates, as there are
-    /// fewer steps. Splats that do not fit the coarser mip yet are trained there first.
+    /// For splats that already fit one mip coarser: full SH degree from the start and higher first learning rates, as
+    /// there are fewer steps. Splats that do not fit the coarser mip yet are trained there first.
     pub fn refinement() -> Self {
         let recipe = Self::default();
         let longer = |[first, last]: [f32; 2]| [1.5 * first, last];
@@ -107,8 +109,8 @@ impl Recipe {
         }
     }
 
-    /// The same recipe on a fixed schedule that ignores the training error: the baseline for the adaptive schedule. Blocks
-    /// that are initialised from points start at coarse mips, others do not.
+    /// The same recipe on a fixed schedule that ignores the training error: the baseline for the adaptive schedule.
+    /// Blocks that are initialised from points start at coarse mips, others do not.
     #[must_use]
     pub fn fixed_schedule(self, from_points: bool) -> Self {
         let coarse = if from_points { vec![0.15, 0.3] } else { Vec::new() };

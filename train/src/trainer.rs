@@ -1,9 +1,9 @@
 //! The training loop of one block.
 //!
-//! A step renders windows of one or more views, compares them with the photos and updates the visible splats. Steps are counted
-//! in views. Training starts at coarse mips, densification follows a schedule towards the budget, and learning rates decay
-//! to the end. The frozen context covers what lies outside the block, and a pixel is weighted by the share of it that the
-//! block's own splats explain.
+//! A step renders windows of one or more views, compares them with the photos and updates the visible splats. Steps are
+//! counted in views. Training starts at coarse mips, densification follows a schedule towards the budget, and learning
+//! rates decay to the end. The frozen context covers what lies outside the block, and a pixel is weighted by the share
+//! of it that the block's own splats explain.
 
 use render::Options;
 use render::cpu::Isa;
@@ -23,8 +23,8 @@ use crate::recipe::Recipe;
 use crate::source::AHEAD;
 use crate::view::TrainView;
 
-/// The progress of training. Methods download their values from the device, which takes time and does not change the result.
-/// They return `None` where the download fails; training then ends with that error.
+/// The progress of training. Methods download their values from the device, which takes time and does not change the
+/// result. They return `None` where the download fails; training then ends with that error.
 pub struct Progress<'a> {
     /// Steps done, counted in views.
     pub step: u32,
@@ -82,8 +82,8 @@ pub fn train(job: Job, report: &mut dyn FnMut(Progress) -> Flow) -> Result<Splat
     train_from(job, None, report).map(|(splats, _)| splats)
 }
 
-/// Trains a block, resuming from a state of the same job where one is given; the result is that of an uninterrupted run.
-/// Returns the splats, and the exposures where they are trained.
+/// Trains a block, resuming from a state of the same job where one is given; the result is that of an uninterrupted
+/// run. Returns the splats, and the exposures where they are trained.
 ///
 /// # Errors
 /// See [`TrainError`].
@@ -251,7 +251,8 @@ impl<'a> Trainer<'a> {
         Ok(error)
     }
 
-    /// Goes to the next finer mip when the error is down to the detail that the current mip lacks, or its share of steps is used.
+    /// Goes to the next finer mip when the error is down to the detail that the current mip lacks, or its share of
+    /// steps is used.
     fn advance_mip(&mut self, error: Option<f64>) -> Result<(), TrainError> {
         let Job { steps, recipe, .. } = self.job;
         let CoarseToFine { stage, stage_start, .. } = self.state.coarse_to_fine;
@@ -266,8 +267,8 @@ impl<'a> Trainer<'a> {
         Ok(())
     }
 
-    /// Adds and removes splats where that is due after a step of `count` views. Skips the steps up to the end of growth where it
-    /// no longer improves the error.
+    /// Adds and removes splats where that is due after a step of `count` views. Skips the steps up to the end of growth
+    /// where it no longer improves the error.
     fn densify(&mut self, count: u32, progress: f32, error: Option<f64>) -> Result<(), TrainError> {
         let Job { counts, keeps, budget, steps, recipe, .. } = self.job;
         let (growth, state) = (&recipe.growth, &mut self.state);

@@ -16,8 +16,8 @@ pub struct TrainView {
 }
 
 impl TrainView {
-    /// The window `coarser` mips up: its mip, rectangle and camera. `None` if the window would be under 8 pixels or the image
-    /// under 16 pixels on a side: ingest makes no mips below that.
+    /// The window `coarser` mips up: its mip, rectangle and camera. `None` if the window would be under 8 pixels or the
+    /// image under 16 pixels on a side: ingest makes no mips below that.
     pub fn at(&self, coarser: u8) -> Option<(u8, Rect, Camera)> {
         let mip = self.mip + coarser;
         let (x, y) = (self.rect.x >> coarser, self.rect.y >> coarser);

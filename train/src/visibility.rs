@@ -70,7 +70,8 @@ impl Window {
         }
     }
 
-    /// Updates the splats at which this window's pixel is the finest so far. Branch-free, so that the compiler vectorises it.
+    /// Updates the splats at which this window's pixel is the finest so far. Branch-free, so that the compiler
+    /// vectorises it.
     fn update(&self, [x, y, z]: [&[f32]; 3], area: &mut [f32], coarse_share: &mut [f32]) {
         let [cx, cy, cz] = self.centre;
         let [right, down, forward] = self.rotation;

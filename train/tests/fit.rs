@@ -193,7 +193,8 @@ fn trainable_alpha(own: &Splats, context: &Splats) -> Vec<f32> {
 fn invisible_splats_keep_every_bit() {
     let ground_truth = cloud(7, 160, 0.8);
     let photos = photos(&ground_truth);
-    // Splats to train; one far above the cameras, never in view; one inside an opaque ball of context, in view but occluded.
+    // Splats to train; one far above the cameras, never in view; one inside an opaque ball of context, in view but
+    // occluded.
     let mut initial = perturbed(&half(&ground_truth, -1.0));
     let trained = initial.len();
     initial.push(&Splat::round(Vec3::new(0.0, 0.0, 40.0), -2.0, Vec3::X, 0.5));

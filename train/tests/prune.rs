@@ -51,7 +51,8 @@ fn cloud(key: u64, count: usize, opacity: f32) -> Splats {
     splats
 }
 
-/// The ground ground_truth with perturbed colours, so that its PSNR is finite, plus half as many nearly transparent splats.
+/// The ground ground_truth with perturbed colours, so that its PSNR is finite, plus half as many nearly transparent
+/// splats.
 fn with_faint_splats(ground_truth: &Splats) -> Splats {
     let mut splats = ground_truth.clone();
     for (i, value) in splats.columns_mut()[column::SH].iter_mut().enumerate() {
@@ -161,7 +162,8 @@ fn only_counted_splats_are_removed() {
 
 #[test]
 fn holes_in_front_of_the_context_count_as_error() {
-    // Green splats in front of a red context, and green photos. Where they are removed the pixel is red and no longer theirs.
+    // Green splats in front of a red context, and green photos. Where they are removed the pixel is red and no longer
+    // theirs.
     let mut green = Splats::new(0);
     let mut red = Splats::new(0);
     for i in 0..60 {

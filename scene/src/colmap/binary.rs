@@ -181,7 +181,8 @@ impl<'a> Reader<'a> {
         self.array().map(f64::from_le_bytes)
     }
 
-    /// A count of entries of at least `size` bytes each, checked against the remaining bytes before anything is allocated.
+    /// A count of entries of at least `size` bytes each, checked against the remaining bytes before anything is
+    /// allocated.
     fn count(&mut self, size: usize) -> Result<usize, CodecError> {
         let count = self.u64()?;
         match usize::try_from(count) {

@@ -40,8 +40,8 @@ pub struct ColmapPoints {
     pub positions: Vec<DVec3>,
     /// sRGB colours.
     pub colours: Vec<[u8; 3]>,
-    /// Offsets into `track_images`: point `i` was observed in `track_images[track_start[i] .. track_start[i + 1]]`. One longer than
-    /// `ids`, or empty without points.
+    /// Offsets into `track_images`: point `i` was observed in `track_images[track_start[i] .. track_start[i + 1]]`. One
+    /// longer than `ids`, or empty without points.
     pub track_start: Vec<u32>,
     /// COLMAP image ids of all tracks.
     pub track_images: Vec<u32>,

@@ -1,7 +1,7 @@
 //! COLMAP's text files: one line per entry, two per image; `#` starts a comment.
 //!
-//! If COLMAP's comment states the number of entries, the file must have that many and end with a line break. This detects
-//! truncated files.
+//! If COLMAP's comment states the number of entries, the file must have that many and end with a line break. This
+//! detects truncated files.
 
 use std::collections::BTreeMap;
 use std::str::FromStr;
@@ -95,7 +95,8 @@ fn lines(bytes: &[u8]) -> Result<impl Iterator<Item = (usize, &str)>, CodecError
     Ok(text.lines().enumerate().map(|(i, line)| (i + 1, line)))
 }
 
-/// Compares `count` with a leading comment such as `# Number of images: 50, mean observations per image: 9.5`, if there is one.
+/// Compares `count` with a leading comment such as `# Number of images: 50, mean observations per image: 9.5`, if there
+/// is one.
 fn check_count(bytes: &[u8], what: &str, count: usize) -> Result<(), CodecError> {
     let comments = lines(bytes)?.take_while(|(_, line)| !is_content(line));
     let stated = comments.filter_map(|(_, line)| {

@@ -191,8 +191,8 @@ impl<'a> Header<'a> {
         self.elements.iter().any(|e| e.name == element)
     }
 
-    /// The element of this name. Checks that its rows fit the body before anything is allocated. In a text PLY only the first element
-    /// can be read.
+    /// The element of this name. Checks that its rows fit the body before anything is allocated. In a text PLY only the
+    /// first element can be read.
     pub(super) fn element(&self, name: &str) -> Result<Element<'_>, CodecError> {
         let mut body = self.body;
         for element in &self.elements {

@@ -1,9 +1,9 @@
 //! Reads PlayCanvas' `.compressed.ply`: 16 bytes per splat, quantised to the value range of each chunk of 256 splats.
 //!
-//! Element `chunk` holds min and max of positions, log scales and (in newer files) colours. Element `vertex` holds four words:
-//! position and log scale with 11, 10 and 11 bits between min and max; the rotation as two bits for the index of the largest component
-//! (in the order w, x, y, z) and 10 bits for each of the others; colour and opacity with 8 bits each. Element `sh` holds
-//! the coefficients of higher degrees as bytes over -4 to 4, channel-major like INRIA's.
+//! Element `chunk` holds min and max of positions, log scales and (in newer files) colours. Element `vertex` holds four
+//! words: position and log scale with 11, 10 and 11 bits between min and max; the rotation as two bits for the index of
+//! the largest component (in the order w, x, y, z) and 10 bits for each of the others; colour and opacity with 8 bits
+//! each. Element `sh` holds the coefficients of higher degrees as bytes over -4 to 4, channel-major like INRIA's.
 //!
 //! Source: PlayCanvas' `splat-transform` (`write-compressed-ply`) and engine (`gsplat-compressed-data`).
 
@@ -121,8 +121,8 @@ fn unpack_rotation(word: u32) -> [f32; 4] {
     quat
 }
 
-/// The logit of an opacity of `byte / 255`. The outermost bytes are moved inwards by a quarter of a step, so that every logit is finite and
-/// is quantised to the same byte again.
+/// The logit of an opacity of `byte / 255`. The outermost bytes are moved inwards by a quarter of a step, so that every
+/// logit is finite and is quantised to the same byte again.
 pub(crate) fn logit_of_byte(byte: u8) -> f32 {
     let opacity = f32::from(byte).clamp(0.25, 254.75) / 255.0;
     (opacity / (1.0 - opacity)).ln()

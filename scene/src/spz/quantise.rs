@@ -144,8 +144,8 @@ fn first_three(xyzw: [f32; 4]) -> u32 {
 fn smallest_three(xyzw: [f32; 4]) -> u32 {
     let xyzw = normalised(xyzw);
     let largest_magnitude = xyzw.iter().fold(0.0f32, |largest_magnitude, v| largest_magnitude.max(v.abs()));
-    // The first of the components that rounding could reorder. The margin is one and a half steps: with a whole number, two codes could
-    // map to each other.
+    // The first of the components that rounding could reorder. The margin is one and a half steps: with a whole number,
+    // two codes could map to each other.
     let threshold = largest_magnitude - 1.5 * FRAC_1_SQRT_2 / MAX_MAGNITUDE;
     let largest = xyzw.iter().position(|v| v.abs() >= threshold).unwrap_or(3);
     let negative = xyzw[largest] < 0.0;

@@ -117,13 +117,13 @@ fn accumulate(sum: &mut Gradients, more: &Gradients, first: bool) {
     sum.seen.iter_mut().zip(&more.seen).for_each(|(sum, more)| *sum |= more);
 }
 
-/// Loss weight of each pixel: zero under a mask, else from the share of the pixel that the block's own splats explain. Empty where all
-/// weights are 1.
+/// Loss weight of each pixel: zero under a mask, else from the share of the pixel that the block's own splats explain.
+/// Empty where all weights are 1.
 pub(super) fn pixel_weights(frame: &Frame, photo: &Pixels, weights: &mut Vec<f32>) {
     weights.clear();
     if !frame.trainable_alpha.is_empty() {
-        // Transmittance that nothing explains yet counts half as the block's own, so that a block may fill it. The share is squared:
-        // Adam normalises gradients, so small steady ones would still move splats.
+        // Transmittance that nothing explains yet counts half as the block's own, so that a block may fill it. The
+        // share is squared: Adam normalises gradients, so small steady ones would still move splats.
         const UNEXPLAINED: f32 = 0.5;
         const MIN_SHARE: f32 = 1e-4;
         weights.extend(frame.trainable_alpha.iter().zip(&frame.transmittance).map(|(own, transmittance)| {

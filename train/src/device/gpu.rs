@@ -1,13 +1,15 @@
-//! Computes training steps on a GPU. Splats, Adam moments and densification statistics live on the device, which runs ahead of the host.
+//! Computes training steps on a GPU. Splats, Adam moments and densification statistics live on the device, which runs
+//! ahead of the host.
 //!
 //! ```text
 //! photos ┐
-//! splats ┴forward→ frames ─loss_forward→ sums ─finish_loss→ optimiser state ─loss_backward→ upstream ─backward→ gradients ─adam→ splats
+//! splats ┴forward→ frames ─loss_forward→ sums ─finish_loss→ optimiser state
+//!         ─loss_backward→ upstream ─backward→ gradients ─adam→ splats
 //! ```
-//! A step reads nothing back. The device itself checks that the loss is finite and counts finished steps in its optimiser state.
-//! When a step has more tile pairs than the pair buffer holds, that step and all after it change nothing. The host finds this at the
-//! next synchronisation, enlarges the buffer and resubmits those steps. The result therefore depends neither on the buffer's
-//! size nor on when the host synchronises.
+//! A step reads nothing back. The device itself checks that the loss is finite and counts finished steps in its
+//! optimiser state. When a step has more tile pairs than the pair buffer holds, that step and all after it change
+//! nothing. The host finds this at the next synchronisation, enlarges the buffer and resubmits those steps. The result
+//! therefore depends neither on the buffer's size nor on when the host synchronises.
 
 use std::collections::VecDeque;
 use std::iter;

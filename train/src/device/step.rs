@@ -1,8 +1,8 @@
 //! The interface between the training loop and a device, and the inputs of one step.
 //!
-//! The loop decides on the host (views, mips, densification) from a [`State`]; a [`TrainDevice`] computes the steps. The CPU works
-//! on the state in place. A GPU keeps its own copy and runs ahead of the host. [`TrainDevice::download`] brings the host's
-//! state up to date; it costs time and changes no bit of the result.
+//! The loop decides on the host (views, mips, densification) from a [`State`]; a [`TrainDevice`] computes the steps.
+//! The CPU works on the state in place. A GPU keeps its own copy and runs ahead of the host. [`TrainDevice::download`]
+//! brings the host's state up to date; it costs time and changes no bit of the result.
 
 use std::sync::Arc;
 

@@ -1,4 +1,5 @@
-//! A test scene of a few hundred splats in a ring of cameras, with photos rendered from the ground truth, and jobs that train it.
+//! A test scene of a few hundred splats in a ring of cameras, with photos rendered from the ground truth, and jobs that
+//! train it.
 #![allow(dead_code, unreachable_pub)] // Each test file uses a part.
 
 use std::sync::Arc;
