@@ -1,5 +1,5 @@
-//! Generates the wire's types and its service with protox, which needs no protoc installed, and lists what is on the wire for
-//! the test that holds it against what it was.
+//! Generates the messages and the service with protox, which needs no protoc, and lists all calls, fields and values for the test that
+//! compares them with `wire.txt`.
 
 use std::fmt::Write;
 use std::path::Path;

@@ -1,10 +1,9 @@
-//! Who may call: the version of the wire and the token that each call carries in its header, how a client shows them, and
-//! how a server checks them.
+//! Authenticates calls: a client sends its protocol version and its token in the headers, and the server checks them.
 //!
 //! ```text
-//! plat-wire: 2                       of every call
-//! authorization: Bearer <token>      where the coordinator asks for one
-//! traceparent: 00-<trace>-<span>-01  where whoever calls is traced; proves nothing, and is not asked for
+//! plat-wire: 2                       in every call
+//! authorization: Bearer <token>      if the coordinator requires one
+//! traceparent: 00-<trace>-<span>-01  if the caller is traced; optional, and not part of the authentication
 //! ```
 
 use std::error::Error;
@@ -19,30 +18,30 @@ use tonic::transport::{Certificate, Channel, ClientTlsConfig, Endpoint, Identity
 use tonic::{Request, Status};
 
 use crate::coordinator_client::CoordinatorClient;
-use crate::{MESSAGE_BYTES_LIMIT, OLDEST, VERSION};
+use crate::{MESSAGE_BYTES_LIMIT, MIN_VERSION, VERSION};
 
-/// The header in which a call says its version of the wire.
+/// The header with the caller's protocol version.
 pub const VERSION_HEADER: &str = "plat-wire";
-/// A connection that is not there by then has failed.
+/// Time limit of connecting.
 const CONNECT_TIMEOUT: Duration = Duration::from_secs(5);
-/// A call without an answer for this long has failed.
+/// Time limit of a call.
 pub const CALL_TIMEOUT: Duration = Duration::from_secs(20);
-/// Either side asks the other so often whether it is still there.
+/// Interval of either side's HTTP/2 keep-alive pings.
 pub const KEEP_ALIVE: Duration = Duration::from_secs(15);
-/// Without an answer to that for this long, the connection is closed.
+/// Without an answer to a ping for this long, the connection is closed.
 pub const KEEP_ALIVE_TIMEOUT: Duration = Duration::from_secs(10);
-/// Characters of a token.
+/// Length of a token in characters.
 const TOKEN_LENGTHS: std::ops::RangeInclusive<usize> = 16..=512;
 
-/// A client of a coordinator: its messages are limited, its calls carry version and token.
+/// A client of a coordinator: message sizes are limited, and each call carries version and token.
 pub type Client = CoordinatorClient<InterceptedService<Channel, Credentials>>;
 
-/// What whoever calls must know. It is never printed.
+/// A shared secret that authenticates callers. It is never printed.
 #[derive(Clone, PartialEq, Eq)]
 pub struct Token(String);
 
 impl Token {
-    /// A token: 16 to 512 printable ASCII characters without spaces; white space around it is left out.
+    /// A token of 16 to 512 printable ASCII characters without spaces; surrounding white space is removed.
     ///
     /// # Errors
     /// What is wrong with it, without repeating it.
@@ -62,10 +61,10 @@ impl Token {
         value
     }
 
-    /// Compares all of the two, so that the time that it takes says nothing of where they differ.
-    fn opens(&self, shown: &[u8]) -> bool {
-        let [own, shown] = [self.header().as_bytes(), shown].map(|bytes| ArtefactId::of(bytes).0);
-        own.iter().zip(shown).fold(0, |differ, (own, shown)| differ | (own ^ shown)) == 0
+    /// Compares in constant time: the hashes of both, every byte.
+    fn matches(&self, header: &[u8]) -> bool {
+        let [own, other] = [self.header().as_bytes(), header].map(|bytes| ArtefactId::of(bytes).0);
+        own.iter().zip(other).fold(0, |differ, (own, other)| differ | (own ^ other)) == 0
     }
 }
 
@@ -75,7 +74,7 @@ impl fmt::Debug for Token {
     }
 }
 
-/// A certificate's chain and its private key, both PEM.
+/// A certificate chain and its private key, both PEM.
 #[derive(Clone, PartialEq, Eq)]
 pub struct KeyPair {
     /// The chain, own certificate first.
@@ -85,7 +84,7 @@ pub struct KeyPair {
 }
 
 impl KeyPair {
-    /// As tonic wants it.
+    /// In tonic's type.
     pub fn identity(&self) -> Identity {
         Identity::from_pem(&self.certificate, &self.key)
     }
@@ -97,21 +96,22 @@ impl fmt::Debug for KeyPair {
     }
 }
 
-/// How a client proves itself to a coordinator, and the coordinator to it.
+/// A client's credentials, and the certificates by which it verifies the coordinator.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Access {
-    /// Whom the client trusts: certificates, PEM.
+    /// Trusted root certificates, PEM.
     pub authority: Option<Vec<u8>>,
-    /// Its own certificate, where the coordinator asks for one.
+    /// The client's certificate, if the coordinator requires one.
     pub identity: Option<KeyPair>,
-    /// What it must know.
+    /// The token, if the coordinator requires one.
     pub token: Option<Token>,
 }
 
-/// A client of the coordinator at this URL. It connects with its first call, and again whenever the connection is lost.
+/// A client of the coordinator at this URL. It connects with its first call, and reconnects when the connection is lost.
 ///
 /// # Errors
-/// A URL that is none, or does not go with the access: TLS needs an authority, and a token goes to other machines only by TLS.
+/// An invalid URL, or one that does not fit the credentials: TLS needs a root certificate, and a token is sent to other machines only
+/// over TLS.
 pub fn connect(url: &str, access: &Access) -> Result<Client, BadInput> {
     let bad = |problem: String, advice: &str| BadInput::new("--coordinator", format!("'{url}' {problem}"), advice);
     let endpoint = Endpoint::from_shared(url.to_string())
@@ -143,18 +143,23 @@ pub fn connect(url: &str, access: &Access) -> Result<Client, BadInput> {
         }
         (Some("https"), None) => {
             let advice = "give --tls-ca with the certificate that signed the coordinator's";
-            return Err(bad("is encrypted, and there is nobody whom to trust".into(), advice));
+            return Err(bad("is encrypted, and no trusted certificate is given".into(), advice));
         }
         (Some("http"), None) if access.identity.is_none() => {
             if access.token.is_some() && !is_local {
-                let problem = "is on another machine and not encrypted: anyone on the way could read the token";
+                let problem = "is on another machine and not encrypted: the token could be read on the network";
                 return Err(bad(problem.into(), "give it as https:// with --tls-ca"));
             }
         }
         (Some("http"), _) => {
             return Err(bad("is not encrypted, but certificates are given".into(), "give it as https://host:port"));
         }
-        _ => return Err(bad("is not a coordinator's".into(), "give it as http://host:port or https://host:port")),
+        _ => {
+            return Err(bad(
+                "is not the URL of a coordinator".into(),
+                "give it as http://host:port or https://host:port",
+            ));
+        }
     }
     Ok(client(endpoint.connect_lazy(), access.token.as_ref()))
 }
@@ -166,7 +171,7 @@ pub fn client(channel: Channel, token: Option<&Token>) -> Client {
         .max_encoding_message_size(MESSAGE_BYTES_LIMIT)
 }
 
-/// Puts version and token into the header of each call.
+/// Adds version and token to the headers of each call.
 #[derive(Debug, Clone)]
 pub struct Credentials {
     bearer: Option<AsciiMetadataValue>,
@@ -182,10 +187,10 @@ impl Interceptor for Credentials {
     }
 }
 
-/// Refuses calls without the token, where there is one, and of versions that are not served.
+/// Refuses calls without the token, if there is one, and calls of unsupported protocol versions.
 #[derive(Debug, Clone, Default)]
 pub struct Guard {
-    /// What whoever calls must show; `None`: nothing.
+    /// The required token; `None` = none.
     pub token: Option<Token>,
 }
 
@@ -194,29 +199,29 @@ impl Interceptor for Guard {
         let header = request.metadata();
         if let Some(token) = &self.token {
             match header.get("authorization") {
-                Some(shown) if token.opens(shown.as_bytes()) => {}
+                Some(header) if token.matches(header.as_bytes()) => {}
                 Some(_) => {
                     return Err(Status::unauthenticated("the token is not this coordinator's; give --token-file"));
                 }
-                None => return Err(Status::unauthenticated("this coordinator asks for a token; give --token-file")),
+                None => return Err(Status::unauthenticated("this coordinator requires a token; give --token-file")),
             }
         }
-        let said = header.get(VERSION_HEADER).and_then(|value| value.to_str().ok()?.parse::<u32>().ok());
-        match said {
-            Some(OLDEST..=VERSION) => Ok(request),
+        let version = header.get(VERSION_HEADER).and_then(|value| value.to_str().ok()?.parse::<u32>().ok());
+        match version {
+            Some(MIN_VERSION..=VERSION) => Ok(request),
             Some(newer) if newer > VERSION => Err(Status::failed_precondition(format!(
-                "the caller speaks version {newer} of the wire, this coordinator no newer one than {VERSION}; \
+                "the caller uses protocol version {newer}, this coordinator supports none above {VERSION}; \
                  update the coordinator"
             ))),
             older => Err(Status::failed_precondition(format!(
-                "the caller is too old: it speaks {} of the wire, this coordinator none before {OLDEST}; update it",
-                older.map_or("a version without a number".into(), |older| format!("version {older}")),
+                "the caller is too old: it uses protocol {}, this coordinator supports none below {MIN_VERSION}; update it",
+                older.map_or("without a version".into(), |older| format!("version {older}")),
             ))),
         }
     }
 }
 
-/// What a status says and, where it comes of the connection, the reason beneath it.
+/// A status's message and, for a connection error, its root cause.
 pub fn explain(status: &Status) -> String {
     match status.source() {
         Some(source) => crate::one_line(&format!("{} ({})", status.message(), root_cause(source))),
@@ -224,7 +229,7 @@ pub fn explain(status: &Status) -> String {
     }
 }
 
-/// The last of an error's sources.
+/// The message of the last error in the chain of sources.
 pub fn root_cause(error: &dyn Error) -> String {
     let mut root = error;
     while let Some(source) = root.source() {
@@ -238,12 +243,12 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_token_is_needed_whole_and_never_printed() {
+    fn a_token_matches_as_a_whole_and_is_never_printed() {
         let token = Token::new(" 0123456789abcdef\n").unwrap();
-        assert!(token.opens(b"Bearer 0123456789abcdef"));
+        assert!(token.matches(b"Bearer 0123456789abcdef"));
         for wrong in [&b""[..], b"Bearer ", b"0123456789abcdef", b"Bearer 0123456789abcde", b"Bearer 0123456789abcdeff"]
         {
-            assert!(!token.opens(wrong));
+            assert!(!token.matches(wrong));
         }
         for bad in ["", "short", "two words of a token", "é0123456789abcdef", &"x".repeat(513)] {
             assert!(Token::new(bad).is_err(), "{bad}");
@@ -258,7 +263,7 @@ mod tests {
     }
 
     #[test]
-    fn versions_that_are_not_served_are_told_which_side_to_update() {
+    fn unsupported_versions_are_refused_with_the_side_to_update() {
         let mut guard = Guard::default();
         assert!(guard.call(client_header(&Access::default())).is_ok());
         let mut refused = |version: Option<&'static str>| {
@@ -275,7 +280,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_token_does_not_leave_the_machine_in_the_open() {
+    async fn a_token_is_not_sent_unencrypted_to_other_machines() {
         let access = Access { token: Some(Token::new("0123456789abcdef").unwrap()), ..Access::default() };
         for fine in ["http://127.0.0.1:7", "http://localhost:7", "http://[::1]:7"] {
             assert!(connect(fine, &access).is_ok(), "{fine}");

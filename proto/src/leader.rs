@@ -1,26 +1,26 @@
-//! The lease of the coordinator that leads, as it lies in the store: `leader/<epoch>.json`, the highest number counts.
+//! The leader's lease in the store: `leader/<epoch>.json`; the highest epoch is the current one.
 //!
-//! Whoever takes over has made its epoch sure in the durable state before, so no two coordinators write the same object, and
-//! creating it needs no comparing and swapping. Its owner writes over it while it is alive, a higher beat each time. That tells
-//! who to ask and when to take over; what keeps a coordinator that is late from doing harm is the fence of the durable state.
+//! A new leader first makes its epoch durable in the state, so no two coordinators write the same object and creating it needs no
+//! compare-and-swap. The leader overwrites its lease with a growing beat. Workers and clients find the leader by it, and standbys take
+//! over when the beat stops. It does not fence: a late leader is fenced by the durable state.
 
 use serde::{Deserialize, Serialize};
 
-/// Where leases lie among the records of a store.
+/// The folder of leases among a store's records.
 pub const FOLDER: &str = "leader";
-/// The longest lease that is read, in bytes.
+/// The largest lease that is read, in bytes.
 const BYTES_LIMIT: usize = 4096;
 
-/// A lease. A field that a later version adds is left out by those that do not know it.
+/// A lease. Unknown fields, of later versions, are ignored.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Leader {
-    /// Under which epoch it grants; also the number of the object.
+    /// The leader's epoch; also the number of the object.
     pub epoch: u64,
-    /// Where it is reached: `http://host:port` or `https://host:port`.
+    /// The leader's address: `http://host:port` or `https://host:port`.
     pub address: String,
-    /// Grows while it is alive.
+    /// Heartbeat counter: grows while the leader is alive.
     pub beat: u64,
-    /// It has left, and whoever wants may follow at once.
+    /// The leader has shut down: a standby may take over at once.
     pub released: bool,
 }
 
@@ -30,18 +30,18 @@ impl Leader {
         name(self.epoch)
     }
 
-    /// As it lies in the store.
+    /// Encodes it for the store.
     pub fn to_bytes(&self) -> Vec<u8> {
         // Plain fields always encode.
         serde_json::to_vec(self).unwrap_or_default()
     }
 
-    /// The lease of this number.
+    /// Decodes the lease of this epoch.
     ///
     /// # Errors
     /// What is wrong with it, as the rest of a line.
     pub fn from_bytes(epoch: u64, bytes: &[u8]) -> Result<Self, String> {
-        let wrong = |what: String| format!("{} is no lease of a leader: {what}", name(epoch));
+        let wrong = |problem: String| format!("{} is not a leader's lease: {problem}", name(epoch));
         if bytes.len() > BYTES_LIMIT {
             return Err(wrong(format!("it has {} bytes, at most {BYTES_LIMIT}", bytes.len())));
         }
@@ -67,7 +67,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_lease_is_read_as_written_and_checked() {
+    fn a_lease_round_trips_and_is_checked() {
         let lease = Leader { epoch: 17, address: "http://10.0.0.7:7070".into(), beat: 3, released: false };
         assert_eq!(lease.name(), "leader/000017.json");
         assert_eq!(Leader::from_bytes(17, &lease.to_bytes()).unwrap(), lease);

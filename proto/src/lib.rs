@@ -1,5 +1,5 @@
-//! The wire between coordinator, workers and command line: the types and the service of `proto/plat.proto`, the limits
-//! of a message, who may call (`access`), and checked conversions.
+//! The gRPC protocol between coordinator, workers and command line: the messages and the service of `proto/plat.proto`, message limits,
+//! authentication (`access`, `tls`), and checked conversions.
 //!
 //! Architecture invariant: bulk data never goes through here, and generated types never enter floors 0 to 2.
 
@@ -10,12 +10,14 @@ mod generated {
 
 mod access;
 pub mod leader;
+mod tls;
 
 pub use access::{
     Access, CALL_TIMEOUT, Client, Credentials, Guard, KEEP_ALIVE, KEEP_ALIVE_TIMEOUT, KeyPair, Token, VERSION_HEADER,
     client, connect, explain, root_cause,
 };
 pub use generated::*;
+pub use tls::rejected_certificate;
 
 use std::collections::BTreeMap;
 
@@ -23,24 +25,24 @@ use scene::ArtefactId;
 use tonic::Status;
 use tonic::service::interceptor::InterceptedService;
 
-/// The service's full name, by which its health is asked for.
+/// The service's full name, as health checks name it.
 pub const SERVICE_NAME: &str = coordinator_server::SERVICE_NAME;
 
-/// The version of the wire that this program speaks. It grows where an older side would misunderstand a newer one.
+/// The protocol version of this program. It grows when an older peer would misunderstand a newer one.
 pub const VERSION: u32 = 2;
-/// The oldest version that a coordinator still serves. (The first one did not say its number.)
-pub const OLDEST: u32 = 2;
-/// The longest message that either side accepts, in bytes. The longest that is meant to occur is a grant: 40 bytes for
-/// each block of its context.
+/// The oldest protocol version that a coordinator still serves. (The first version did not send its number.)
+pub const MIN_VERSION: u32 = 2;
+/// The largest message that either side accepts, in bytes. The largest in regular use is a grant: 40 bytes for each block of its
+/// context.
 pub const MESSAGE_BYTES_LIMIT: usize = 4 << 20;
 /// The longest name of a worker or of a backend, in bytes.
 pub const NAME_BYTES_LIMIT: usize = 128;
-/// The longest error message that is kept, in bytes; longer ones are cut.
+/// The longest error message that is kept, in bytes; longer ones are truncated.
 pub const ERROR_BYTES_LIMIT: usize = 4096;
-/// The most reports in one call.
+/// The largest number of reports in one call.
 pub const REPORTS_LIMIT: usize = 1024;
 
-/// A server whose messages are limited, for whom the guard lets in.
+/// A server of calls that the guard admits, with limited message sizes.
 pub fn server<S: coordinator_server::Coordinator>(
     service: S,
     guard: Guard,
@@ -51,7 +53,7 @@ pub fn server<S: coordinator_server::Coordinator>(
     InterceptedService::new(server, guard)
 }
 
-/// An artefact's name off the wire.
+/// An artefact's name from a message.
 ///
 /// # Errors
 /// `InvalidArgument` if it is not 32 bytes.
@@ -62,15 +64,15 @@ pub fn artefact_id(bytes: &[u8]) -> Result<ArtefactId, Status> {
     Ok(ArtefactId(id))
 }
 
-/// Under which key a task's result and its checkpoints are remembered in the store: a result follows from its plan, which names
-/// the backend, and from the results that it is given, by task.
-pub fn memory_key(plan: ArtefactId, task: u32, inputs: &BTreeMap<u32, ArtefactId>) -> ArtefactId {
+/// The key of a task's result and checkpoints in the store: the hash of what determines the result, which is the plan (it names the
+/// backend), the task, and the task's inputs by task.
+pub fn result_key(plan: ArtefactId, task: u32, inputs: &BTreeMap<u32, ArtefactId>) -> ArtefactId {
     let inputs: Vec<String> = inputs.iter().map(|(task, id)| format!("{task}={id}")).collect();
     ArtefactId::of(format!("{plan}/{task}/{}", inputs.join(",")).as_bytes())
 }
 
-/// A worker's or a backend's name off the wire: 1 to [`NAME_BYTES_LIMIT`] printable ASCII characters, so that it may
-/// stand in a log as it is.
+/// Checks a worker's or a backend's name from a message: 1 to [`NAME_BYTES_LIMIT`] printable ASCII characters without spaces, so that
+/// it can be logged as it is.
 ///
 /// # Errors
 /// `InvalidArgument` otherwise.
@@ -96,7 +98,7 @@ pub fn one_line(message: &str) -> String {
 }
 
 impl Report {
-    /// Whether all numbers are finite, as the wire demands.
+    /// Whether all numbers are finite, which the protocol requires.
     pub fn is_finite(&self) -> bool {
         let optional = |value: Option<f64>| value.is_none_or(f64::is_finite);
         self.cpu_seconds.is_finite() && self.wall_seconds.is_finite() && optional(self.loss) && optional(self.psnr)
@@ -108,7 +110,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_comes_off_the_wire_is_checked() {
+    fn values_from_messages_are_checked() {
         assert_eq!(artefact_id(&[7; 32]).unwrap(), ArtefactId([7; 32]));
         assert!(artefact_id(&[7; 31]).is_err());
         assert!(check_name("worker", "local-0").is_ok());
@@ -121,12 +123,12 @@ mod tests {
         assert!(!Report { psnr: Some(f64::NAN), ..Report::default() }.is_finite());
     }
 
-    /// What was once on the wire stays as it is; new lines are added to `wire.txt` with the change that needs them.
+    /// Fields and calls never change; new ones are added to `wire.txt` with the change that needs them.
     #[test]
-    fn nothing_on_the_wire_changes_its_meaning() {
+    fn the_protocol_only_grows() {
         let [kept, now] = [include_str!("../wire.txt"), include_str!(concat!(env!("OUT_DIR"), "/wire.txt"))];
         for line in kept.lines() {
-            assert!(now.lines().any(|other| other == line), "'{line}' is no longer on the wire");
+            assert!(now.lines().any(|other| other == line), "'{line}' is no longer in the protocol");
         }
         for line in now.lines() {
             assert!(kept.lines().any(|other| other == line), "'{line}' is new: add it to proto/wire.txt");

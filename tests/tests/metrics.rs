@@ -65,6 +65,6 @@ async fn a_coordinator_exports_what_is_documented() {
 #[test]
 fn a_worker_exports_what_is_documented() {
     let mut registry = Registry::default();
-    worker::execute::Shared::default().metrics.register(&mut registry);
+    worker::Shared::default().metrics.register(&mut registry);
     assert_eq!(exported(&registry), documented("Worker"));
 }

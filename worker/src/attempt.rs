@@ -1,4 +1,4 @@
-//! One attempt: the compute on a blocking thread, the heartbeat beside it, and the last word to the coordinator.
+//! Runs one attempt: the compute on a blocking thread, the heartbeat beside it, and the delivery of the outcome.
 
 use std::any::Any;
 use std::sync::Arc;
@@ -14,20 +14,21 @@ use tonic::Code;
 use tracing::field::Empty;
 use tracing::{Instrument, Span};
 
-use crate::link::Link;
-use crate::{Execute, ExecuteError, FULL_RATE, Flow, Options, Report, TaskOrder, asks, is_passing};
+use crate::coordinator_link::{CoordinatorLink, is_transient};
+use crate::options::Options;
+use crate::task::{Execute, ExecuteError, FULL_RATE, Flow, Report, TaskOrder};
 
-/// News go out this often, if there are any.
-const NEWS_PERIOD: Duration = Duration::from_millis(250);
-/// Signs of life per lease.
-const BEATS_PER_LEASE: u32 = 4;
-/// Tries to deliver the last word before the lease is left to expire: about half a minute.
-const LAST_WORD_TRIES: u32 = 13;
+/// Interval at which queued reports are sent.
+const REPORT_PERIOD: Duration = Duration::from_millis(250);
+/// Heartbeats per lease.
+const HEARTBEATS_PER_LEASE: u32 = 4;
+/// Tries to deliver the outcome before the lease is left to expire: about half a minute.
+const OUTCOME_TRIES: u32 = 13;
 
-/// Carries out what was granted, says how it ended, and returns what the coordinator answered to the worker's asking for more, if
-/// it did. Troubles on the wire are logged, not returned: the lease expires and the coordinator grants the task anew.
+/// Carries out a grant and delivers its outcome. Returns the reply to the lease request that goes with the outcome, if there is one.
+/// Connection errors are logged, not returned: the lease expires and the coordinator grants the task again.
 pub(crate) async fn run(
-    link: &mut Link,
+    link: &mut CoordinatorLink,
     options: &Options,
     grant: proto::Grant,
     executor: Arc<dyn Execute>,
@@ -36,13 +37,13 @@ pub(crate) async fn run(
     let lease = Duration::from_millis(grant.lease_millis.into());
     let parent = TraceParent::parse(&grant.traceparent);
     let Some((key, order)) = order_of(grant) else {
-        tracing::error!("a grant that makes no sense was dropped");
-        tokio::time::sleep(NEWS_PERIOD).await;
+        tracing::error!("dropped a malformed grant");
+        tokio::time::sleep(REPORT_PERIOD).await;
         return None;
     };
-    link.saw(key.epoch);
+    link.observe_epoch(key.epoch);
     let proto::Attempt { job, task, number: attempt, .. } = key;
-    // Of the highest level, so that whatever is logged within says of which attempt it is.
+    // At the highest level, so that every event within it carries the attempt's fields.
     let worker = &options.worker_id;
     let span = tracing::error_span!("task", job, task, attempt, worker, artefact = Empty, otel.status_code = Empty);
     parent.iter().for_each(|parent| parent.adopt(&span));
@@ -50,7 +51,7 @@ pub(crate) async fn run(
 }
 
 async fn carry_out(
-    link: &mut Link,
+    link: &mut CoordinatorLink,
     options: &Options,
     (key, order): (proto::Attempt, TaskOrder),
     lease: Duration,
@@ -59,12 +60,12 @@ async fn carry_out(
 ) -> Option<proto::LeaseReply> {
     tracing::info!("begins");
     let stop = Arc::new(AtomicBool::new(false));
-    let (sender, mut news) = mpsc::channel(REPORTS_LIMIT);
+    let (sender, mut reports) = mpsc::channel(REPORTS_LIMIT);
     let mut work = {
         let (stop, span) = (stop.clone(), Span::current());
         tokio::task::spawn_blocking(move || {
             let mut report = |report: Report| {
-                // A full channel means that the coordinator is away: the line is lost, the compute goes on.
+                // The channel is full while the coordinator is unreachable: the report is dropped, the compute goes on.
                 let _ = sender.try_send(to_wire(report));
                 if stop.load(Ordering::Relaxed) { Flow::Stop } else { Flow::Continue }
             };
@@ -72,32 +73,32 @@ async fn carry_out(
         })
     };
 
-    let longest_silence = lease / BEATS_PER_LEASE;
-    let mut beat = tokio::time::interval(NEWS_PERIOD.min(longest_silence).max(Duration::from_millis(1)));
-    beat.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    let max_silence = lease / HEARTBEATS_PER_LEASE;
+    let mut heartbeat = tokio::time::interval(REPORT_PERIOD.min(max_silence).max(Duration::from_millis(1)));
+    heartbeat.set_missed_tick_behavior(MissedTickBehavior::Delay);
     let mut last_call = Instant::now();
-    // How long to wait before it is looked for again who leads, where nobody answered.
-    let mut pause: Option<Duration> = None;
-    let (mut void, mut leaving) = (false, false);
+    // Set while the coordinator does not answer: the pause before the next try.
+    let mut retry_after: Option<Duration> = None;
+    let (mut is_void, mut is_leaving) = (false, false);
     let result = loop {
         tokio::select! {
             biased;
             result = &mut work => break result,
-            () = shutdown.cancelled(), if !leaving => {
-                leaving = true;
+            () = shutdown.cancelled(), if !is_leaving => {
+                is_leaving = true;
                 stop.store(true, Ordering::Relaxed);
             }
-            _ = beat.tick(), if !void => {
-                let due = match pause {
-                    Some(pause) => last_call.elapsed() >= pause,
-                    None => !news.is_empty() || last_call.elapsed() >= longest_silence,
+            _ = heartbeat.tick(), if !is_void => {
+                let is_due = match retry_after {
+                    Some(retry_after) => last_call.elapsed() >= retry_after,
+                    None => !reports.is_empty() || last_call.elapsed() >= max_silence,
                 };
-                if due {
-                    let told = tell(link, key, &mut news).await;
+                if is_due {
+                    let answer = send_reports(link, key, &mut reports).await;
                     last_call = Instant::now();
-                    pause = if let Told::Nobody(pause) = told { Some(pause) } else { None };
-                    void = told == Told::Void;
-                    if void {
+                    retry_after = if let LeaseStatus::Unknown { retry_after } = answer { Some(retry_after) } else { None };
+                    is_void = answer == LeaseStatus::Void;
+                    if is_void {
                         tracing::warn!("the attempt is void, stopping");
                         stop.store(true, Ordering::Relaxed);
                     }
@@ -105,15 +106,15 @@ async fn carry_out(
             }
         }
     };
-    if !void {
-        while !news.is_empty() && tell(link, key, &mut news).await == Told::Counts {}
+    if !is_void {
+        while !reports.is_empty() && send_reports(link, key, &mut reports).await == LeaseStatus::Held {}
     }
-    if void {
+    if is_void {
         return None;
     }
     let result = result.unwrap_or_else(|error| {
         let message = if error.is_panic() { panic_text(&*error.into_panic()) } else { error.to_string() };
-        Err(ExecuteError::of(FailureKind::Work, message))
+        Err(ExecuteError::work(message))
     });
     match &result {
         Ok(artefact) => {
@@ -125,8 +126,8 @@ async fn carry_out(
             tracing::warn!("ends without a result: {error}");
         }
     }
-    let then = (!shutdown.is_cancelled()).then(|| asks(options, link));
-    say_last_word(link, key, result, leaving, then).await
+    let then = (!shutdown.is_cancelled()).then(|| link.lease_request(options));
+    deliver_outcome(link, key, result, is_leaving, then).await
 }
 
 fn order_of(grant: proto::Grant) -> Option<(proto::Attempt, TaskOrder)> {
@@ -157,44 +158,48 @@ fn to_wire(report: Report) -> proto::Report {
     }
 }
 
-/// What came of a report.
+/// The state of an attempt's lease, as the answer to a report shows it.
 #[derive(Debug, Clone, Copy, PartialEq)]
-enum Told {
+enum LeaseStatus {
     /// The attempt holds its lease.
-    Counts,
-    /// It does not.
+    Held,
+    /// The attempt has lost its lease.
     Void,
-    /// Nobody answered; the next try after this long.
-    Nobody(Duration),
+    /// The coordinator did not answer.
+    Unknown { retry_after: Duration },
 }
 
-/// Sends the waiting news, or a mere sign of life.
-async fn tell(link: &mut Link, key: proto::Attempt, news: &mut mpsc::Receiver<proto::Report>) -> Told {
-    let reports = std::iter::from_fn(|| news.try_recv().ok()).take(REPORTS_LIMIT).collect();
+/// Sends the queued reports, or an empty heartbeat.
+async fn send_reports(
+    link: &mut CoordinatorLink,
+    key: proto::Attempt,
+    queue: &mut mpsc::Receiver<proto::Report>,
+) -> LeaseStatus {
+    let reports = std::iter::from_fn(|| queue.try_recv().ok()).take(REPORTS_LIMIT).collect();
     let request = proto::ReportRequest { attempt: Some(key), reports };
     let answer = async { link.client().await?.report(request).await }.await;
     match answer {
         Ok(reply) => {
-            link.found();
-            if reply.into_inner().cancelled { Told::Void } else { Told::Counts }
+            link.reset_backoff();
+            if reply.into_inner().cancelled { LeaseStatus::Void } else { LeaseStatus::Held }
         }
-        // A coordinator that does not know the job has forgotten it; any other trouble may pass.
-        Err(status) if status.code() == Code::NotFound => Told::Void,
+        // The coordinator no longer knows the job. Any other error may pass.
+        Err(status) if status.code() == Code::NotFound => LeaseStatus::Void,
         Err(status) => {
             tracing::warn!("no answer to a report: {}", status.message());
-            Told::Nobody(link.lost())
+            LeaseStatus::Unknown { retry_after: link.disconnect() }
         }
     }
 }
 
-async fn say_last_word(
-    link: &mut Link,
+async fn deliver_outcome(
+    link: &mut CoordinatorLink,
     key: proto::Attempt,
     result: Result<scene::ArtefactId, ExecuteError>,
-    leaving: bool,
+    is_leaving: bool,
     then: Option<proto::LeaseRequest>,
 ) -> Option<proto::LeaseReply> {
-    for _ in 0..LAST_WORD_TRIES {
+    for _ in 0..OUTCOME_TRIES {
         let answer = match &result {
             Ok(artefact) => {
                 let (attempt, artefact) = (Some(key), artefact.0.to_vec());
@@ -202,7 +207,7 @@ async fn say_last_word(
                 async { link.client().await?.complete(traced(request)).await }.await
             }
             Err(error) => {
-                let kind = if leaving { FailureKind::GivenBack } else { error.kind };
+                let kind = if is_leaving { FailureKind::GivenBack } else { error.kind };
                 let message = proto::one_line(&error.message);
                 let request = proto::FailRequest { attempt: Some(key), message, kind: kind.into() };
                 async { link.client().await?.fail(traced(request)).await }.await
@@ -210,20 +215,20 @@ async fn say_last_word(
         };
         match answer {
             Ok(reply) => {
-                link.found();
+                link.reset_backoff();
                 if !reply.get_ref().accepted {
                     tracing::warn!("the coordinator refuses the result of a stale attempt");
                 }
                 return reply.into_inner().next;
             }
-            Err(status) if is_passing(&status) => tokio::time::sleep(link.lost()).await,
+            Err(status) if is_transient(&status) => tokio::time::sleep(link.disconnect()).await,
             Err(status) => {
                 tracing::warn!("{}", status.message());
                 return None;
             }
         }
     }
-    tracing::warn!("the coordinator could not be told how it ended");
+    tracing::warn!("the outcome could not be delivered; the lease is left to expire");
     None
 }
 

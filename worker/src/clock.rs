@@ -1,4 +1,4 @@
-//! The one place in a worker that reads clocks: how much CPU and wall time a task has taken, pauses left out.
+//! Measures the CPU and wall time of a task without its pauses. The only place in a worker that reads clocks.
 
 use std::time::Instant;
 
@@ -8,8 +8,8 @@ pub fn cpu_seconds() -> f64 {
     time.tv_sec as f64 + time.tv_nsec as f64 * 1e-9
 }
 
-/// CPU and wall seconds since it was started, without what was spent in [`Stopwatch::paused`]. The CPU time is that of
-/// the whole process: with several workers in one process each sees the sum.
+/// CPU and wall seconds since its start, without the time inside [`Stopwatch::paused`]. The CPU time is that of the whole process:
+/// with several workers in one process each sees the sum.
 #[derive(Debug, Clone)]
 pub struct Stopwatch {
     started: Instant,
@@ -34,7 +34,7 @@ impl Stopwatch {
         self.started.elapsed().as_secs_f64() - self.paused_wall
     }
 
-    /// Does something that does not count.
+    /// Runs `f` without counting its time.
     pub fn paused<T>(&mut self, f: impl FnOnce() -> T) -> T {
         let (cpu, wall) = (cpu_seconds(), Instant::now());
         let value = f();

@@ -15,7 +15,7 @@ use bytes::Bytes;
 use dataset::byte_lru::ByteLru;
 use dataset::ingest::IngestError;
 use dataset::windows::{SharedTileCache, WindowReader};
-use scene::frame::{self, About};
+use scene::frame::{self, TrainingInfo};
 use scene::{ArtefactId, BlockId, Capture, Exposures, Splats};
 use store::BlockingStore;
 use train::Backend;
@@ -52,7 +52,7 @@ pub struct BlockTrainer {
 type CachedCapture = (ArtefactId, Arc<Capture>, Arc<SharedTileCache>);
 
 /// The inputs of a task: splats by block, and the parent's exposures and residual.
-type Inputs = (BTreeMap<BlockId, Splats>, About);
+type Inputs = (BTreeMap<BlockId, Splats>, TrainingInfo);
 
 impl BlockTrainer {
     /// A trainer over this store.
@@ -181,15 +181,15 @@ impl BlockTrainer {
     }
 
     /// Puts a block's result into the store. Exposures and residual are passed down from the parent unless the block has its own.
-    fn put_result(&self, trained: TrainedBlock, given: About) -> Result<ArtefactId, ExecuteError> {
+    fn put_result(&self, trained: TrainedBlock, given: TrainingInfo) -> Result<ArtefactId, ExecuteError> {
         let TrainedBlock { splats, exposures, residual } = trained;
         let store = &self.context.store;
         let exposures = match exposures {
             Some(trained) => Some(store.put(trained.to_frame())?),
             None => given.exposures,
         };
-        let about = About { exposures, residual: residual.or(given.residual) };
-        Ok(store.put(frame::encode_result(&splats, about))?)
+        let training = TrainingInfo { exposures, residual: residual.or(given.residual) };
+        Ok(store.put(frame::encode_result(&splats, training))?)
     }
 
     fn plan(&self, id: ArtefactId) -> Result<Arc<Plan>, ExecuteError> {
@@ -233,7 +233,7 @@ impl BlockTrainer {
         order: &TaskOrder,
         report: &mut (dyn FnMut(Report) -> Flow + Send),
     ) -> Result<Inputs, ExecuteError> {
-        let (mut results, mut given) = (BTreeMap::new(), About::default());
+        let (mut results, mut given) = (BTreeMap::new(), TrainingInfo::default());
         let wanted = task.context_cut().blocks().into_iter().map(|block| {
             let index = plan.tasks.iter().position(|t| t.block == block);
             let known = index.and_then(|i| order.inputs.get_key_value(&(i as u32)));
@@ -256,9 +256,9 @@ impl BlockTrainer {
                     Some(bytes) => bytes,
                     None => recompute(self, &self.context.store, plan, order, (index, id), report)?,
                 };
-                let (splats, about) = frame::decode_result(&bytes).map_err(ExecuteError::work)?;
+                let (splats, training) = frame::decode_result(&bytes).map_err(ExecuteError::work)?;
                 results.insert(block, splats);
-                given = if Some(block) == task.parent { about } else { given };
+                given = if Some(block) == task.parent { training } else { given };
             }
         }
         Ok((results, given))

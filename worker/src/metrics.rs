@@ -1,4 +1,4 @@
-//! What a worker tells Prometheus: `docs/src/metrics.md` lists it.
+//! The worker's Prometheus metrics, which `docs/src/metrics.md` lists.
 
 use std::any::Any;
 use std::fmt;
@@ -16,9 +16,10 @@ use scene::ArtefactId;
 use store::Store;
 
 use crate::clock::cpu_seconds;
-use crate::{Execute, ExecuteError, FailureKind, Flow, Report, TaskOrder};
+use crate::task::{Execute, ExecuteError, Flow, Report, TaskOrder};
+use proto::FailureKind;
 
-/// Why a task had no result.
+/// Values of the label `kind` of failed tasks.
 const FAILURES: [&str; 6] = ["input", "work", "infrastructure", "out_of_memory", "numeric", "panic"];
 
 /// A worker's metrics. Clones share them.
@@ -50,7 +51,7 @@ impl Default for Metrics {
             checkpoints: Counter::default(),
             store: Arc::default(),
         };
-        // A rate over what appears later misses its first.
+        // Present from the start as 0: a rate over a series that appears later misses its first increment.
         for kind in FAILURES {
             metrics.tasks_failed.get_or_create(&[("kind", kind)]).inc_by(0);
         }
@@ -59,52 +60,56 @@ impl Default for Metrics {
 }
 
 impl Metrics {
-    /// Has them told, with what this process used.
+    /// Registers them under `plat_worker_`, with the CPU time of this process.
     pub fn register(&self, registry: &mut Registry) {
         let worker = registry.sub_registry_with_prefix("plat_worker");
         worker.register("tasks_done", "Tasks finished", self.tasks_done.clone());
-        worker.register("tasks_failed", "Tasks that ended without a result, by why", self.tasks_failed.clone());
-        worker.register("tasks_stopped", "Tasks given back or not needed any more", self.tasks_stopped.clone());
-        worker.register("steps", "Optimiser steps, those of healing included", self.steps.clone());
-        worker.register("splats", "Splats of the block in hand", self.splats.clone());
+        worker.register(
+            "tasks_failed",
+            "Tasks that ended without a result, by failure kind",
+            self.tasks_failed.clone(),
+        );
+        worker.register("tasks_stopped", "Tasks given back or no longer needed", self.tasks_stopped.clone());
+        worker.register("steps", "Optimiser steps, those of recovery after pruning included", self.steps.clone());
+        worker.register("splats", "Splats of the current block", self.splats.clone());
         worker.register(
             "cache_bytes",
-            "Bytes of windows that the block in hand keeps in memory",
+            "Bytes of decoded windows that are cached for the current block",
             self.cache_bytes.clone(),
         );
         worker.register("window_read_bytes", "Bytes read for windows of photos", self.window_read_bytes.clone());
         worker.register(
             "window_used_bytes",
-            "The part of them that the windows' own pixels take of their tiles",
+            "Bytes of those that belong to the windows' own pixels",
             self.window_used_bytes.clone(),
         );
-        worker.register("checkpoints", "Checkpoints left in the store", self.checkpoints.clone());
+        worker.register("checkpoints", "Checkpoints written to the store", self.checkpoints.clone());
         worker.register_collector(Box::new(Usage { store: self.store.clone() }));
     }
 
-    /// From now on what is moved from and to this store is told, as its meter shows it. The first one stays.
-    pub fn moves_from_and_to(&self, store: Store) {
+    /// Exports the traffic of this store from now on. Later calls have no effect.
+    pub fn export_traffic_of(&self, store: Store) {
         let _ = self.store.set(store);
     }
 
-    /// Counts what a reader of a task that ended has read.
-    pub(crate) fn has_read(&self, stats: WindowStats) {
+    /// Adds what a task's window reader has read.
+    pub(crate) fn count_reads(&self, stats: WindowStats) {
         self.window_read_bytes.inc_by(stats.bytes_read);
         self.window_used_bytes.inc_by(stats.bytes_used);
     }
 
-    /// Bytes read for windows of photos in tasks that ended, and the part of them that the windows' own pixels take.
+    /// Bytes read for windows of photos in ended tasks, and those of them that belong to the windows' own pixels.
     pub fn window_bytes(&self) -> (u64, u64) {
         (self.window_read_bytes.get(), self.window_used_bytes.get())
     }
 
     /// Tasks finished so far.
-    pub fn done(&self) -> u64 {
+    pub fn tasks_done(&self) -> u64 {
         self.tasks_done.get()
     }
 }
 
-/// What is known without being counted here.
+/// Values that are read at each scrape: CPU time and store traffic.
 #[derive(Debug)]
 struct Usage {
     store: Arc<OnceLock<Store>>,
@@ -113,31 +118,31 @@ struct Usage {
 impl Collector for Usage {
     fn encode(&self, mut encoder: DescriptorEncoder<'_>) -> Result<(), fmt::Error> {
         let traffic = self.store.get().map(Store::traffic).unwrap_or_default();
-        let mut tell = |name: &str, help: &str, counter: &dyn EncodeMetric| {
+        let mut encode = |name: &str, help: &str, counter: &dyn EncodeMetric| {
             counter.encode(encoder.encode_descriptor(name, help, None, counter.metric_type())?)
         };
         let seconds = ConstCounter::new(cpu_seconds());
-        tell("cpu_seconds", "CPU seconds of this process, user and system", &seconds)?;
-        tell("store_read_bytes", "Bytes read from the store", &ConstCounter::new(traffic.read))?;
-        tell("store_written_bytes", "Bytes written to the store", &ConstCounter::new(traffic.written))
+        encode("cpu_seconds", "CPU seconds of this process, user and system", &seconds)?;
+        encode("store_read_bytes", "Bytes read from the store", &ConstCounter::new(traffic.read))?;
+        encode("store_written_bytes", "Bytes written to the store", &ConstCounter::new(traffic.written))
     }
 }
 
-/// An executor whose tasks are counted.
+/// An executor that counts its tasks.
 #[derive(Debug)]
-pub struct Measured<E> {
+pub struct CountedExecutor<E> {
     executor: E,
     metrics: Metrics,
 }
 
-impl<E: Execute> Measured<E> {
-    /// Counts what this one does.
+impl<E: Execute> CountedExecutor<E> {
+    /// Counts the tasks of `executor`.
     pub fn new(executor: E, metrics: Metrics) -> Self {
         Self { executor, metrics }
     }
 }
 
-impl<E: Execute> Execute for Measured<E> {
+impl<E: Execute> Execute for CountedExecutor<E> {
     fn execute(
         &self,
         order: &TaskOrder,
@@ -149,26 +154,26 @@ impl<E: Execute> Execute for Measured<E> {
             stopped |= flow == Flow::Stop;
             flow
         };
-        // Whoever waits for the task sees the panic as it was.
+        // The panic is passed on unchanged.
         let ended = catch_unwind(AssertUnwindSafe(|| self.executor.execute(order, &mut report)));
         match &ended {
             Ok(Ok(_)) => self.metrics.tasks_done.inc(),
             Ok(Err(_)) if stopped => self.metrics.tasks_stopped.inc(),
-            Ok(Err(error)) => self.failed(word_of(error.kind)),
-            Err(_) => self.failed("panic"),
+            Ok(Err(error)) => self.count_failure(label_of(error.kind)),
+            Err(_) => self.count_failure("panic"),
         };
         ended.unwrap_or_else(|panic: Box<dyn Any + Send>| resume_unwind(panic))
     }
 }
 
-impl<E> Measured<E> {
-    fn failed(&self, kind: &'static str) -> u64 {
+impl<E> CountedExecutor<E> {
+    fn count_failure(&self, kind: &'static str) -> u64 {
         self.metrics.tasks_failed.get_or_create(&[("kind", kind)]).inc()
     }
 }
 
 /// One of [`FAILURES`].
-fn word_of(kind: FailureKind) -> &'static str {
+fn label_of(kind: FailureKind) -> &'static str {
     match kind {
         FailureKind::Input => "input",
         FailureKind::Work | FailureKind::GivenBack => "work",
@@ -205,20 +210,20 @@ mod tests {
     }
 
     #[test]
-    fn every_end_of_a_task_is_counted_once() {
+    fn each_task_end_is_counted_once() {
         let metrics = Metrics::default();
-        let measured = Measured::new(Fake, metrics.clone());
+        let counted = CountedExecutor::new(Fake, metrics.clone());
         for task in 0..5 {
             let (plan, inputs) = (ArtefactId([1; 32]), BTreeMap::new());
-            let order = TaskOrder { job: 1, plan, task, attempt: 1, inputs, rate_permille: crate::FULL_RATE };
+            let order = TaskOrder { job: 1, plan, task, attempt: 1, inputs, rate_permille: crate::task::FULL_RATE };
             let mut report = |_| if task == 4 { Flow::Stop } else { Flow::Continue };
-            let ended = catch_unwind(AssertUnwindSafe(|| measured.execute(&order, &mut report)));
+            let ended = catch_unwind(AssertUnwindSafe(|| counted.execute(&order, &mut report)));
             assert_eq!((ended.is_err(), matches!(ended, Ok(Ok(_)))), (task == 1, task == 0));
         }
         let mut registry = Registry::default();
         metrics.register(&mut registry);
         let store = Store::open("memory://").unwrap();
-        metrics.moves_from_and_to(store.clone());
+        metrics.export_traffic_of(store.clone());
         store.blocking().put_record("seven", "letters").unwrap();
         let text = telemetry::metrics::text(&registry).unwrap();
         for line in [

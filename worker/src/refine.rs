@@ -1,32 +1,30 @@
-//! Is a block worth looking at more closely than its parent did?
+//! Decides whether a block is refined beyond its parent's resolution.
 //!
-//! A block begins with its parent's splats. Where these already are so near to what its own, finer photos show that the
-//! scene as a whole has hardly anything to gain there, it is *settled*: it keeps them, and healing and pruning at the
-//! parent's resolution is all that is done to it. A meadow stays as coarse as it was beside the facade that is refined. A settled
-//! block's children ask again, with photos finer still, so that a monument in the meadow is found.
+//! A block starts from its parent's splats. If their error in the block's own, finer photos is already within a share of the root's
+//! error, the block is *settled*: it keeps the parent's resolution and is only pruned. So a meadow stays coarse beside a facade that is
+//! refined. The children of a settled block are decided again with their finer photos, so that a monument in the meadow is found.
 
 use glam::Vec3;
 use scene::Splats;
 use train::importance::EvaluationViews;
 use train::{TrainError, TrainView, low_pass};
 
-/// Windows looked at, at most.
-const WINDOWS: usize = 16;
+use crate::initial_splats::InitialSplats;
 
-/// Splats to train and what is drawn around them.
-pub(crate) type Start = (Splats, Option<Splats>);
+/// Largest number of windows that an error is measured on.
+const MAX_WINDOWS: usize = 16;
 
-/// How far splats are off in the photos: root mean square, 0 to 1; `None` where too little is seen to tell.
+/// Root mean square error of the splats in the photos, 0 to 1; `None` if too little of them is visible.
 ///
 /// # Errors
 /// A window that cannot be read.
 pub(crate) fn residual(all: EvaluationViews, splats: &Splats) -> Result<Option<f64>, TrainError> {
-    let some = all.some(WINDOWS);
-    let judge = EvaluationViews { views: &some, ..all };
-    judge.residual(splats, &judge.ownership_weights(splats)?)
+    let some = all.some(MAX_WINDOWS);
+    let evaluation = EvaluationViews { views: &some, ..all };
+    evaluation.residual(splats, &evaluation.ownership_weights(splats)?)
 }
 
-/// As [`residual`], of those splats that the block owns, in what the windows show of them.
+/// As [`residual`], of the splats that the block owns, over the pixels that show them.
 ///
 /// # Errors
 /// A window that cannot be read.
@@ -42,17 +40,17 @@ pub(crate) fn residual_of_core(
     if core.is_empty() { Ok(None) } else { residual(EvaluationViews { context: Some(&rest), ..around }, &core) }
 }
 
-/// The windows as the parent's resolution has them, where they have one.
+/// The windows at the parent's resolution, one mip coarser, if they have such a mip.
 pub(crate) fn coarser(views: &[TrainView]) -> Vec<TrainView> {
     views.iter().map(|view| view.at(1).map_or(*view, |(mip, rect, _)| TrainView { mip, rect, ..*view })).collect()
 }
 
-/// A start on some windows as one on others: what pixels hide of a splat's size depends on theirs (see [`low_pass`]).
-pub(crate) fn moved((splats, context): Start, from: &[TrainView], to: &[TrainView]) -> Start {
-    let again = |mut splats: Splats| {
+/// Converts splats that were filtered for the pixels of some windows to those of others (see [`low_pass`]).
+pub(crate) fn refilter(initial: InitialSplats, from: &[TrainView], to: &[TrainView]) -> InitialSplats {
+    let refilter = |mut splats: Splats| {
         low_pass::to_full_resolution(&mut splats, from);
         low_pass::from_full_resolution(&mut splats, to);
         splats
     };
-    (again(splats), context.map(again))
+    InitialSplats { trained: refilter(initial.trained), context: initial.context.map(refilter) }
 }

@@ -8,7 +8,7 @@ use ::bench::parts::{Ablation, Reached};
 use ::bench::{CurvePoint, PartLine, append_part, cpu_seconds_to};
 use serde::Serialize;
 use store::Store;
-use worker::whole::{Look, Whole};
+use worker::one_block::{Evaluation, OneBlockTraining};
 
 use crate::ablation_variants::{DEFAULT, Variant};
 use crate::args::{AblateArgs, Auto, Blocks, PlanOptions, RESIDUAL};
@@ -70,17 +70,17 @@ pub(crate) fn run(args: &AblateArgs, output: &Output) -> Result<(), Failure> {
     let targets_are_known = !args.to.is_empty() && args.to_gain.is_none();
     for &seed in &args.seeds {
         let (_, plan) = plan_of(&source.capture, &plan_options(args, seed))?;
-        let whole = Whole {
+        let training = OneBlockTraining {
             plan: &plan,
             capture: capture.clone(),
             store: store.clone(),
             backend: backend.clone(),
             threads: args.threads as usize,
             cache_bytes: CACHE_BYTES,
-            looks: args.looks,
+            evaluations: args.looks,
         };
         for variant in variants {
-            let samples = whole.train(variant.recipe).map_err(|error| match error.kind {
+            let samples = training.train(variant.recipe).map_err(|error| match error.kind {
                 worker::FailureKind::Input => Failure::Input(error.message),
                 _ => Failure::Work(error.message),
             })?;
@@ -152,8 +152,8 @@ fn blank_line(args: &AblateArgs) -> Ablation {
     }
 }
 
-fn point(look: &Look) -> CurvePoint {
-    CurvePoint { cpu_seconds: look.cpu_seconds, psnr: look.psnr, splats: Some(look.splats) }
+fn point(evaluation: &Evaluation) -> CurvePoint {
+    CurvePoint { cpu_seconds: evaluation.cpu_seconds, psnr: evaluation.psnr, splats: Some(evaluation.splats) }
 }
 
 fn reached(curve: &[CurvePoint], targets: &[f64]) -> Vec<Reached> {

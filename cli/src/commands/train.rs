@@ -181,8 +181,8 @@ fn train_plan(args: &TrainArgs, prepared: &Prepared, clock: Stopwatch, output: &
     }
     let progress = output.progress("training", plan.tasks.iter().map(|task| u64::from(task.steps)).sum());
     let mut log = MetricsLog::create(&args.out.join("metrics.jsonl"), plan, args.workers, clock.clone(), &progress)?;
-    let cap = args.minutes.map(|minutes| cap_of(minutes, clock, plan, args.workers));
-    let shared = Arc::new(Shared { cap, ..Shared::default() });
+    let time_limit = args.minutes.map(|minutes| time_limit_of(minutes, clock, plan, args.workers));
+    let shared = Arc::new(Shared { time_limit, ..Shared::default() });
     let metered = store.metered();
     let options = TrainerOptions {
         threads: threads_of(args) as usize,
@@ -204,7 +204,7 @@ fn train_plan(args: &TrainArgs, prepared: &Prepared, clock: Stopwatch, output: &
         let tasks = plan.tasks.len();
         output.note(format!("{resumed} of {tasks} tasks were resumed from an earlier run; --fresh starts over"));
     }
-    let capped = shared.cap.as_ref().is_some_and(TimeLimit::shortened);
+    let capped = shared.time_limit.as_ref().is_some_and(TimeLimit::is_shortened);
     if capped {
         output.note("--minutes left fewer steps than planned: another run may give other bytes");
     }
@@ -219,7 +219,7 @@ fn train_plan(args: &TrainArgs, prepared: &Prepared, clock: Stopwatch, output: &
 }
 
 /// The time limit of training for a job that shall end after this many minutes, writing the model included.
-fn cap_of(minutes: f64, clock: Stopwatch, plan: &Plan, workers: u32) -> TimeLimit {
+fn time_limit_of(minutes: f64, clock: Stopwatch, plan: &Plan, workers: u32) -> TimeLimit {
     /// Wall seconds of merging and writing a splat.
     const SECONDS_PER_SPLAT: f64 = 2e-6;
     let seconds = 60.0 * minutes;

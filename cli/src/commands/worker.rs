@@ -8,8 +8,8 @@ use scene::BadInput;
 use serde::Serialize;
 use tokio_util::sync::CancellationToken;
 use worker::WorkerError;
-use worker::execute::{BlockTrainer, Shared, TrainerOptions};
-use worker::metrics::Measured;
+use worker::{BlockTrainer, Shared, TrainerOptions};
+use worker::metrics::CountedExecutor;
 
 use crate::args::WorkerArgs;
 use crate::backend;
@@ -90,12 +90,12 @@ pub(crate) fn run(args: &WorkerArgs, output: &Output) -> Result<(), Failure> {
                 resume: true,
                 checkpoint_seconds: args.checkpoint_every,
             };
-            shared.metrics.moves_from_and_to(store.clone());
+            shared.metrics.export_traffic_of(store.clone());
             let trainer = BlockTrainer::new(store.blocking(), options, shared.clone(), backend);
-            let measured = Measured::new(trainer.map_err(Failure::Work)?, shared.metrics.clone());
+            let measured = CountedExecutor::new(trainer.map_err(Failure::Work)?, shared.metrics.clone());
             output.note(format!("worker {} for {url}: {} on {threads} threads", worked.name, worked.backend));
             worker::run(worker, Arc::new(measured), stop).await.map_err(worker_failure)?;
-            worked.done = shared.metrics.done();
+            worked.done = shared.metrics.tasks_done();
             worked.cpu_seconds = worker::clock::cpu_seconds();
             let traffic = store.traffic();
             (worked.bytes_read, worked.bytes_written) = (traffic.read, traffic.written);
@@ -114,7 +114,7 @@ pub(crate) fn run(args: &WorkerArgs, output: &Output) -> Result<(), Failure> {
 fn memory_of(args: &WorkerArgs) -> Result<u64, Failure> {
     /// Memory of the program without a block.
     const MIN_MIB: u64 = 16;
-    let Some(mebibytes) = args.memory.0 else { return Ok(worker::room::bytes().unwrap_or(0)) };
+    let Some(mebibytes) = args.memory.0 else { return Ok(worker::memory_budget::total_bytes().unwrap_or(0)) };
     if !(MIN_MIB..1 << 40).contains(&mebibytes) {
         let what = format!("{mebibytes} MiB is out of range");
         return Err(BadInput::new("--memory", what, format!("give {MIN_MIB} or more, or auto")).into());
