@@ -1,9 +1,9 @@
-//! Photos to artefacts: each view decoded once, undistorted, shrunk if asked, and stored with its mips.
+//! Ingests photos: decodes, undistorts and downscales each one and stores its mip pyramid as artefacts.
 //!
-//! Everything is keyed by content. A photo that was ingested before, under whatever name or in whatever capture, is
-//! known by the hash of what its pixels depend on, so a second ingest only reads and hashes files, and one that was
-//! interrupted goes on where it was. A thread holds one photo at a time: peak memory depends on the size of photos and
-//! the number of threads, not on the number of photos.
+//! Photos are identified by a hash of everything that their mips depend on. A record under that hash lists the mips of a photo
+//! ingested before, from this or another capture, so a repeated ingest only reads and hashes files, and an interrupted one
+//! resumes. A thread holds one photo at a time: peak memory depends on the size of photos and the number of threads, not on the
+//! number of photos.
 
 use std::fs::File;
 use std::io::Read;
@@ -16,53 +16,54 @@ use scene::{ArtefactId, BadInput, Camera, CameraModel, Capture, Pinhole, Pixels,
 use serde::{Deserialize, Serialize};
 use store::{BlockingStore, StoreError};
 
-use crate::lens::Undistorter;
 use crate::open::{Photo, Source};
-use crate::photo::Photograph;
-use crate::{mips, photo};
+use crate::photo::DecodedPhoto;
+use crate::undistortion::Undistorter;
+use crate::{mip_tiles, mips, photo};
 
 /// An ingested capture in the store.
 pub const CAPTURE: Kind = Kind(*b"capt", 1);
-/// What is remembered of a photo.
-const MEMO: Kind = Kind(*b"memo", 1);
-/// Raised whenever the same photo would give other mips: decoding, undistortion, downscaling, mips, their format.
+/// The ingest record of a photo.
+const RECORD: Kind = Kind(*b"memo", 1);
+/// Part of the hash of a photo. Raise it with each change of decoding, undistortion, downscaling, mips or their format.
 const FORMAT: u32 = 2;
 
 /// How to ingest.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct IngestOptions {
-    /// Block average by this factor: sides are divided and rounded down, intrinsics divided exactly. 1 keeps photos.
+    /// Photos are box-filtered by this factor: sides are divided and rounded down, intrinsics divided exactly. 1 keeps the size.
     pub downscale: u32,
-    /// Photos in work at once, at least 1.
+    /// Photos processed concurrently, at least 1.
     pub threads: usize,
 }
 
-/// What came of it.
+/// An ingested capture.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Ingested {
     /// The capture, with the cameras of mip 0 and the mips of every view.
     pub capture: Capture,
-    /// The capture in the store, as a frame of kind [`CAPTURE`]: the same for the same photos, poses and options.
+    /// Artefact of the capture, a frame of kind [`CAPTURE`]. Equal photos, poses and options give an equal id.
     pub id: ArtefactId,
-    /// How many photos had to be decoded; the others were known.
+    /// Number of photos decoded; the others had an ingest record.
     pub decoded: usize,
 }
 
 /// Why an ingest stopped.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum IngestError {
-    /// A file or an option is at fault.
+    /// An invalid file or option.
     #[error(transparent)]
     BadInput(#[from] BadInput),
-    /// The store is.
+    /// The store failed.
     #[error(transparent)]
     Store(#[from] StoreError),
 }
 
-/// Ingests all photos of a capture. `progress` hears (done, of how many) from any thread, one call at a time, in order.
+/// Ingests all photos of a capture. `progress` is called with (photos done, photos in total) from any thread, one call at a
+/// time, in order.
 ///
 /// # Errors
-/// The first photo, by name, that cannot be used, or a store that fails. What was stored until then is found again.
+/// The first photo, by name, that cannot be used, or a failing store. The next ingest reuses the photos stored so far.
 pub fn ingest(
     source: &Source,
     store: &BlockingStore,
@@ -74,14 +75,14 @@ pub fn ingest(
     }
     let photos = &source.photos;
     if photos.len() != source.capture.views.len() {
-        return Err(BadInput::new("the capture", "has not one photo for each view", "open it again").into());
+        return Err(BadInput::new("the capture", "does not have one photo per view", "open it again").into());
     }
     let job = Job { store, downscale: options.downscale, next: AtomicUsize::new(0), failed: AtomicBool::new(false) };
     let done = Mutex::new(0);
     let run = || {
-        let (mut views, mut lens) = (Vec::new(), None);
+        let (mut views, mut undistorter) = (Vec::new(), None);
         while let Some(i) = job.take(photos.len()) {
-            let view = job.view(&source.capture.views[i], &photos[i], &mut lens);
+            let view = job.view(&source.capture.views[i], &photos[i], &mut undistorter);
             job.failed.fetch_or(view.is_err(), Ordering::Relaxed);
             views.push((i, view));
             let mut done = done.lock().unwrap_or_else(PoisonError::into_inner);
@@ -98,7 +99,7 @@ pub fn ingest(
         }
         views
     });
-    // Photos are taken in order, so whichever thread fails, the first that cannot be used is among those taken.
+    // Threads take photos in order, so the first photo that cannot be used is among those taken, whichever thread fails first.
     views.sort_by_key(|(i, _)| *i);
     let views: Vec<(View, bool)> = views.into_iter().map(|(_, view)| view).collect::<Result<_, _>>()?;
     let decoded = views.iter().filter(|(_, decoded)| *decoded).count();
@@ -108,7 +109,7 @@ pub fn ingest(
     Ok(Ingested { capture, id, decoded })
 }
 
-/// Reads an ingested capture back.
+/// Loads an ingested capture.
 ///
 /// # Errors
 /// Not in the store, damaged, or not a capture.
@@ -128,12 +129,13 @@ struct Job<'a> {
     failed: AtomicBool,
 }
 
-/// A lens and what undoes it: photos next to each other mostly share one.
-type Lens = Option<((CameraModel, u32, u32), Undistorter)>;
+/// The undistorter of the last photo, by lens and size. Consecutive photos mostly share a lens.
+type LastUndistorter = Option<((CameraModel, u32, u32), Undistorter)>;
 
+/// The cached ingest of a photo.
 #[derive(Serialize, Deserialize)]
-struct Memo {
-    /// Ids and lengths in bytes.
+struct IngestRecord {
+    /// Artefacts, and their lengths in bytes.
     mips: Vec<(ArtefactId, u64)>,
     masked: bool,
 }
@@ -146,38 +148,43 @@ impl Job<'_> {
         Some(self.next.fetch_add(1, Ordering::Relaxed)).filter(|&i| i < count)
     }
 
-    /// The view with its mips, and true if its photo had to be decoded.
-    fn view(&self, view: &View, photo: &Photo, lens: &mut Lens) -> Result<(View, bool), IngestError> {
+    /// The view with its mips, and whether its photo was decoded.
+    fn view(
+        &self,
+        view: &View,
+        photo: &Photo,
+        last_undistorter: &mut LastUndistorter,
+    ) -> Result<(View, bool), IngestError> {
         let (w, h) = (photo.width, photo.height);
         let ideal = view.camera.pinhole;
         for (w, h) in [(w, h), (ideal.width, ideal.height)] {
-            if !(1..=mips::PIXEL_LIMIT).contains(&(u64::from(w) * u64::from(h))) {
-                let problem = format!("has a camera of {w}×{h} pixels, which is nothing or over {}", mips::PIXEL_LIMIT);
+            if !(1..=mip_tiles::MAX_PIXELS).contains(&(u64::from(w) * u64::from(h))) {
+                let problem =
+                    format!("has a camera of {w}×{h} pixels, which is none or over {}", mip_tiles::MAX_PIXELS);
                 return Err(BadInput::new(show(&photo.path), problem, "correct its camera's width and height").into());
             }
         }
-        let pinhole = shrink(ideal, self.downscale);
-        if pinhole.width.min(pinhole.height) < mips::SHORTEST_SIDE && self.downscale > 1 {
-            let problem =
-                format!("{} leaves less than {} pixels of {}", self.downscale, mips::SHORTEST_SIDE, view.name);
+        let pinhole = downscaled(ideal, self.downscale);
+        if pinhole.width.min(pinhole.height) < mips::MIN_MIP_SIDE && self.downscale > 1 {
+            let problem = format!("{} leaves less than {} pixels of {}", self.downscale, mips::MIN_MIP_SIDE, view.name);
             return Err(BadInput::new("--downscale", problem, "give a smaller factor").into());
         }
-        let limit = photo::file_limit(w, h);
+        let limit = photo::max_file_bytes(w, h);
         let bytes = read(&photo.path, limit)?;
         let mask = photo.mask.as_ref().map(|path| Ok::<_, BadInput>((path, read(path, limit)?))).transpose()?;
-        let name = self.memo_name(photo, &bytes, mask.as_ref().map(|(_, bytes)| bytes.as_slice()));
-        let known = self.recall(&name)?;
-        let decoded = known.is_none();
-        let memo = match known {
-            Some(memo) => memo,
+        let name = self.record_name(photo, &bytes, mask.as_ref().map(|(_, bytes)| bytes.as_slice()));
+        let cached = self.load_record(&name)?;
+        let decoded = cached.is_none();
+        let record = match cached {
+            Some(record) => record,
             None => {
                 let mut pixels = photo::decode(&bytes, w, h).map_err(|e| at(&photo.path, &e))?;
                 drop(bytes);
                 if let Some((path, bytes)) = mask {
                     let usable = photo::decode_mask(&bytes, w, h).map_err(|e| at(path, &e))?;
-                    pixels.mask = Some(both(pixels.mask.take(), usable));
+                    pixels.mask = Some(intersected(pixels.mask.take(), usable));
                 }
-                let finest = self.finest(pixels, undistorter(photo, ideal, lens)?);
+                let finest = self.finest(pixels, undistorter(photo, ideal, last_undistorter)?);
                 self.store_mips(finest, &name, &photo.path)?
             }
         };
@@ -186,15 +193,15 @@ impl Job<'_> {
             View {
                 name: view.name.clone(),
                 camera,
-                mips: memo.mips.iter().map(|(id, _)| *id).collect(),
-                masked: memo.masked,
+                mips: record.mips.iter().map(|(id, _)| *id).collect(),
+                masked: record.masked,
             },
             decoded,
         ))
     }
 
-    /// Mip 0: undistorted and shrunk; a mask that leaves nothing out is none.
-    fn finest(&self, mut photo: Photograph, undistorter: &Undistorter) -> Pixels {
+    /// Mip 0: undistorted and downscaled. A mask that excludes nothing is dropped.
+    fn finest(&self, mut photo: DecodedPhoto, undistorter: &Undistorter) -> Pixels {
         if !undistorter.is_identity() {
             photo.mask = photo.mask.map(|mask| undistorter.mask(&mask));
             photo.rgb = undistorter.rgb(&photo.rgb);
@@ -209,57 +216,61 @@ impl Job<'_> {
         pixels
     }
 
-    fn store_mips(&self, finest: Pixels, name: &str, path: &Path) -> Result<Memo, IngestError> {
+    fn store_mips(&self, finest: Pixels, name: &str, path: &Path) -> Result<IngestRecord, IngestError> {
         let masked = finest.mask.is_some();
         let mut encoded = Vec::new();
-        mips::for_each(finest, |mip| {
-            encoded.push(mips::encode(mip).map_err(|e| at(path, &e))?);
+        mips::for_each_mip(finest, |mip| {
+            encoded.push(mip_tiles::encode(mip).map_err(|e| at(path, &e))?);
             Ok::<_, IngestError>(())
         })?;
         let lengths: Vec<u64> = encoded.iter().map(|bytes: &Vec<u8>| bytes.len() as u64).collect();
-        // To a bucket each takes its time, whatever its size.
+        // Concurrently: a remote store has the same latency for a small mip as for a large one.
         let ids = self.store.put_all(encoded)?;
-        let memo = Memo { mips: ids.into_iter().zip(lengths).collect(), masked };
-        self.store.put_record(name, frame::encode(MEMO, &memo, &[]))?;
-        Ok(memo)
+        let record = IngestRecord { mips: ids.into_iter().zip(lengths).collect(), masked };
+        self.store.put_record(name, frame::encode(RECORD, &record, &[]))?;
+        Ok(record)
     }
 
-    /// The name under which a photo is remembered: a hash of all that its mips depend on.
-    fn memo_name(&self, photo: &Photo, bytes: &[u8], mask: Option<&[u8]>) -> String {
+    /// The name of a photo's ingest record: a hash of everything that its mips depend on.
+    fn record_name(&self, photo: &Photo, bytes: &[u8], mask: Option<&[u8]>) -> String {
         let mask = mask.map(ArtefactId::of);
         let key = (FORMAT, ArtefactId::of(bytes), mask, photo.model, photo.width, photo.height, self.downscale);
-        format!("ingest/{}", ArtefactId::of(&frame::encode(MEMO, &key, &[])))
+        format!("ingest/{}", ArtefactId::of(&frame::encode(RECORD, &key, &[])))
     }
 
-    /// What is remembered, if all of it is still there, at its full length.
-    fn recall(&self, name: &str) -> Result<Option<Memo>, StoreError> {
+    /// The ingest record of this name, if the store has all of its mips at their full length.
+    fn load_record(&self, name: &str) -> Result<Option<IngestRecord>, StoreError> {
         let Some(bytes) = self.store.get_record(name)? else { return Ok(None) };
-        let Ok((memo, _)) = frame::decode::<Memo>(MEMO, &bytes) else { return Ok(None) };
-        for &(id, length) in &memo.mips {
+        let Ok((record, _)) = frame::decode::<IngestRecord>(RECORD, &bytes) else { return Ok(None) };
+        for &(id, length) in &record.mips {
             if self.store.size(id)? != Some(length) {
                 return Ok(None);
             }
         }
-        Ok(Some(memo))
+        Ok(Some(record))
     }
 }
 
-/// What undoes the lens of a photo, which has to lead to the camera of its view.
-fn undistorter<'a>(photo: &Photo, pinhole: Pinhole, lens: &'a mut Lens) -> Result<&'a Undistorter, BadInput> {
+/// The undistorter of a photo, whose pinhole has to be the camera of its view.
+fn undistorter<'a>(
+    photo: &Photo,
+    pinhole: Pinhole,
+    last: &'a mut LastUndistorter,
+) -> Result<&'a Undistorter, BadInput> {
     let key = (photo.model, photo.width, photo.height);
-    let known = lens.take().filter(|(of, _)| *of == key).map(|(_, undistorter)| undistorter);
-    let undistorter = known.or_else(|| Undistorter::new(&photo.model, photo.width, photo.height));
+    let cached = last.take().filter(|(of, _)| *of == key).map(|(_, undistorter)| undistorter);
+    let undistorter = cached.or_else(|| Undistorter::new(&photo.model, photo.width, photo.height));
     match undistorter.filter(|undistorter| undistorter.pinhole() == pinhole) {
-        Some(undistorter) => Ok(&lens.insert((key, undistorter)).1),
+        Some(undistorter) => Ok(&last.insert((key, undistorter)).1),
         None => {
             let advice = "check the parameters of its camera";
-            Err(BadInput::new(show(&photo.path), "was taken with a lens that cannot be undone", advice))
+            Err(BadInput::new(show(&photo.path), "was taken with a lens whose distortion cannot be inverted", advice))
         }
     }
 }
 
-/// The camera of a photo shrunk by [`IngestOptions::downscale`].
-pub fn shrink(pinhole: Pinhole, factor: u32) -> Pinhole {
+/// The camera of a photo downscaled by [`IngestOptions::downscale`].
+pub fn downscaled(pinhole: Pinhole, factor: u32) -> Pinhole {
     let n = f64::from(factor);
     Pinhole {
         width: pinhole.width / factor,
@@ -271,7 +282,8 @@ pub fn shrink(pinhole: Pinhole, factor: u32) -> Pinhole {
     }
 }
 
-fn both(mask: Option<Vec<u8>>, mut other: Vec<u8>) -> Vec<u8> {
+/// A pixel is usable only if both masks say so.
+fn intersected(mask: Option<Vec<u8>>, mut other: Vec<u8>) -> Vec<u8> {
     if let Some(mask) = mask {
         other.iter_mut().zip(mask).for_each(|(a, b)| *a &= b);
     }

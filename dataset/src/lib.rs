@@ -1,14 +1,15 @@
-//! Captures: opened from the formats they come in, ingested into the store as mips, read back as windows, or rehearsed
-//! in a generated city.
+//! Captures: opened from common formats, ingested into the store as mip pyramids, read back as windows of pixels, or written
+//! synthetically from a generated city.
 //!
-//! Architecture invariant: this is the only crate that opens a capture's files. What it hands out is plain data
-//! (`scene`) and artefact ids; nothing above it knows where a photo came from or what its lens was like.
+//! Architecture invariant: this is the only crate that opens a capture's files. It returns plain data (`scene`) and artefact
+//! ids; crates above it do not know the files or the lenses of photos.
 
 pub mod byte_lru;
 pub mod ingest;
-pub mod lens;
+pub mod mip_tiles;
 pub mod mips;
 pub mod open;
 mod photo;
 pub mod synth;
+pub mod undistortion;
 pub mod windows;

@@ -1,17 +1,19 @@
-//! Opens a capture of any known format: what it says is checked, photos are found and their headers read, lenses become
-//! ideal pinholes. No pixel is decoded.
+//! Opens a capture of any supported format: validates its files, finds its photos, reads their headers and replaces their lenses
+//! by ideal pinholes. No pixel is decoded.
 //!
-//! A capture without sparse points gets some where its views overlap ([`frusta`]), as training has to start somewhere.
+//! A capture without sparse points gets points sampled from the overlap of its views ([`frustum_points`]), from which training
+//! can start.
 //!
-//! What a capture names is looked for inside its own folder only: a path that leads out, by `..` or by a link, is
-//! refused. Photos that are missing are left out and reported, as captures often travel without all of them.
+//! Files are opened only inside the capture's folder: a path that leads out of it, by `..` or by a symbolic link, is refused.
+//! Missing photos are skipped and reported, because captures are often shared without all of them.
 
 mod colmap;
 mod files;
-mod frusta;
+mod frustum_points;
 mod kitti360;
 mod masks;
 mod opensfm;
+mod parsed;
 mod transforms;
 
 use std::collections::BTreeMap;
@@ -19,26 +21,19 @@ use std::path::{Path, PathBuf};
 
 use rayon::prelude::*;
 use scene::transforms::{Focal, Intrinsics};
-use scene::{BadInput, Camera, CameraModel, Capture, GeoOrigin, Pinhole, Rigid, SparsePoints, View};
+use scene::{BadInput, Camera, CameraModel, Capture, GeoOrigin, Pinhole, View};
 
-use self::files::{Found, Root};
-use crate::lens;
-
-/// How to open a capture.
-#[derive(Debug, Clone, Default)]
-pub struct OpenOptions {
-    /// Folder of the photos, relative to the capture; `None` finds it.
-    pub images: Option<String>,
-    /// Only cameras are wanted: neither photos nor points need to be there.
-    pub cameras_only: bool,
-}
+use self::files::{CaptureRoot, Found};
+pub use self::parsed::OpenOptions;
+use self::parsed::{ParsedCapture, PosedImage};
+use crate::undistortion;
 
 /// The file behind a view.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Photo {
     /// Canonical path of the image file, inside the capture.
     pub path: PathBuf,
-    /// Canonical path of the mask, as large as the photo: bright is usable, dark is left out.
+    /// Canonical path of the mask, of the photo's size: bright pixels are usable, dark ones excluded.
     pub mask: Option<PathBuf>,
     /// The lens, in pixels of this file.
     pub model: CameraModel,
@@ -55,27 +50,27 @@ pub struct Source {
     pub capture: Capture,
     /// One per view.
     pub photos: Vec<Photo>,
-    /// Images that the capture names and that are not used, and why.
+    /// Names of the capture's images that are not used, with the reason.
     pub left_out: Vec<(String, String)>,
-    /// What the capture was: `colmap`, `transforms`, `opensfm` or `kitti360`, and ` without points` if its points were
-    /// made from the overlap of its views.
+    /// `colmap`, `transforms`, `opensfm` or `kitti360`, followed by ` without points` if its points were sampled from the
+    /// overlap of its views.
     pub format: &'static str,
 }
 
 /// Opens a capture: a folder, or the path of a `transforms.json` or `reconstruction.json`.
 ///
 /// # Errors
-/// What is wrong with which file, and what to do.
+/// The invalid file, its defect, and advice.
 pub fn open(path: &Path, options: &OpenOptions) -> Result<Source, BadInput> {
-    let root = Root::new(path)?;
-    let Contents { mut format, posed, points, origin, left_out: unused } = read(&root, path, options)?;
-    let (posed, photos, mut left_out) = find_photos(&root, posed, options)?;
+    let root = CaptureRoot::new(path)?;
+    let ParsedCapture { mut format, images, points, origin, left_out: unused } = parse(&root, path, options)?;
+    let (images, photos, mut left_out) = find_photos(&root, images, options)?;
     left_out.extend(unused);
-    let views = views(&posed, &photos)?;
-    let mut points = points.with_views(posed.iter().map(|posed| posed.id));
+    let views = views(&images, &photos)?;
+    let mut points = points.with_view_indices(images.iter().map(|image| image.id));
     if points.is_empty() && !options.cameras_only {
         let cameras: Vec<Camera> = views.iter().map(|view| view.camera).collect();
-        points = frusta::points(&cameras).ok_or_else(|| {
+        points = frustum_points::sample(&cameras).ok_or_else(|| {
             let advice = "run structure from motion that writes points, as training starts from them";
             BadInput::new(files::show(path), "has no sparse points, and its views do not overlap", advice)
         })?;
@@ -90,18 +85,8 @@ pub fn open(path: &Path, options: &OpenOptions) -> Result<Source, BadInput> {
     Ok(Source { capture, photos, left_out, format })
 }
 
-/// What the files of a capture say, before its photos were looked for.
-struct Contents {
-    format: &'static str,
-    posed: Vec<Posed>,
-    points: Points,
-    origin: Option<GeoOrigin>,
-    /// Images that are not used, and why.
-    left_out: Vec<(String, String)>,
-}
-
-/// Finds out what the capture is, and reads it.
-fn read(root: &Root, path: &Path, options: &OpenOptions) -> Result<Contents, BadInput> {
+/// Detects the format of a capture and parses it.
+fn parse(root: &CaptureRoot, path: &Path, options: &OpenOptions) -> Result<ParsedCapture, BadInput> {
     if path.is_file() {
         return match path.file_name() {
             Some(name) if name == opensfm::FILE => opensfm::read(root, path),
@@ -118,7 +103,7 @@ fn read(root: &Root, path: &Path, options: &OpenOptions) -> Result<Contents, Bad
     if let Some(path) = opensfm::find(root) {
         return opensfm::read(root, &path);
     }
-    if kitti360::is_there(root) {
+    if kitti360::is_present(root) {
         return kitti360::read(root, options);
     }
     if let Some(folder) = colmap::find(root, &["colmap/sparse/0"]) {
@@ -129,63 +114,27 @@ fn read(root: &Root, path: &Path, options: &OpenOptions) -> Result<Contents, Bad
     Err(BadInput::new(files::show(path), problem, "give a folder that has one of them"))
 }
 
-/// An image as the capture describes it.
-struct Posed {
-    id: u32,
-    name: String,
-    /// Where the image file is, relative to the capture.
-    file: String,
-    /// Where its mask has to be, if the capture says so.
-    mask: Option<String>,
-    intrinsics: Intrinsics,
-    camera_from_world: Rigid,
-}
+/// Images, their photos, and the images left out with the reason.
+type Photos = (Vec<PosedImage>, Vec<Photo>, Vec<(String, String)>);
 
-/// Sparse points whose tracks are ids of [`Posed`] images.
-#[derive(Default)]
-struct Points(SparsePoints);
-
-impl Points {
-    /// Tracks of ids become sorted tracks of indices; views that were left out drop from them.
-    fn with_views(self, ids: impl Iterator<Item = u32>) -> SparsePoints {
-        let index: BTreeMap<u32, u32> = ids.zip(0..).collect();
-        let mut points = SparsePoints { track_start: vec![0], seen_by: Vec::new(), ..self.0 };
-        let tracks = SparsePoints { track_start: self.0.track_start, seen_by: self.0.seen_by, ..Default::default() };
-        for i in 0..points.len() {
-            let ids = tracks.track(i).unwrap_or_default();
-            let mut track: Vec<u32> = ids.iter().filter_map(|id| index.get(id).copied()).collect();
-            track.sort_unstable();
-            track.dedup();
-            points.seen_by.extend(track);
-            points.track_start.push(points.seen_by.len() as u32);
-        }
-        if points.seen_by.is_empty() {
-            points.track_start.clear();
-        }
-        points
-    }
-}
-
-type Photos = (Vec<Posed>, Vec<Photo>, Vec<(String, String)>);
-
-/// The images whose files are there, sorted by name.
-fn find_photos(root: &Root, mut posed: Vec<Posed>, options: &OpenOptions) -> Result<Photos, BadInput> {
-    posed.sort_by(|a, b| a.name.cmp(&b.name));
-    if let Some(pair) = posed.windows(2).find(|pair| pair[0].name == pair[1].name) {
+/// Finds the photos of images. Images are sorted by name.
+fn find_photos(root: &CaptureRoot, mut images: Vec<PosedImage>, options: &OpenOptions) -> Result<Photos, BadInput> {
+    images.sort_by(|a, b| a.name.cmp(&b.name));
+    if let Some(pair) = images.windows(2).find(|pair| pair[0].name == pair[1].name) {
         let advice = "remove one of them from the capture";
-        return Err(BadInput::new(format!("image {}", pair[0].name), "is named twice by the capture", advice));
+        return Err(BadInput::new(format!("image {}", pair[0].name), "is in the capture twice", advice));
     }
     let masks = masks::folders(root);
-    // All answers first, then the first error by name, whichever thread is faster.
-    let photos: Vec<_> = posed.par_iter().map(|posed| photo(root, posed, &masks, options)).collect();
+    // All results first, then the first error by name, whichever thread is faster.
+    let photos: Vec<_> = images.par_iter().map(|image| photo(root, image, &masks, options)).collect();
     let (mut kept, mut found, mut left_out) = (Vec::new(), Vec::new(), Vec::new());
-    for (posed, photo) in posed.into_iter().zip(photos) {
+    for (image, photo) in images.into_iter().zip(photos) {
         match photo? {
             Some(photo) => {
-                kept.push(posed);
+                kept.push(image);
                 found.push(photo);
             }
-            None => left_out.push((posed.name, format!("there is no file {}", posed.file))),
+            None => left_out.push((image.name, format!("there is no file {}", image.file))),
         }
     }
     match left_out.first() {
@@ -197,24 +146,29 @@ fn find_photos(root: &Root, mut posed: Vec<Posed>, options: &OpenOptions) -> Res
     }
 }
 
-/// The photo of an image, `None` where its file is missing.
-fn photo(root: &Root, posed: &Posed, masks: &[&str], options: &OpenOptions) -> Result<Option<Photo>, BadInput> {
-    let path = match root.image(&posed.file)? {
+/// The photo of an image, `None` if its file is missing.
+fn photo(
+    root: &CaptureRoot,
+    image: &PosedImage,
+    masks: &[&str],
+    options: &OpenOptions,
+) -> Result<Option<Photo>, BadInput> {
+    let path = match root.image(&image.file)? {
         Found::File(path) => path,
         Found::Missing => {
-            let Some((width, height)) = posed.intrinsics.size.filter(|_| options.cameras_only) else { return Ok(None) };
-            files::check_size(&root.path(&posed.file), width, height)?;
-            let model = posed.intrinsics.model(width, height);
-            return Ok(Some(Photo { path: root.path(&posed.file), mask: None, model, width, height }));
+            let Some((width, height)) = image.intrinsics.size.filter(|_| options.cameras_only) else { return Ok(None) };
+            files::check_size(&root.path(&image.file), width, height)?;
+            let model = image.intrinsics.model(width, height);
+            return Ok(Some(Photo { path: root.path(&image.file), mask: None, model, width, height }));
         }
     };
     let (width, height) = files::image_size(&path)?;
-    let model = fitted(&posed.intrinsics, width, height).ok_or_else(|| {
-        let (w, h) = posed.intrinsics.size.unwrap_or_default();
+    let model = scaled_model(&image.intrinsics, width, height).ok_or_else(|| {
+        let (w, h) = image.intrinsics.size.unwrap_or_default();
         let problem = format!("has {width}×{height} pixels, its camera {w}×{h}, which is another shape");
         BadInput::new(files::show(&path), problem, "use the photos that the poses were computed from")
     })?;
-    let mask = match &posed.mask {
+    let mask = match &image.mask {
         Some(mask) => match root.image(mask)? {
             Found::File(path) => Some(path),
             Found::Missing => {
@@ -222,13 +176,14 @@ fn photo(root: &Root, posed: &Posed, masks: &[&str], options: &OpenOptions) -> R
                 return Err(BadInput::new(files::show(&path), problem, "put the mask there or take it out"));
             }
         },
-        None => masks::find(root, masks, &posed.file, &path, options),
+        None => masks::find(root, masks, &image.file, &path, options),
     };
     Ok(Some(Photo { path, mask, model, width, height }))
 }
 
-/// The lens in pixels of a photo of this size, which may be the camera's image uniformly scaled; `None` if it is not.
-fn fitted(intrinsics: &Intrinsics, width: u32, height: u32) -> Option<CameraModel> {
+/// The lens in pixels of a photo of this size. The photo may be a uniformly scaled copy of the camera's image; `None` for another
+/// aspect ratio.
+fn scaled_model(intrinsics: &Intrinsics, width: u32, height: u32) -> Option<CameraModel> {
     let (w, h) = intrinsics.size.unwrap_or((width, height));
     let model = intrinsics.model(w, h);
     if (w, h) == (width, height) {
@@ -249,35 +204,35 @@ fn fitted(intrinsics: &Intrinsics, width: u32, height: u32) -> Option<CameraMode
     Some(scaled.model(width, height))
 }
 
-fn views(posed: &[Posed], photos: &[Photo]) -> Result<Vec<View>, BadInput> {
-    let mut known: BTreeMap<([u64; 12], bool, u32, u32), Option<Pinhole>> = BTreeMap::new();
-    let view = |(posed, photo): (&Posed, &Photo)| {
+fn views(images: &[PosedImage], photos: &[Photo]) -> Result<Vec<View>, BadInput> {
+    let mut pinholes: BTreeMap<([u64; 12], bool, u32, u32), Option<Pinhole>> = BTreeMap::new();
+    let view = |(image, photo): (&PosedImage, &Photo)| {
         let mut key = [0; 12];
         let parameters = photo.model.focal_and_centre().into_iter().chain(photo.model.distortion());
         key.iter_mut().zip(parameters).for_each(|(key, parameter)| *key = parameter.to_bits());
-        let pinhole = *known
+        let pinhole = *pinholes
             .entry((key, photo.model.is_fisheye(), photo.width, photo.height))
-            .or_insert_with(|| lens::ideal_pinhole(&photo.model, photo.width, photo.height));
+            .or_insert_with(|| undistortion::ideal_pinhole(&photo.model, photo.width, photo.height));
         let pinhole = pinhole.ok_or_else(|| {
-            let problem = "was taken with a lens whose distortion cannot be undone inside the photo";
+            let problem = "was taken with a lens whose distortion cannot be inverted inside the photo";
             BadInput::new(files::show(&photo.path), problem, "check the parameters of its camera")
         })?;
-        let camera = Camera { pinhole, camera_from_world: posed.camera_from_world };
-        Ok(View { name: posed.name.clone(), camera, mips: Vec::new(), masked: photo.mask.is_some() })
+        let camera = Camera { pinhole, camera_from_world: image.camera_from_world };
+        Ok(View { name: image.name.clone(), camera, mips: Vec::new(), masked: photo.mask.is_some() })
     };
-    posed.iter().zip(photos).map(view).collect()
+    images.iter().zip(photos).map(view).collect()
 }
 
-/// The largest file that says where a capture lies.
-const INFO_BYTES: u64 = 1 << 20;
+/// The largest JSON file that may give a capture's origin.
+const MAX_ORIGIN_FILE_BYTES: u64 = 1 << 20;
 
-/// From OpenSfM's `reference_lla.json`, or the `gps_origin_lat_lon_alt` of an `info.json`.
-fn geo_origin(root: &Root) -> Result<Option<GeoOrigin>, BadInput> {
+/// The origin from OpenSfM's `reference_lla.json`, or the `gps_origin_lat_lon_alt` of an `info.json`.
+fn geo_origin(root: &CaptureRoot) -> Result<Option<GeoOrigin>, BadInput> {
     let json = |name: &str| -> Result<Option<(String, serde_json::Value)>, BadInput> {
         let Some(path) = root.file(name) else { return Ok(None) };
-        // As values, JSON takes many times its length.
-        if path.metadata().is_ok_and(|data| data.len() > INFO_BYTES) {
-            let problem = format!("is larger than {} MB, which no such file is", INFO_BYTES >> 20);
+        // Parsed JSON values take many times the file's length in memory.
+        if path.metadata().is_ok_and(|data| data.len() > MAX_ORIGIN_FILE_BYTES) {
+            let problem = format!("is larger than {} MB, the limit for such a file", MAX_ORIGIN_FILE_BYTES >> 20);
             return Err(BadInput::new(files::show(&path), problem, "correct or remove the file"));
         }
         Ok(serde_json::from_slice(&files::read(&path)?).ok().map(|value| (files::show(&path), value)))

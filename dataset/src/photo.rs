@@ -1,4 +1,4 @@
-//! A photo's bytes to pixels, with nothing believed that the bytes say of themselves.
+//! Decodes photos and masks from untrusted bytes, with bounded memory.
 //!
 //! EXIF orientation is not applied: poses and lens models refer to the pixels as they are stored.
 
@@ -7,23 +7,23 @@ use std::io::{BufRead, Cursor, Seek};
 use image::{DynamicImage, ImageDecoder, ImageError, ImageReader, ImageResult, Limits};
 use scene::CodecError;
 
-/// What a decoder may allocate beyond the pixels.
+/// Memory that a decoder may allocate beyond the pixels, bytes.
 const DECODER_BYTES: u64 = 64 << 20;
 
-/// Pixels that any file may claim, and how many more for each of its bytes: photos have over a quarter of a bit for each
-/// pixel. More is a decompression bomb, or a header that lies: pixels are allocated before the first is decoded.
-const FREE_PIXELS: u64 = 8 << 20;
+/// A header may claim `BASE_PIXELS` plus `PIXELS_PER_BYTE` for each byte of the file; photos have over a quarter of a bit per
+/// pixel. A larger claim is a decompression bomb: the decoder allocates all pixels first.
+const BASE_PIXELS: u64 = 8 << 20;
 const PIXELS_PER_BYTE: u64 = 32;
 
-/// The largest file that can be a photo of this size: 16 bytes a pixel, and room for what cameras append.
-pub(crate) fn file_limit(width: u32, height: u32) -> u64 {
+/// The largest file accepted for a photo of this size: 16 bytes per pixel, and room for metadata.
+pub(crate) fn max_file_bytes(width: u32, height: u32) -> u64 {
     DECODER_BYTES + 16 * u64::from(width) * u64::from(height)
 }
 
-/// Width and height as an image's header says; no pixel is decoded.
+/// Width and height from an image's header. No pixel is decoded.
 ///
 /// # Errors
-/// Not an image, or one whose header takes more memory than any photo's.
+/// Not an image, or one whose header needs too much memory.
 pub(crate) fn size(file: impl BufRead + Seek) -> ImageResult<(u32, u32)> {
     let mut reader = ImageReader::new(file).with_guessed_format()?;
     let mut limits = Limits::default();
@@ -32,36 +32,36 @@ pub(crate) fn size(file: impl BufRead + Seek) -> ImageResult<(u32, u32)> {
     reader.into_dimensions()
 }
 
-/// A photo as its file has it.
+/// A decoded photo, still distorted.
 #[derive(Debug)]
-pub(crate) struct Photograph {
-    /// Red, green, blue of each pixel.
+pub(crate) struct DecodedPhoto {
+    /// Interleaved red, green and blue.
     pub(crate) rgb: Vec<u8>,
-    /// 255 = use, 0 = leave out, where the file is transparent anywhere.
+    /// From the alpha channel: 255 is usable, 0 is excluded. `None` without transparent pixels.
     pub(crate) mask: Option<Vec<u8>>,
 }
 
-/// Decodes JPEG, PNG, WebP or TIFF, told apart by content. An alpha channel with transparent pixels becomes the mask:
-/// at least half opaque is usable.
+/// Decodes JPEG, PNG, WebP or TIFF; the content decides which. An alpha channel with transparent pixels becomes the mask:
+/// pixels of alpha 128 or more are usable.
 ///
 /// # Errors
-/// Not such an image, of another size than its camera's, damaged or cut short.
-pub(crate) fn decode(bytes: &[u8], width: u32, height: u32) -> Result<Photograph, CodecError> {
-    if u64::from(width) * u64::from(height) > FREE_PIXELS + PIXELS_PER_BYTE * bytes.len() as u64 {
+/// Another format, another size than its camera's, damaged or truncated.
+pub(crate) fn decode(bytes: &[u8], width: u32, height: u32) -> Result<DecodedPhoto, CodecError> {
+    if u64::from(width) * u64::from(height) > BASE_PIXELS + PIXELS_PER_BYTE * bytes.len() as u64 {
         let length = bytes.len();
         return Err(CodecError::new(format!("claims {width}×{height} pixels, which {length} bytes cannot hold")));
     }
     let image = open(bytes, width, height)?;
     if !image.color().has_alpha() {
-        return Ok(Photograph { rgb: image.into_rgb8().into_raw(), mask: None });
+        return Ok(DecodedPhoto { rgb: image.into_rgb8().into_raw(), mask: None });
     }
     let rgba = image.into_rgba8();
     let usable: Vec<u8> = rgba.chunks_exact(4).map(|p| if p[3] < 128 { 0 } else { 255 }).collect();
     let rgb = rgba.chunks_exact(4).flat_map(|p| [p[0], p[1], p[2]]).collect();
-    Ok(Photograph { rgb, mask: usable.contains(&0).then_some(usable) })
+    Ok(DecodedPhoto { rgb, mask: usable.contains(&0).then_some(usable) })
 }
 
-/// Decodes a mask of the photo's size: brighter than half is usable (255), the rest is left out (0).
+/// Decodes a mask of the photo's size: luma of 128 or more is usable (255), the rest is excluded (0).
 ///
 /// # Errors
 /// As [`decode`].
@@ -70,7 +70,7 @@ pub(crate) fn decode_mask(bytes: &[u8], width: u32, height: u32) -> Result<Vec<u
     Ok(luma.iter().map(|&v| if v < 128 { 0 } else { 255 }).collect())
 }
 
-/// Planes from interleaved pixels: all red, all green, all blue.
+/// Converts interleaved pixels to planes: all red, all green, all blue.
 pub(crate) fn planes(rgb: &[u8]) -> Vec<u8> {
     let mut planes = vec![0u8; rgb.len()];
     let (red, rest) = planes.split_at_mut(rgb.len() / 3);
@@ -94,7 +94,7 @@ fn open(bytes: &[u8], width: u32, height: u32) -> Result<DynamicImage, CodecErro
     if (w, h) != (width, height) {
         return Err(CodecError::new(format!("has {w}×{h} pixels where its camera has {width}×{height}")));
     }
-    if jpeg_is_cut(bytes) {
+    if is_truncated_jpeg(bytes) {
         return Err(CodecError::new("is a JPEG that is cut short"));
     }
     DynamicImage::from_decoder(decoder).map_err(|e| failed(&e))
@@ -103,7 +103,7 @@ fn open(bytes: &[u8], width: u32, height: u32) -> Result<DynamicImage, CodecErro
 fn failed(error: &ImageError) -> CodecError {
     match error {
         ImageError::Limits(_) => CodecError::new("needs far more memory than a photo of its camera"),
-        ImageError::Unsupported(_) => CodecError::new(format!("is of a kind that is not read ({})", line(error))),
+        ImageError::Unsupported(_) => CodecError::new(format!("has an unsupported format ({})", line(error))),
         other => damaged(other),
     }
 }
@@ -116,13 +116,14 @@ fn line(error: &dyn std::error::Error) -> String {
     error.to_string().split_whitespace().collect::<Vec<_>>().join(" ")
 }
 
-/// A JPEG without an end-of-image marker after its first scan. The decoder would fill the rest with grey.
-fn jpeg_is_cut(bytes: &[u8]) -> bool {
+/// Whether a JPEG lacks an end-of-image marker after its first scan. The decoder would fill the rest with grey.
+fn is_truncated_jpeg(bytes: &[u8]) -> bool {
     if !bytes.starts_with(&[0xff, 0xd8]) {
         return false;
     }
     let mut at = 2;
-    // Segments before the scan: marker, then a length that counts itself. Thumbnails hide in them.
+    // Skips the segments before the scan (marker, then a length that includes itself): a thumbnail in one of them has an
+    // end-of-image marker of its own.
     while let Some(&[marker, kind, high, low]) = bytes.get(at..at + 4) {
         match (marker, kind) {
             (0xff, 0xff) => at += 1,
@@ -150,7 +151,7 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn lossless_formats_give_the_pixels() {
+    fn lossless_formats_decode_to_the_same_pixels() {
         let image = texture(40, 30);
         for format in [ImageFormat::Png, ImageFormat::Tiff, ImageFormat::WebP] {
             let pixels = decode(&encoded(image.clone(), format), 40, 30).unwrap();
@@ -165,17 +166,17 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn alpha_is_a_mask_only_where_something_is_transparent() {
+    fn alpha_becomes_a_mask_only_with_transparent_pixels() {
         let alpha = |low: u8| RgbaImage::from_fn(4, 4, |x, _| Rgba([1, 2, 3, if x == 1 { low } else { 255 }]));
         let mask = |low| decode(&encoded(alpha(low), ImageFormat::Png), 4, 4).unwrap().mask;
         assert_eq!(mask(255), None);
         assert_eq!(mask(0).unwrap()[..4], [255, 0, 255, 255]);
         let file = encoded(alpha(0), ImageFormat::Png);
-        assert_eq!(decode_mask(&file, 4, 4).unwrap(), [0; 16], "a mask file goes by brightness");
+        assert_eq!(decode_mask(&file, 4, 4).unwrap(), [0; 16], "a mask file is thresholded by luma");
     }
 
     #[test]
-    fn what_is_cut_or_something_else_is_refused() {
+    fn truncated_and_other_files_are_refused() {
         for format in [ImageFormat::Jpeg, ImageFormat::Png, ImageFormat::Tiff, ImageFormat::WebP] {
             let bytes = encoded(texture(200, 100), format);
             decode(&bytes, 200, 100).unwrap();
@@ -190,11 +191,11 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn a_bomb_is_refused_by_its_header() {
+    fn a_decompression_bomb_is_refused_by_its_header() {
         let mut bytes = encoded(texture(10, 10), ImageFormat::Png);
         bytes[16..24].copy_from_slice(&[0, 0, 0xff, 0xff, 0, 0, 0xff, 0xff]);
         assert!(decode(&bytes, 10, 10).is_err());
-        // As large as its camera, who believes the header where the capture says no size: still not allocated.
+        // Also where the camera has the size that the header claims, as in captures that give no size.
         bytes[16..24].copy_from_slice(&[0, 0, 0x3f, 0xff, 0, 0, 0x3f, 0xff]);
         let refused = decode(&bytes, 0x3fff, 0x3fff).unwrap_err().to_string();
         assert!(refused.contains("claims 16383×16383 pixels"), "{refused}");

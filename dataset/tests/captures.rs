@@ -1,5 +1,5 @@
-//! Hostile captures, whole: opened, ingested and planned. Each ends in a capture, perhaps with views left out, or in one
-//! line that names the file, what is wrong and what to do; never in a panic.
+//! Hostile captures are opened, ingested and planned. Each gives a capture, perhaps with views left out, or a one-line error with
+//! the file, the problem and advice; never a panic.
 
 use std::fs;
 use std::io::Cursor;
@@ -16,7 +16,7 @@ use scene::colmap::{self, Reconstruction};
 use store::Store;
 use tempfile::TempDir;
 
-/// Opens, ingests, loads and plans; all words in one line if the capture is at fault.
+/// Opens, ingests, loads and plans a capture; a one-line error if it is invalid.
 fn run(path: &Path) -> Result<Source, String> {
     let source = open(path, &OpenOptions::default()).map_err(|error| line(error.to_string()))?;
     let store = Store::open("memory://").unwrap().blocking();
@@ -105,7 +105,7 @@ fn models_with_impossible_numbers_are_refused() {
         camera(&[], CameraModel::OpenCv([focal, focal, 24.0, 16.0, 0.1, 0.1, 0.0, 0.0]), 48, 32);
         camera(&[], CameraModel::OpenCvFisheye([focal, focal, 24.0, 16.0, 0.1, 0.1, 0.0, 0.0]), 48, 32);
     }
-    // Finite, and yet out of all proportion.
+    // Finite but extreme values.
     for far in [1e9, 1e160, 1e308] {
         with(&[], &|m| m.images.iter_mut().for_each(|i| i.camera_from_world.translation *= far));
         with(&[], &|m| m.images[0].camera_from_world.translation.x = far);
@@ -117,7 +117,7 @@ fn models_with_impossible_numbers_are_refused() {
         let pose = m.images[0].camera_from_world;
         m.images.iter_mut().for_each(|image| image.camera_from_world = pose);
     });
-    // A rotation of another length is the same rotation.
+    // Quaternions are normalised.
     with(&[], &|m| m.images.iter_mut().for_each(|i| i.camera_from_world.rotation *= 3.0));
     let scaled = run(folder.path()).unwrap();
     rewrite(folder.path(), &whole);
@@ -128,7 +128,7 @@ fn models_with_impossible_numbers_are_refused() {
 }
 
 #[test]
-fn names_lead_nowhere_else() {
+fn names_cannot_leave_the_capture() {
     let (folder, whole) = city();
     let outside = tempfile::tempdir().unwrap();
     let secret = outside.path().join("secret.png");
@@ -142,7 +142,7 @@ fn names_lead_nowhere_else() {
         named(name);
         refused(folder.path(), &["outside of the capture", name]);
     }
-    // Not there, as the folder of the images comes before them: left out, and said in a line.
+    // No such file below the image folder: left out and reported.
     for name in [
         "/etc/passwd",
         "//etc/passwd",
@@ -167,11 +167,11 @@ fn names_lead_nowhere_else() {
     refused(folder.path(), &["images.bin", "UTF-8"]);
     rewrite(folder.path(), &whole);
     #[cfg(unix)]
-    links_and_foreign_names(folder.path(), outside.path(), &whole.images[2].name);
+    links_and_non_utf8_names(folder.path(), outside.path(), &whole.images[2].name);
 }
 
 #[cfg(unix)]
-fn links_and_foreign_names(folder: &Path, outside: &Path, name: &str) {
+fn links_and_non_utf8_names(folder: &Path, outside: &Path, name: &str) {
     use std::os::unix::ffi::OsStrExt;
     use std::os::unix::fs::symlink;
     let photo = folder.join("images").join(name);
@@ -180,14 +180,14 @@ fn links_and_foreign_names(folder: &Path, outside: &Path, name: &str) {
     symlink(outside.join("secret.png"), &photo).unwrap();
     refused(folder, &["outside of the capture", name]);
     fs::remove_file(&photo).unwrap();
-    symlink(&photo, &photo).unwrap(); // to itself: as if it were not there
+    symlink(&photo, &photo).unwrap(); // a link to itself counts as missing
     assert_eq!(run(folder).unwrap().left_out.len(), 1);
     fs::remove_file(&photo).unwrap();
     fs::create_dir(&photo).unwrap();
     assert_eq!(run(folder).unwrap().left_out.len(), 1);
     fs::remove_dir(&photo).unwrap();
     fs::write(&photo, bytes).unwrap();
-    // Masks that nobody named are not followed out, one that lies is said to.
+    // An unnamed mask outside of the capture is ignored; an invalid one is an error.
     let masks = folder.join("masks");
     fs::create_dir(&masks).unwrap();
     let mask = masks.join(Path::new(name).with_extension("png"));
@@ -200,16 +200,16 @@ fn links_and_foreign_names(folder: &Path, outside: &Path, name: &str) {
     RgbImage::new(32, 48).save(&mask).unwrap();
     refused(folder, &["masks", "32×48"]);
     fs::remove_file(&mask).unwrap();
-    // Names that are no text disturb nobody.
-    let foreign = std::ffi::OsStr::from_bytes(b"\xff\xfe.png");
+    // Names that are not UTF-8 are ignored.
+    let non_utf8 = std::ffi::OsStr::from_bytes(b"\xff\xfe.png");
     for folder in [folder.to_path_buf(), folder.join("images"), folder.join("sparse/0"), masks] {
-        fs::write(folder.join(foreign), "?").unwrap();
+        fs::write(folder.join(non_utf8), "?").unwrap();
     }
     assert!(run(folder).unwrap().left_out.is_empty());
-    let elsewhere = outside.join(foreign);
+    let elsewhere = outside.join(non_utf8);
     fs::rename(folder, &elsewhere).unwrap();
-    assert!(run(&elsewhere).unwrap().left_out.is_empty(), "in a folder whose name is no text");
-    // A model in a folder that is a link out is none.
+    assert!(run(&elsewhere).unwrap().left_out.is_empty(), "in a folder whose name is not UTF-8");
+    // A model behind a link that leaves the capture is ignored.
     fs::create_dir(folder).unwrap();
     symlink(elsewhere.join("sparse"), folder.join("sparse")).unwrap();
     refused(folder, &["neither a COLMAP model"]);
@@ -294,11 +294,11 @@ fn frames_with_impossible_numbers_are_refused() {
 }
 
 #[test]
-fn photos_that_lie_are_refused() {
+fn photos_with_false_headers_are_refused() {
     let folder = frames(r#""fl_x": 50"#, r#""file_path": "a.jpg""#);
     let photo = folder.path().join("a.jpg");
     let mut pixels = Vec::new();
-    // Whatever the name says, the content counts.
+    // The content determines the format, not the name.
     for format in [ImageFormat::Png, ImageFormat::Tiff, ImageFormat::WebP, ImageFormat::Jpeg] {
         fs::write(&photo, encoded(format)).unwrap();
         let source = run(folder.path()).unwrap();
@@ -338,13 +338,13 @@ fn photos_that_lie_are_refused() {
         fs::write(&photo, bytes).unwrap();
         refused(folder.path(), &[word]);
     }
-    // One pixel is a photo, if a useless one.
+    // A photo of one pixel is accepted.
     RgbImage::new(1, 1).save_with_format(&photo, ImageFormat::Png).unwrap();
     drop(run(folder.path()));
 }
 
 #[test]
-fn cameras_alone_are_checked_too() {
+fn sizes_are_checked_with_cameras_only() {
     let (folder, mut model) = city();
     fs::remove_dir_all(folder.path().join("images")).unwrap();
     let lens = CameraModel::OpenCv([40.0, 40.0, 24.0, 16.0, 0.1, 0.0, 0.0, 0.0]);

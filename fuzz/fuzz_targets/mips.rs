@@ -5,15 +5,15 @@ use libfuzzer_sys::fuzz_target;
 use scene::Rect;
 
 #[allow(dead_code, reason = "ingest uses more of it")]
-#[path = "../../dataset/src/mips.rs"]
-mod mips;
+#[path = "../../dataset/src/mip_tiles.rs"]
+mod mip_tiles;
 
 /// The size of the mip that the seed is. Four tiles.
 const SIZE: (u32, u32) = (150, 140);
 
 fuzz_target!(|bytes: &[u8]| {
     for masked in [false, true] {
-        let layout = mips::Layout { width: SIZE.0, height: SIZE.1, masked };
+        let layout = mip_tiles::MipLayout { width: SIZE.0, height: SIZE.1, masked };
         let mut bytes = bytes.to_vec();
         let Some(index) = bytes.get_mut(..layout.index_len()) else { return };
         let words = [SIZE.0, SIZE.1, 3 + u32::from(masked)].map(u32::to_le_bytes);

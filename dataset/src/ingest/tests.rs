@@ -5,8 +5,8 @@ use scene::{Rect, Rigid};
 use store::Store;
 
 use super::*;
-use crate::lens::ideal_pinhole;
 use crate::photo::tests::{encoded, texture};
+use crate::undistortion::ideal_pinhole;
 use crate::windows::{SharedTileCache, WindowReader};
 
 const WIDTH: u32 = 150;
@@ -16,7 +16,7 @@ fn model() -> CameraModel {
     CameraModel::Pinhole([120.0, 121.0, 74.5, 50.25])
 }
 
-/// A capture of PNG and JPEG photos, each of another brightness.
+/// A capture of PNG and JPEG photos of different brightness.
 fn source(folder: &Path, count: u32) -> Source {
     let photo = |i: u32| {
         let format = if i.is_multiple_of(2) { ImageFormat::Png } else { ImageFormat::Jpeg };
@@ -51,12 +51,12 @@ fn whole(camera: &Camera) -> Rect {
 }
 
 #[test]
-fn a_second_ingest_decodes_nothing_and_threads_do_not_matter() {
+fn a_second_ingest_decodes_nothing_and_the_result_does_not_depend_on_threads() {
     let folder = tempfile::tempdir().unwrap();
     let (source, store) = (source(folder.path(), 7), memory());
-    let heard = Mutex::new(Vec::new());
-    let first = ingest(&source, &store, &options(1, 1), &|done, of| heard.lock().unwrap().push((done, of))).unwrap();
-    assert_eq!(heard.into_inner().unwrap(), (1..=7).map(|i| (i, 7)).collect::<Vec<_>>());
+    let calls = Mutex::new(Vec::new());
+    let first = ingest(&source, &store, &options(1, 1), &|done, of| calls.lock().unwrap().push((done, of))).unwrap();
+    assert_eq!(calls.into_inner().unwrap(), (1..=7).map(|i| (i, 7)).collect::<Vec<_>>());
     assert_eq!(first.decoded, 7);
     assert_eq!(load_capture(&store, first.id).unwrap(), first.capture);
     let second = run(&source, &store, options(2, 1)).unwrap();
@@ -67,7 +67,7 @@ fn a_second_ingest_decodes_nothing_and_threads_do_not_matter() {
 }
 
 #[test]
-fn what_was_interrupted_goes_on_where_it_was() {
+fn an_interrupted_ingest_resumes() {
     let folder = tempfile::tempdir().unwrap();
     let (mut source, store) = (source(folder.path(), 5), memory());
     let mut early = source.clone();
@@ -76,11 +76,15 @@ fn what_was_interrupted_goes_on_where_it_was() {
     assert_eq!(run(&early, &store, options(2, 1)).unwrap().decoded, 3);
     assert_eq!(run(&source, &store, options(2, 1)).unwrap().decoded, 2);
     source.capture.views[0].name = "another name.png".into();
-    assert_eq!(run(&source, &store, options(2, 1)).unwrap().decoded, 0, "known by content, not by name");
+    assert_eq!(
+        run(&source, &store, options(2, 1)).unwrap().decoded,
+        0,
+        "ingest records are keyed by content, not by name"
+    );
 }
 
 #[test]
-fn a_lost_or_cut_artefact_is_made_again() {
+fn a_lost_or_truncated_artefact_is_recomputed() {
     let folder = tempfile::tempdir().unwrap();
     let source = source(folder.path(), 3);
     let root = folder.path().join("store");
@@ -99,7 +103,7 @@ fn a_lost_or_cut_artefact_is_made_again() {
 }
 
 #[test]
-fn cut_and_foreign_files_are_named_in_one_line() {
+fn truncated_and_other_files_are_one_line_errors() {
     let folder = tempfile::tempdir().unwrap();
     let source = source(folder.path(), 6);
     let whole = std::fs::read(&source.photos[3].path).unwrap();
@@ -132,7 +136,7 @@ fn sizes_are_checked_against_the_camera() {
 }
 
 #[test]
-fn windows_are_crops_of_the_mips_and_the_cache_keeps_its_bound() {
+fn windows_are_crops_of_the_mips_and_the_cache_keeps_its_limit() {
     let folder = tempfile::tempdir().unwrap();
     let (source, store) = (source(folder.path(), 4), memory());
     let ingested = run(&source, &store, options(2, 1)).unwrap();
@@ -169,7 +173,7 @@ fn windows_are_crops_of_the_mips_and_the_cache_keeps_its_bound() {
 }
 
 #[test]
-fn tiles_are_read_once_by_all_who_share_them_and_never_kept_damaged() {
+fn shared_tiles_are_read_once_and_damaged_ones_not_cached() {
     let folder = tempfile::tempdir().unwrap();
     let store = memory();
     let mut capture = run(&source(folder.path(), 2), &store, options(1, 1)).unwrap().capture;
@@ -179,8 +183,9 @@ fn tiles_are_read_once_by_all_who_share_them_and_never_kept_damaged() {
     // Ranges are not checked against the artefact's name, tiles against their own checksum.
     capture.views.push(View { mips: vec![store.put(bytes).unwrap()], ..capture.views[0].clone() });
     let capture = Arc::new(capture);
-    let common = Arc::new(SharedTileCache::new(1 << 20));
-    let reader = || WindowReader::with_shared_tiles(Arc::clone(&common), Arc::clone(&capture), store.clone(), 1 << 20);
+    let shared_tiles = Arc::new(SharedTileCache::new(1 << 20));
+    let reader =
+        || WindowReader::with_shared_tiles(Arc::clone(&shared_tiles), Arc::clone(&capture), store.clone(), 1 << 20);
     let whole = whole(&capture.views[0].camera);
     let [corner, right] = [Rect { width: 70, height: 70, ..whole }, Rect { x: 64, width: 80, height: 64, ..whole }];
     let first = reader();
@@ -188,7 +193,7 @@ fn tiles_are_read_once_by_all_who_share_them_and_never_kept_damaged() {
     let second = reader();
     assert_eq!(*second.window(0, 0, corner).unwrap(), *first.window(0, 0, corner).unwrap());
     assert_eq!(second.stats().bytes_read, 0);
-    // The tile that both have in common is not read again.
+    // The tile in both windows is not read again.
     let alone = WindowReader::new(Arc::clone(&capture), store.clone(), 0);
     assert_eq!(*second.window(0, 0, right).unwrap(), *alone.window(0, 0, right).unwrap());
     let [shared, alone] = [second, alone].map(|reader| reader.stats().bytes_read);
@@ -196,12 +201,12 @@ fn tiles_are_read_once_by_all_who_share_them_and_never_kept_damaged() {
     for _ in 0..2 {
         let reader = reader();
         assert!(reader.window(2, 0, whole).is_err());
-        assert!(reader.stats().bytes_read > 0, "what was damaged is looked at anew");
+        assert!(reader.stats().bytes_read > 0, "damaged tiles are read again");
     }
 }
 
 #[test]
-fn what_is_not_there_is_said() {
+fn missing_and_damaged_windows_are_one_line_errors() {
     let folder = tempfile::tempdir().unwrap();
     let store = memory();
     let mut capture = run(&source(folder.path(), 1), &store, options(1, 1)).unwrap().capture;
@@ -223,7 +228,7 @@ fn what_is_not_there_is_said() {
 }
 
 #[test]
-fn what_is_expected_is_there_when_it_is_asked_for() {
+fn prefetched_windows_equal_those_read_directly() {
     let folder = tempfile::tempdir().unwrap();
     let store = memory();
     let mut capture = run(&source(folder.path(), 3), &store, options(1, 1)).unwrap().capture;
@@ -235,7 +240,7 @@ fn what_is_expected_is_there_when_it_is_asked_for() {
     for (i, &rect) in rects.iter().enumerate() {
         let view = i as u32 % 3;
         reader.prefetch(view, 0, rect);
-        // Again, and what cannot be had: neither is anybody's trouble.
+        // Duplicate and failing prefetches have no effect.
         reader.prefetch(view, 0, rect);
         reader.prefetch(3, 0, rect);
         reader.prefetch(99, 0, rect);
@@ -243,12 +248,12 @@ fn what_is_expected_is_there_when_it_is_asked_for() {
     }
     assert!(reader.window(3, 0, rects[0]).is_err() && reader.window(99, 0, rects[0]).is_err());
     let stats = reader.stats();
-    // What found no room in the queue was read by whoever asked.
-    assert!(stats.expected > 0 && stats.expected + stats.misses >= 40, "{stats:?}");
+    // Windows that the queue had no room for are read by the caller.
+    assert!(stats.prefetched > 0 && stats.prefetched + stats.misses >= 40, "{stats:?}");
     assert!(stats.bytes_used > 0 && stats.bytes_used < stats.bytes_read, "{stats:?}");
-    // Where there is no room, nothing is fetched to be thrown away.
+    // A cache without room fetches nothing.
     plain.prefetch(0, 0, rects[0]);
-    assert_eq!(plain.stats().expected, 0);
+    assert_eq!(plain.stats().prefetched, 0);
 }
 
 #[test]
@@ -270,7 +275,7 @@ fn masks_and_downscaling_reach_the_mips() {
     let window = reader.window(1, 1, whole(&camera.mip(1))).unwrap();
     let usable: Vec<u8> = (0..25).map(|x| if x < 5 { 0 } else { 255 }).collect();
     assert_eq!(window.mask.as_ref().unwrap()[..25], usable);
-    // Another mask is another view; a mask that is no image is named.
+    // Another mask is ingested anew. A mask that is not an image is named in the error.
     std::fs::write(&path, encoded(GrayImage::from_pixel(WIDTH, HEIGHT, Luma([255])), ImageFormat::Png)).unwrap();
     let open = run(&source, &store, options(1, 3)).unwrap();
     assert!(open.decoded == 1 && !open.capture.views[1].masked);
@@ -279,7 +284,7 @@ fn masks_and_downscaling_reach_the_mips() {
 }
 
 #[test]
-fn a_real_capture_comes_back_as_its_photos() {
+fn a_real_capture_is_read_back_as_its_photos() {
     let shared = std::env::var("PLAT_SHARED").unwrap_or(concat!(env!("CARGO_MANIFEST_DIR"), "/../../shared").into());
     let capture = Path::new(&shared).join("data/fox/pinhole_270");
     if !capture.exists() {

@@ -1,4 +1,4 @@
-//! A COLMAP model, binary or text, and the folder of its images.
+//! Parses a COLMAP model, binary or text.
 
 use std::path::Path;
 
@@ -6,19 +6,19 @@ use scene::colmap::{self, ColmapPoints};
 use scene::transforms::Intrinsics;
 use scene::{BadInput, CodecError, SparsePoints};
 
-use super::files::{self, Root};
-use super::{Contents, OpenOptions, Points, Posed};
+use super::files::{self, CaptureRoot};
+use super::parsed::{OpenOptions, ParsedCapture, PosedImage, RawPoints};
 
-/// The first of these folders that has a model.
-pub(super) fn find(root: &Root, folders: &[&str]) -> Option<String> {
+/// The first of these folders with a model.
+pub(super) fn find(root: &CaptureRoot, folders: &[&str]) -> Option<String> {
     let has = |folder: &str, extension: &str| {
         ["cameras", "images"].iter().all(|name| root.file(&format!("{folder}/{name}.{extension}")).is_some())
     };
     folders.iter().find(|folder| has(folder, "bin") || has(folder, "txt")).map(ToString::to_string)
 }
 
-/// Reads the model of a folder that [`find`] found.
-pub(super) fn read(root: &Root, folder: &str, options: &OpenOptions) -> Result<Contents, BadInput> {
+/// Parses the model of a folder found by [`find`].
+pub(super) fn read(root: &CaptureRoot, folder: &str, options: &OpenOptions) -> Result<ParsedCapture, BadInput> {
     let has_bin = ["cameras", "images"].iter().all(|name| root.file(&format!("{folder}/{name}.bin")).is_some());
     let cameras = load(root, folder, "cameras", has_bin, colmap::read_cameras_bin, colmap::read_cameras_txt)?;
     let images = load(root, folder, "images", has_bin, colmap::read_images_bin, colmap::read_images_txt)?;
@@ -33,13 +33,13 @@ pub(super) fn read(root: &Root, folder: &str, options: &OpenOptions) -> Result<C
         None if root.path("images").is_dir() => "images/".to_string(),
         None => String::new(),
     };
-    let posed = images.into_iter().map(|image| {
+    let images = images.into_iter().map(|image| {
         let camera = cameras.get(&image.camera_id).ok_or_else(|| {
             let problem = format!("has image {} with camera {}, which is not there", image.name, image.camera_id);
             BadInput::new(format!("{root}: {folder}"), problem, "export the model again")
         })?;
         let size = Some((camera.width, camera.height));
-        Ok(Posed {
+        Ok(PosedImage {
             id: image.id,
             file: format!("{photos}{}", image.name),
             name: image.name,
@@ -48,19 +48,19 @@ pub(super) fn read(root: &Root, folder: &str, options: &OpenOptions) -> Result<C
             camera_from_world: image.camera_from_world,
         })
     });
-    let posed = posed.collect::<Result<Vec<_>, BadInput>>()?;
-    if posed.is_empty() {
+    let images = images.collect::<Result<Vec<_>, BadInput>>()?;
+    if images.is_empty() {
         return Err(BadInput::new(format!("{root}: {folder}"), "has no images", "give a model with registered images"));
     }
     let ColmapPoints { positions, colours, track_start, track_images, .. } = points;
-    let points = Points(SparsePoints { positions, colours, track_start, seen_by: track_images });
-    Ok(Contents { format: "colmap", posed, points, origin: None, left_out: Vec::new() })
+    let points = RawPoints(SparsePoints { positions, colours, track_start, seen_by: track_images });
+    Ok(ParsedCapture { format: "colmap", images, points, origin: None, left_out: Vec::new() })
 }
 
 type Codec<T> = fn(&[u8]) -> Result<T, CodecError>;
 
 fn load<T>(
-    root: &Root,
+    root: &CaptureRoot,
     folder: &str,
     name: &str,
     bin: bool,

@@ -1,4 +1,4 @@
-//! Files inside a capture, and nowhere else.
+//! Access to the files of a capture, confined to its folder.
 
 use std::fmt;
 use std::fs::File;
@@ -8,32 +8,32 @@ use std::path::{Component, Path, PathBuf};
 use image::ImageError;
 use scene::BadInput;
 
-use crate::{mips, photo};
+use crate::{mip_tiles, photo};
 
-/// Pixels of the longest side of a photo: as many as a JPEG can have.
-const LONGEST_SIDE: u32 = 65_535;
-/// Extensions that are tried where a capture names images without one.
+/// Longest side of a photo in pixels: the limit of JPEG.
+const MAX_SIDE: u32 = 65_535;
+/// Extensions tried for images named without one.
 const EXTENSIONS: [&str; 6] = ["png", "jpg", "jpeg", "PNG", "JPG", "JPEG"];
 
-/// The folder of a capture.
-pub(super) struct Root(PathBuf);
+/// The canonical folder of a capture.
+pub(super) struct CaptureRoot(PathBuf);
 
-/// What became of the search for a file.
+/// Result of the search for a file.
 pub(super) enum Found {
     /// Canonical, inside the capture.
     File(PathBuf),
-    /// Not there.
+    /// No such file.
     Missing,
 }
 
-impl fmt::Display for Root {
+impl fmt::Display for CaptureRoot {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         self.0.display().fmt(f)
     }
 }
 
-impl Root {
-    /// The folder, or the folder of the file.
+impl CaptureRoot {
+    /// The folder `path`, or the folder of the file `path`.
     pub(super) fn new(path: &Path) -> Result<Self, BadInput> {
         let cannot = |e| BadInput::new(show(path), format!("cannot be opened ({e})"), "give the folder of a capture");
         let path = path.canonicalize().map_err(cannot)?;
@@ -43,18 +43,21 @@ impl Root {
         }
     }
 
-    /// Where a file of the capture would be; not checked.
+    /// Joins a name to the folder. Neither existence nor confinement is checked.
     pub(super) fn path(&self, name: &str) -> PathBuf {
         self.0.join(name)
     }
 
-    /// A file of the capture that may be there.
+    /// The canonical path of an optional file; `None` if it does not exist or lies outside.
     pub(super) fn file(&self, name: &str) -> Option<PathBuf> {
         let path = self.0.join(name).canonicalize().ok()?;
         (path.is_file() && path.starts_with(&self.0)).then_some(path)
     }
 
-    /// A file that the capture names, at times without its extension.
+    /// The file of an image or another file named by the capture, possibly without its extension.
+    ///
+    /// # Errors
+    /// The name leads out of the capture.
     pub(super) fn image(&self, name: &str) -> Result<Found, BadInput> {
         let outside = || {
             let problem = "lies outside of the capture";
@@ -83,7 +86,7 @@ impl Root {
     }
 }
 
-/// Width and height as the image's header says.
+/// Width and height from the image's header.
 pub(super) fn image_size(path: &Path) -> Result<(u32, u32), BadInput> {
     let cannot = |e: &dyn fmt::Display| {
         let problem = format!("is not an image that can be read ({e})");
@@ -91,30 +94,30 @@ pub(super) fn image_size(path: &Path) -> Result<(u32, u32), BadInput> {
     };
     let file = File::open(path).map_err(|e| cannot(&e))?;
     let (width, height) = photo::size(BufReader::new(file)).map_err(|e| match e {
-        ImageError::Limits(_) => cannot(&"it claims more pixels than any photo has"),
+        ImageError::Limits(_) => cannot(&"its header needs too much memory"),
         other => cannot(&other),
     })?;
     check_size(path, width, height)?;
     Ok((width, height))
 }
 
-/// Refuses sizes that no photo has: whoever walks along the border of one, or allocates for it, relies on this.
+/// Refuses sizes that no photo has. Allocations and loops over the border of an image depend on this limit.
 pub(super) fn check_size(path: &Path, width: u32, height: u32) -> Result<(), BadInput> {
     let area = u64::from(width) * u64::from(height);
-    if area == 0 || area > mips::PIXEL_LIMIT || width.max(height) > LONGEST_SIDE {
-        let most = mips::PIXEL_LIMIT;
-        let problem = format!("claims {width}×{height} pixels: none, over {LONGEST_SIDE} a side or over {most} in all");
+    if area == 0 || area > mip_tiles::MAX_PIXELS || width.max(height) > MAX_SIDE {
+        let max = mip_tiles::MAX_PIXELS;
+        let problem = format!("claims {width}×{height} pixels: none, over {MAX_SIDE} a side or over {max} in all");
         return Err(BadInput::new(show(path), problem, "replace the file or take its image out of the capture"));
     }
     Ok(())
 }
 
-/// All bytes of a file.
+/// Reads a whole file.
 pub(super) fn read(path: &Path) -> Result<Vec<u8>, BadInput> {
     std::fs::read(path).map_err(|e| BadInput::new(show(path), format!("cannot be read ({e})"), "check the file"))
 }
 
-/// A path in a message.
+/// A path for messages.
 pub(super) fn show(path: &Path) -> String {
     path.display().to_string()
 }

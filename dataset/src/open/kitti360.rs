@@ -1,5 +1,5 @@
-//! KITTI-360 in its own layout: rectified photos of the two front cameras, poses of the vehicle, and its Velodyne scans as
-//! initial points, grey as scanners see no colours.
+//! Parses KITTI-360 in its own layout: rectified photos of the two front cameras, poses of the vehicle, and Velodyne scans as
+//! initial points. RawPoints are grey, because scans have no colour.
 //!
 //! ```text
 //! calibration/{perspective,calib_cam_to_pose,calib_cam_to_velo}.txt
@@ -17,31 +17,31 @@ use scene::kitti360::{self, KittiCamera};
 use scene::transforms::Intrinsics;
 use scene::{BadInput, CodecError, Rigid, SparsePoints};
 
-use super::files::{self, Root};
-use super::{Contents, OpenOptions, Points, Posed};
+use super::files::{self, CaptureRoot};
+use super::parsed::{OpenOptions, ParsedCapture, PosedImage, RawPoints};
 
-/// Initial points at most, give or take a few.
-const POINTS: u64 = 400_000;
-/// Scans that are read at most, evenly spread.
-const SCANS: usize = 1000;
-/// The largest scan: ten times what the scanner delivers in a turn.
-const SCAN_BYTES: u64 = 32 << 20;
-/// Nearer points lie on the vehicle, farther ones are few and scattered; metres.
+/// Approximate maximum of initial points.
+const MAX_POINTS: u64 = 400_000;
+/// Maximum of scans read, evenly spread.
+const MAX_SCANS: usize = 1000;
+/// The largest scan file: ten times a revolution of the scanner.
+const MAX_SCAN_BYTES: u64 = 32 << 20;
+/// Range of points kept, metres. Nearer points lie on the vehicle, farther ones are sparse.
 const RANGE_METRES: std::ops::Range<f64> = 3.0..80.0;
 
-/// True where the folders are those of the data set.
-pub(super) fn is_there(root: &Root) -> bool {
+/// Whether the capture has the layout of the data set.
+pub(super) fn is_present(root: &CaptureRoot) -> bool {
     root.file("calibration/perspective.txt").is_some() && root.path("data_poses").is_dir()
 }
 
-/// Reads calibration, poses and scans.
-pub(super) fn read(root: &Root, options: &OpenOptions) -> Result<Contents, BadInput> {
+/// Parses calibration, poses and scans.
+pub(super) fn read(root: &CaptureRoot, options: &OpenOptions) -> Result<ParsedCapture, BadInput> {
     let cameras = load(root, "calibration/perspective.txt", kitti360::read_perspective)?;
     let imu_from_cameras = match root.file("calibration/calib_cam_to_pose.txt") {
         Some(_) => load(root, "calibration/calib_cam_to_pose.txt", kitti360::read_cam_to_pose)?,
         None => BTreeMap::new(),
     };
-    let (mut posed, mut scans) = (Vec::new(), Vec::new());
+    let (mut images, mut scans) = (Vec::new(), Vec::new());
     for drive in drives(root)? {
         let pose_file = ["poses.txt", "cam0_to_world.txt"].map(|name| format!("data_poses/{drive}/{name}"));
         let [poses, first_camera] = pose_file.map(|name| root.file(&name).is_some().then_some(name));
@@ -52,8 +52,8 @@ pub(super) fn read(root: &Root, options: &OpenOptions) -> Result<Contents, BadIn
             vehicle = load(root, &name, kitti360::read_poses)?;
             for (camera, KittiCamera { rectified_from_camera, .. }) in &cameras {
                 let Some(imu_from_camera) = imu_from_cameras.get(camera) else { continue };
-                let imu_from_rectified = after(imu_from_camera, &rectified_from_camera.inverse());
-                let track = vehicle.iter().map(|(&frame, pose)| (frame, after(pose, &imu_from_rectified)));
+                let imu_from_rectified = compose(imu_from_camera, &rectified_from_camera.inverse());
+                let track = vehicle.iter().map(|(&frame, pose)| (frame, compose(pose, &imu_from_rectified)));
                 tracks.insert(camera, track.collect());
             }
         } else if let Some(name) = first_camera {
@@ -67,15 +67,15 @@ pub(super) fn read(root: &Root, options: &OpenOptions) -> Result<Contents, BadIn
                 format!("data_2d_rect/{drive}/{camera}/data_rect"),
                 format!("data_2d_rect/{drive}/{camera}"),
             ];
-            let there = folders.iter().find(|folder| root.path(folder).is_dir());
-            let Some(folder) = there.or(folders.first().filter(|_| options.cameras_only)) else { continue };
+            let existing = folders.iter().find(|folder| root.path(folder).is_dir());
+            let Some(folder) = existing.or(folders.first().filter(|_| options.cameras_only)) else { continue };
             for (frame, world_from_camera) in track {
                 let file = format!("{folder}/{frame:010}.png");
                 if root.file(&file).is_some() {
                     seen.insert(frame);
                 }
-                posed.push(Posed {
-                    id: posed.len() as u32,
+                images.push(PosedImage {
+                    id: images.len() as u32,
                     name: format!("{drive}/{camera}/{frame:010}.png"),
                     file,
                     mask: None,
@@ -90,7 +90,7 @@ pub(super) fn read(root: &Root, options: &OpenOptions) -> Result<Contents, BadIn
         };
         scans.extend(seen.iter().filter_map(of_frame));
     }
-    if posed.is_empty() {
+    if images.is_empty() {
         let problem = "has no drive with poses and rectified photos";
         let advice = "put data_poses/DRIVE/poses.txt and data_2d_raw/DRIVE/image_00/data_rect there";
         return Err(BadInput::new(root.to_string(), problem, advice));
@@ -99,20 +99,20 @@ pub(super) fn read(root: &Root, options: &OpenOptions) -> Result<Contents, BadIn
     let points = match imu_from_first.filter(|_| root.file("calibration/calib_cam_to_velo.txt").is_some()) {
         Some(imu_from_camera) => {
             let velo_from_camera = load(root, "calibration/calib_cam_to_velo.txt", kitti360::read_cam_to_velo)?;
-            scanned(&scans, &after(imu_from_camera, &velo_from_camera.inverse()))?
+            scan_points(&scans, &compose(imu_from_camera, &velo_from_camera.inverse()))?
         }
-        None => Points::default(),
+        None => RawPoints::default(),
     };
-    Ok(Contents { format: "kitti360", posed, points, origin: None, left_out: Vec::new() })
+    Ok(ParsedCapture { format: "kitti360", images, points, origin: None, left_out: Vec::new() })
 }
 
-/// Points of scans, thinned evenly.
-fn scanned(scans: &[(PathBuf, Rigid)], imu_from_velo: &Rigid) -> Result<Points, BadInput> {
-    let chosen: Vec<_> = scans.iter().step_by(scans.len().div_ceil(SCANS)).collect();
+/// World points of the scans, thinned evenly.
+fn scan_points(scans: &[(PathBuf, Rigid)], imu_from_velo: &Rigid) -> Result<RawPoints, BadInput> {
+    let chosen: Vec<_> = scans.iter().step_by(scans.len().div_ceil(MAX_SCANS)).collect();
     let mut bytes = 0;
     for (path, _) in &chosen {
         let length = path.metadata().map_or(0, |data| data.len());
-        if length > SCAN_BYTES {
+        if length > MAX_SCAN_BYTES {
             return Err(BadInput::new(
                 files::show(path),
                 format!("has {length} bytes, too many for a scan"),
@@ -121,13 +121,13 @@ fn scanned(scans: &[(PathBuf, Rigid)], imu_from_velo: &Rigid) -> Result<Points, 
         }
         bytes += length;
     }
-    let step = (bytes / 16).div_ceil(POINTS).max(1) as usize;
+    let step = (bytes / 16).div_ceil(MAX_POINTS).max(1) as usize;
     let scan = |(path, world_from_imu): &&(PathBuf, Rigid)| -> Result<Vec<DVec3>, BadInput> {
         let points = kitti360::read_scan(&files::read(path)?, step)
             .map_err(|e| BadInput::new(files::show(path), e.to_string(), "download the scan again"))?;
-        let world_from_velo = after(world_from_imu, imu_from_velo);
-        let near = points.into_iter().filter(|point| RANGE_METRES.contains(&point.length()));
-        Ok(near.map(|point| world_from_velo.apply(point)).collect())
+        let world_from_velo = compose(world_from_imu, imu_from_velo);
+        let in_range = points.into_iter().filter(|point| RANGE_METRES.contains(&point.length()));
+        Ok(in_range.map(|point| world_from_velo.apply(point)).collect())
     };
     let scanned: Vec<_> = chosen.par_iter().map(scan).collect();
     let mut positions = Vec::new();
@@ -135,16 +135,16 @@ fn scanned(scans: &[(PathBuf, Rigid)], imu_from_velo: &Rigid) -> Result<Points, 
         positions.extend(points?);
     }
     let colours = vec![[128; 3]; positions.len()];
-    Ok(Points(SparsePoints { positions, colours, ..Default::default() }))
+    Ok(RawPoints(SparsePoints { positions, colours, ..Default::default() }))
 }
 
-/// First `inner`, then `outer`.
-fn after(outer: &Rigid, inner: &Rigid) -> Rigid {
+/// `outer ∘ inner`: applies `inner` first.
+fn compose(outer: &Rigid, inner: &Rigid) -> Rigid {
     Rigid { rotation: outer.rotation * inner.rotation, translation: outer.apply(inner.translation) }
 }
 
-/// The drives of which there are poses, by name.
-fn drives(root: &Root) -> Result<Vec<String>, BadInput> {
+/// The drives with poses, sorted by name.
+fn drives(root: &CaptureRoot) -> Result<Vec<String>, BadInput> {
     let folder = root.path("data_poses");
     let cannot = |e| BadInput::new(files::show(&folder), format!("cannot be read ({e})"), "check the folder");
     let entries = folder.read_dir().map_err(cannot)?;
@@ -153,7 +153,7 @@ fn drives(root: &Root) -> Result<Vec<String>, BadInput> {
     Ok(drives)
 }
 
-fn load<T>(root: &Root, name: &str, read: fn(&[u8]) -> Result<T, CodecError>) -> Result<T, BadInput> {
+fn load<T>(root: &CaptureRoot, name: &str, read: fn(&[u8]) -> Result<T, CodecError>) -> Result<T, BadInput> {
     let Some(path) = root.file(name) else {
         return Err(BadInput::new(format!("{root}: {name}"), "is not there", "put it there"));
     };

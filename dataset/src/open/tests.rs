@@ -50,7 +50,7 @@ fn tracked_inside(capture: &Capture) -> f64 {
 }
 
 #[test]
-fn a_city_comes_back() {
+fn a_synthetic_city_is_opened() {
     let folder = city();
     let source = opened(folder.path()).unwrap();
     assert_eq!((source.format, source.capture.views.len(), source.photos.len()), ("colmap", 24, 24));
@@ -65,7 +65,7 @@ fn a_city_comes_back() {
 }
 
 #[test]
-fn missing_photos_are_left_out_and_their_tracks_follow() {
+fn missing_photos_are_left_out_of_views_and_tracks() {
     let folder = city();
     let whole = opened(folder.path()).unwrap();
     let gone = whole.capture.views[5].name.clone();
@@ -81,7 +81,7 @@ fn missing_photos_are_left_out_and_their_tracks_follow() {
 }
 
 #[test]
-fn scaled_photos_scale_their_cameras_and_other_shapes_are_refused() {
+fn scaled_photos_scale_their_cameras_and_other_aspect_ratios_are_refused() {
     let folder = city();
     let before = opened(folder.path()).unwrap();
     let path = &before.photos[2].path;
@@ -154,7 +154,7 @@ fn transforms_are_opened_by_folder_or_file() {
 }
 
 #[test]
-fn nothing_outside_of_the_capture_is_opened() {
+fn files_outside_of_the_capture_are_not_opened() {
     for file in ["../a.png", "/a.png", "images/../../a.png"] {
         let folder = transforms(&[&format!(r#""file_path": "{file}""#)]);
         refused(folder.path(), &["outside of the capture", file]);
@@ -170,7 +170,7 @@ fn nothing_outside_of_the_capture_is_opened() {
 }
 
 #[test]
-fn what_is_damaged_is_named() {
+fn damaged_files_are_named() {
     let folder = city();
     for name in ["cameras.bin", "images.bin", "points3D.bin"] {
         let path = folder.path().join("sparse/0").join(name);
@@ -194,7 +194,7 @@ fn shared(name: &str) -> Option<PathBuf> {
 }
 
 #[test]
-fn real_captures_open_and_see_their_points() {
+fn real_captures_open_with_points_inside_their_views() {
     for (name, views, geo) in [
         ("fox/pinhole_270", 50, false),
         ("fox/opencv_270", 50, false),
@@ -224,7 +224,7 @@ fn colour_agreement(path: &Path) -> f64 {
     let (mut pairs, mut photos) = (Vec::new(), Vec::new());
     for photo in &source.photos {
         let rgb = image::open(&photo.path).unwrap().into_rgb8().into_raw();
-        let undistorter = crate::lens::Undistorter::new(&photo.model, photo.width, photo.height).unwrap();
+        let undistorter = crate::undistortion::Undistorter::new(&photo.model, photo.width, photo.height).unwrap();
         photos.push(if undistorter.is_identity() { rgb } else { undistorter.rgb(&rgb) });
     }
     let points = &source.capture.points;
@@ -247,7 +247,7 @@ fn colour_agreement(path: &Path) -> f64 {
 }
 
 #[test]
-fn the_undistorted_fox_agrees_with_its_points_as_the_ideal_one() {
+fn undistorted_photos_agree_with_points_as_well_as_ideal_ones() {
     let Some(path) = shared("fox") else { return };
     let (ideal, undistorted) =
         (colour_agreement(&path.join("pinhole_270")), colour_agreement(&path.join("opencv_270")));

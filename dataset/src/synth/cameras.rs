@@ -1,4 +1,4 @@
-//! What is said of the cameras and the points: as it was reported, for trainers, and as it was, in `truth/`.
+//! Writes cameras and sparse points: the reported cameras for trainers, the true ones in `truth/`.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -10,17 +10,17 @@ use scene::{Camera, CameraModel, GeoOrigin, Pinhole, SparsePoints};
 use serde_json::json;
 use store::file::{SaveError, save};
 
-use super::make;
+use super::output::create_folder;
 
-/// Where on Earth the city's origin is said to lie (x east, y north): open sea at the crossing of equator and prime
-/// meridian, so that nobody takes it for a place.
+/// Geographic origin of the city (x east, y north): open sea at the equator and the prime meridian, so that it is not mistaken
+/// for a real place.
 pub(super) const ORIGIN: GeoOrigin = GeoOrigin { latitude_degrees: 0.0, longitude_degrees: 0.0, altitude_metres: 0.0 };
 
-/// Writes `sparse/0`, `transforms.json` with its point cloud, `reference_lla.json`, and `truth/` with the true cameras and
-/// all about the shots.
+/// Writes `sparse/0`, `transforms.json` with its point cloud, `reference_lla.json`, and `truth/` with the true cameras and the
+/// shots.
 pub(super) fn write(out: &Path, shots: &[Shot], points: &SparsePoints, masks: bool) -> Result<(), SaveError> {
     let sparse = out.join("sparse/0");
-    make(&sparse)?;
+    create_folder(&sparse)?;
     let model = reconstruction(shots, points);
     save(&sparse.join("cameras.bin"), &colmap::write_cameras_bin(&model))?;
     save(&sparse.join("points3D.bin"), &colmap::write_points_bin(&model))?;
@@ -37,9 +37,9 @@ pub(super) fn write(out: &Path, shots: &[Shot], points: &SparsePoints, masks: bo
     save(&out.join("reference_lla.json"), format!("{origin}\n").as_bytes())?;
 
     let truth = out.join("truth");
-    make(&truth)?;
-    let told = Transforms { ply_file_path: None, ..frames(shots, masks, |shot| shot.camera) };
-    save(&truth.join("transforms.json"), &transforms::write(&told))?;
+    create_folder(&truth)?;
+    let true_frames = Transforms { ply_file_path: None, ..frames(shots, masks, |shot| shot.camera) };
+    save(&truth.join("transforms.json"), &transforms::write(&true_frames))?;
     let line = |shot: &Shot| serde_json::to_string(shot).expect("plain data") + "\n";
     save(&truth.join("shots.jsonl"), shots.iter().map(line).collect::<String>().as_bytes())
 }
@@ -58,7 +58,7 @@ fn frames(shots: &[Shot], masks: bool, camera: impl Fn(&Shot) -> Camera) -> Tran
     Transforms { frames: shots.iter().map(frame).collect(), ply_file_path: Some("sparse_pc.ply".into()) }
 }
 
-/// COLMAP's words for it; ids count from 1, and the cameras of one lens are one camera.
+/// The COLMAP model. Ids start at 1; shots with equal intrinsics share a camera.
 fn reconstruction(shots: &[Shot], points: &SparsePoints) -> Reconstruction {
     let mut lenses: Vec<Pinhole> = Vec::new();
     let images = shots.iter().zip(1..).map(|(shot, id)| {
@@ -86,7 +86,7 @@ fn reconstruction(shots: &[Shot], points: &SparsePoints) -> Reconstruction {
     Reconstruction { cameras, images, points }
 }
 
-/// The points as binary PLY, for trainers that start from one.
+/// The points as binary PLY.
 fn cloud(points: &SparsePoints) -> Vec<u8> {
     let mut bytes = format!(
         "ply\nformat binary_little_endian 1.0\nelement vertex {}\nproperty float x\nproperty float y\nproperty float z\n\

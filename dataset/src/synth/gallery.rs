@@ -1,5 +1,5 @@
-//! One picture of what rehearsals can show: every layout, every kind of label, every fault. Streets are shown where the most
-//! goes on.
+//! Draws one overview image of synthetic captures: every layout, every kind of label, every fault. Street views are taken where
+//! the most objects are visible.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -14,17 +14,17 @@ use glam::{DVec3, Vec3};
 use image::{Rgb, RgbImage};
 use rayon::prelude::*;
 
-use super::views::views;
-use super::{Progress, Settings, SynthError, impossible};
+use super::settings::{Progress, Settings, SynthError, unsupported};
+use super::shots;
 
-/// Tiles in a row.
+/// Tiles per row.
 const COLUMNS: u32 = 6;
-/// Places along streets that are tried for a lively one.
-const PLACES: usize = 64;
-/// Height of the line above each tile, pixels.
-const CAPTION: u32 = 12;
+/// Street shots tried for the busiest one.
+const CANDIDATES: usize = 64;
+/// Height of the caption above each tile, pixels.
+const CAPTION_HEIGHT: u32 = 12;
 
-/// Draws the gallery of a city's settings, its tiles as large as the photos.
+/// Draws the gallery for these settings, with tiles of the photos' size.
 ///
 /// # Errors
 /// Settings out of range.
@@ -37,13 +37,13 @@ pub fn gallery(settings: &Settings, progress: Progress) -> Result<RgbImage, Synt
     };
     for &layout in Layout::ALL {
         let city = City::generate(&CitySettings { layout, ..settings.city })?;
-        let world = World::new(&city).map_err(|e| impossible(&e))?;
+        let world = World::new(&city).map_err(|e| unsupported(&e))?;
         for (from, shot) in [("above", above(&city, settings)?), ("the street", street(&world, settings)?)] {
             add(&mut tiles, format!("{layout} from {from}"), photo(&take(&world, &shot, &[])?));
         }
     }
     let city = City::generate(&settings.city)?;
-    let world = World::new(&city).map_err(|e| impossible(&e))?;
+    let world = World::new(&city).map_err(|e| unsupported(&e))?;
     let shot = street(&world, settings)?;
     let taken = take(&world, &shot, &[])?;
     for (name, tile) in labels(&taken) {
@@ -53,10 +53,10 @@ pub fn gallery(settings: &Settings, progress: Progress) -> Result<RgbImage, Synt
         let faults = [Fault { kind, strength: 1.0, seed: settings.city.seed }];
         let (caption, tile) = match kind {
             FaultKind::ExposureDrift => ("most, least", drift(&world, &shot, &faults)?),
-            FaultKind::PoseNoise => ("reported over true", ghost(&world, &shot, &faults)?),
+            FaultKind::PoseNoise => ("reported over true", blended_poses(&world, &shot, &faults)?),
             FaultKind::SparseViews | FaultKind::SensorDropout => ("red is lost", map(&world, settings, &faults)?),
             FaultKind::MovingUnmasked => ("red is forgotten", {
-                over(&take(&world, &shot, &faults)?, |frame, i| frame.moves[i] != 0 && frame.mask[i] == 0)
+                highlighted(&take(&world, &shot, &faults)?, |frame, i| frame.moves[i] != 0 && frame.mask[i] == 0)
             }),
             _ => ("", photo(&take(&world, &spoilt(&shot, &faults), &faults)?)),
         };
@@ -68,55 +68,55 @@ pub fn gallery(settings: &Settings, progress: Progress) -> Result<RgbImage, Synt
 
 fn take(world: &World, shot: &Shot, faults: &[Fault]) -> Result<Frame, SynthError> {
     let options = RenderOptions { samples: 3, faults: faults.to_vec(), ..RenderOptions::default() };
-    Ok(render_frame(world, shot, &options).map_err(|e| impossible(&e))?)
+    Ok(render_frame(world, shot, &options).map_err(|e| unsupported(&e))?)
 }
 
-/// The city from a corner, all of it.
+/// The whole city from above a corner.
 fn above(city: &City, settings: &Settings) -> Result<Shot, SynthError> {
-    let lens = pinhole(settings.width, settings.height, 60.0).map_err(|e| impossible(&e))?;
+    let lens = pinhole(settings.width, settings.height, 60.0).map_err(|e| unsupported(&e))?;
     let from = city.extent_metres * DVec3::new(-0.62, -0.62, 0.6);
     Ok(Shot::new("above".into(), "above", 5.0, camera_towards(lens, from, -from.with_z(from.z * 1.08), DVec3::Z)))
 }
 
-/// Ahead from a car, where of some places along all streets the most goes on.
+/// The forward view of a car at the busiest of some positions along all streets.
 fn street(world: &World, settings: &Settings) -> Result<Shot, SynthError> {
     let city = world.city();
     let mut rig = Rig { width: settings.width, height: settings.height, fleet: true, ..Rig::default() };
     rig.cameras.truncate(1);
     rig.field_degrees = 80.0;
-    let shots = drive(city, &rig).map_err(|e| impossible(&e))?;
-    // streets run to the horizon, the city does not
+    let shots = drive(city, &rig).map_err(|e| unsupported(&e))?;
+    // Streets extend to the horizon, beyond the city.
     let within = |shot: &&Shot| shot.camera.centre().truncate().abs().max_element() < 0.4 * city.extent_metres;
     let inside: Vec<&Shot> = shots.iter().filter(within).collect();
-    let tried: Vec<&Shot> = inside.iter().copied().step_by(inside.len().div_ceil(PLACES).max(1)).collect();
-    let lens = pinhole(96, 54, 80.0).map_err(|e| impossible(&e))?;
+    let tried: Vec<&Shot> = inside.iter().copied().step_by(inside.len().div_ceil(CANDIDATES).max(1)).collect();
+    let lens = pinhole(96, 54, 80.0).map_err(|e| unsupported(&e))?;
     let sketch = RenderOptions { samples: 1, corners: false, ..RenderOptions::default() };
-    let life = |shot: &&Shot| -> Result<f64, SynthError> {
+    let activity_of = |shot: &&Shot| -> Result<f64, SynthError> {
         let mut small = (*shot).clone();
         small.camera.pinhole = lens;
-        Ok(liveliness(&render_frame(world, &small, &sketch).map_err(|e| impossible(&e))?))
+        Ok(activity(&render_frame(world, &small, &sketch).map_err(|e| unsupported(&e))?))
     };
-    let lives: Vec<f64> = tried.par_iter().map(life).collect::<Result<_, _>>()?;
-    let best = tried.iter().zip(&lives).rev().max_by(|a, b| a.1.total_cmp(b.1));
+    let activities: Vec<f64> = tried.par_iter().map(activity_of).collect::<Result<_, _>>()?;
+    let best = tried.iter().zip(&activities).rev().max_by(|a, b| a.1.total_cmp(b.1));
     best.map_or_else(|| above(city, settings), |(&best, _)| Ok(best.clone()))
 }
 
-/// How much goes on in a picture: things count that move, and those that could a little; large ones not much more than
-/// small ones, and the first of a class more than the next.
-fn liveliness(frame: &Frame) -> f64 {
-    let mut things: BTreeMap<(u8, u32), (f64, f64)> = BTreeMap::new();
+/// A score of the objects visible in a frame. Moving ones count ten times as much as static ones, large ones little more than small
+/// ones, and the nth of a class 1/n.
+fn activity(frame: &Frame) -> f64 {
+    let mut objects: BTreeMap<(u8, u32), (f64, f64)> = BTreeMap::new();
     for (i, &instance) in frame.first.instance.iter().enumerate().filter(|(_, instance)| **instance != 0) {
-        let thing = things.entry((frame.first.semantic[i], instance)).or_default();
-        thing.0 += 1.0;
-        thing.1 = if frame.moves[i] != 0 { 1.0 } else { 0.1 };
+        let object = objects.entry((frame.first.semantic[i], instance)).or_default();
+        object.0 += 1.0;
+        object.1 = if frame.moves[i] != 0 { 1.0 } else { 0.1 };
     }
     let mut classes: BTreeMap<u8, Vec<f64>> = BTreeMap::new();
-    for ((class, _), (pixels, weight)) in things {
+    for ((class, _), (pixels, weight)) in objects {
         classes.entry(class).or_default().push(weight * pixels.sqrt().min(9.0));
     }
     let of_class = |mut all: Vec<f64>| {
         all.sort_by(|a, b| b.total_cmp(a));
-        all.iter().zip(1..).map(|(life, nth)| life / f64::from(nth)).sum::<f64>()
+        all.iter().zip(1..).map(|(score, nth)| score / f64::from(nth)).sum::<f64>()
     };
     classes.into_values().map(of_class).sum()
 }
@@ -125,7 +125,7 @@ fn spoilt(shot: &Shot, faults: &[Fault]) -> Shot {
     faults::degrade_shots(vec![shot.clone()], faults).pop().unwrap_or_else(|| shot.clone())
 }
 
-/// The shot with the highest gain of two minutes at the left, with the lowest at the right.
+/// The shot with the highest exposure gain of two minutes on the left, with the lowest on the right.
 fn drift(world: &World, shot: &Shot, faults: &[Fault]) -> Result<RgbImage, SynthError> {
     let later = (0..120).map(|i| Shot { seconds: shot.seconds + f64::from(i), ..shot.clone() }).collect();
     let gains: Vec<f32> = faults::degrade_shots(later, faults).iter().map(|shot| shot.exposure).collect();
@@ -141,8 +141,8 @@ fn drift(world: &World, shot: &Shot, faults: &[Fault]) -> Result<RgbImage, Synth
     Ok(tile)
 }
 
-/// What the reported camera would see, over what the true one saw.
-fn ghost(world: &World, shot: &Shot, faults: &[Fault]) -> Result<RgbImage, SynthError> {
+/// The view of the reported camera blended with that of the true one.
+fn blended_poses(world: &World, shot: &Shot, faults: &[Fault]) -> Result<RgbImage, SynthError> {
     let spoilt = spoilt(shot, faults);
     let seen = take(world, &spoilt, &[])?;
     let told = take(world, &Shot { camera: spoilt.reported, ..spoilt }, &[])?;
@@ -157,18 +157,18 @@ fn photo(frame: &Frame) -> RgbImage {
     picture(frame, |i| [0, 1, 2].map(|c| frame.rgb[3 * i + c]))
 }
 
-/// The photo with something in red.
-fn over(frame: &Frame, is_red: impl Fn(&Frame, usize) -> bool) -> RgbImage {
+/// The photo with some pixels in red.
+fn highlighted(frame: &Frame, is_red: impl Fn(&Frame, usize) -> bool) -> RgbImage {
     picture(frame, |i| {
         let [r, g, b] = [0, 1, 2].map(|c| frame.rgb[3 * i + c]);
         if is_red(frame, i) { [255, g / 3, b / 3] } else { [r, g, b] }
     })
 }
 
-/// A colour for a number; black for nothing.
-fn colour(n: u32, nothing: u32) -> [u8; 3] {
+/// A pseudo-random colour for a label; black for `background`.
+fn label_colour(n: u32, background: u32) -> [u8; 3] {
     let [r, g, b, ..] = bits(11, u64::from(n)).to_le_bytes();
-    if n == nothing { [0; 3] } else { [r, g, b].map(|c| 48 + c / 5 * 4) }
+    if n == background { [0; 3] } else { [r, g, b].map(|c| 48 + c / 5 * 4) }
 }
 
 fn labels(frame: &Frame) -> [(&'static str, RgbImage); 8] {
@@ -182,21 +182,21 @@ fn labels(frame: &Frame) -> [(&'static str, RgbImage); 8] {
         ("photo", photo(frame)),
         ("depth", picture(frame, |i| near(first.depth[i]))),
         ("normals", picture(frame, |i| direction(frame.normals[i]))),
-        ("semantic", picture(frame, |i| colour(first.semantic[i].into(), city::Class::Sky as u32))),
-        ("instance", picture(frame, |i| colour(first.instance[i], 0))),
-        ("material", picture(frame, |i| colour(first.material[i].into(), u32::from(u16::MAX)))),
-        ("behind glass", picture(frame, |i| colour(behind.material[i].into(), u32::from(u16::MAX)))),
-        ("what moves", over(frame, |frame, i| frame.moves[i] != 0)),
+        ("semantic", picture(frame, |i| label_colour(first.semantic[i].into(), city::Class::Sky as u32))),
+        ("instance", picture(frame, |i| label_colour(first.instance[i], 0))),
+        ("material", picture(frame, |i| label_colour(first.material[i].into(), u32::from(u16::MAX)))),
+        ("behind glass", picture(frame, |i| label_colour(behind.material[i].into(), u32::from(u16::MAX)))),
+        ("what moves", highlighted(frame, |frame, i| frame.moves[i] != 0)),
     ]
 }
 
-/// The city from straight above with the places of cameras: white those that are kept, red those that are lost.
+/// The city from straight above with the camera positions: white if kept, red if lost to a fault.
 fn map(world: &World, settings: &Settings, faults: &[Fault]) -> Result<RgbImage, SynthError> {
-    let lens = pinhole(settings.width, settings.height, 60.0).map_err(|e| impossible(&e))?;
+    let lens = pinhole(settings.width, settings.height, 60.0).map_err(|e| unsupported(&e))?;
     let height = 0.6 * world.city().extent_metres * lens.fx / f64::from(lens.height.min(lens.width));
     let nadir = camera_towards(lens, DVec3::Z * height * 1.2, DVec3::NEG_Z, DVec3::Y);
     let mut map = photo(&take(world, &Shot::new("map".into(), "map", 5.0, nadir), &[])?);
-    let planned = views(world, settings)?.shots;
+    let planned = shots::plan(world, settings)?.shots;
     let kept: BTreeSet<String> =
         faults::degrade_shots(planned.clone(), faults).into_iter().map(|shot| shot.name).collect();
     for shot in &planned {
@@ -213,12 +213,12 @@ fn map(world: &World, settings: &Settings, faults: &[Fault]) -> Result<RgbImage,
 }
 
 fn sheet(settings: &Settings, tiles: &[(String, RgbImage)]) -> RgbImage {
-    let (width, height) = (settings.width + 2, settings.height + CAPTION);
+    let (width, height) = (settings.width + 2, settings.height + CAPTION_HEIGHT);
     let rows = (tiles.len() as u32).div_ceil(COLUMNS);
     let mut sheet = RgbImage::from_pixel(COLUMNS * width, rows * height, Rgb([24; 3]));
     for (i, (name, tile)) in (0..).zip(tiles) {
         let (left, top) = (i % COLUMNS * width, i / COLUMNS * height);
-        image::imageops::replace(&mut sheet, tile, left.into(), (top + CAPTION).into());
+        image::imageops::replace(&mut sheet, tile, left.into(), (top + CAPTION_HEIGHT).into());
         for (letter, at) in name.chars().zip(0..settings.width / 8) {
             for (y, row) in (0..).zip(BASIC_LEGACY[letter as usize & 127]) {
                 for x in (0..8).filter(|x| row >> x & 1 == 1) {

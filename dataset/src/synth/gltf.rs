@@ -1,8 +1,8 @@
-//! The city as binary glTF 2.0: a mesh for each asset, with a primitive for each of its materials; a node for each actor.
+//! Writes the city as binary glTF 2.0: a mesh per asset with a primitive per material, and a node per actor.
 //!
-//! glTF has y up and this world z: the root node turns the one into the other. What moves stands where it is at second 0.
-//! Normals are left out, so that viewers shade flat, as glTF asks of them; patterns are functions that glTF has no word for,
-//! so a material has its base colour alone.
+//! glTF has y up, the city z up: the root node rotates between them. Moving actors have their pose at second 0. Normals are
+//! omitted; glTF then requires flat shading. Procedural patterns have no equivalent in glTF, so a material has its base colour
+//! alone.
 //!
 //! Source: Khronos, "glTF 2.0 Specification".
 
@@ -16,8 +16,8 @@ use scene::BadInput;
 use serde_json::{Value, json};
 use store::file::save;
 
-use super::SynthError;
 use super::cameras::ORIGIN;
+use super::settings::SynthError;
 
 const FLOAT: u32 = 5126;
 const UNSIGNED_INT: u32 = 5125;
@@ -27,7 +27,7 @@ const ELEMENT_ARRAY_BUFFER: u32 = 34963;
 /// Writes `city.glb`.
 pub(super) fn write(out: &Path, city: &City) -> Result<(), SynthError> {
     let path = out.join("city.glb");
-    // lengths in the file have 32 bits: found out before anything is built
+    // Lengths in the file have 32 bits.
     let size = |mesh: &Mesh| 20 * mesh.positions.len() as u64 + 12 * mesh.triangles.len() as u64;
     let body: u64 = city.assets.iter().map(|asset| size(&asset.mesh)).sum();
     if body > u64::from(u32::MAX) / 2 {
@@ -43,7 +43,7 @@ fn glb(city: &City) -> Vec<u8> {
     let mut writer = Writer::default();
     let meshes: Vec<Option<Value>> =
         city.assets.iter().map(|asset| writer.mesh(&asset.name, &asset.mesh, city.materials.len())).collect();
-    // an asset without triangles is no mesh, and whoever wears it no node
+    // An asset without triangles has no mesh, and its actors have no nodes.
     let mut rows = Vec::with_capacity(meshes.len());
     let mut count = 0u32;
     for mesh in &meshes {
@@ -120,7 +120,7 @@ fn material(material: &Material) -> Value {
     })
 }
 
-/// The binary part, and what lies where in it. All numbers have four bytes, so everything is aligned.
+/// The binary chunk with its buffer views and accessors. All numbers have four bytes, so everything is aligned.
 #[derive(Default)]
 struct Writer {
     bytes: Vec<u8>,
@@ -129,7 +129,7 @@ struct Writer {
 }
 
 impl Writer {
-    /// None for a mesh without triangles.
+    /// Appends a mesh; `None` if it has no triangles.
     fn mesh(&mut self, name: &str, mesh: &Mesh, materials: usize) -> Option<Value> {
         let mut parts: BTreeMap<u16, Vec<u32>> = BTreeMap::new();
         for (triangle, &row) in mesh.triangles.iter().zip(&mesh.materials).filter(|(_, m)| usize::from(**m) < materials)
@@ -142,7 +142,7 @@ impl Writer {
         let positions = self.put(positions.map(f32::to_le_bytes), ARRAY_BUFFER, FLOAT, "VEC3", 3);
         self.accessors[positions]["min"] = json!(low.to_array());
         self.accessors[positions]["max"] = json!(high.to_array());
-        // glTF's v runs down
+        // The v axis of glTF points down.
         let uvs = mesh.uvs.iter().flat_map(|uv| [uv.x, 1.0 - uv.y]);
         let uvs = self.put(uvs.map(f32::to_le_bytes), ARRAY_BUFFER, FLOAT, "VEC2", 2);
         let primitive = |(row, corners): (&u16, &Vec<u32>)| {
@@ -158,7 +158,7 @@ impl Writer {
         Some(json!({ "name": name, "primitives": primitives }))
     }
 
-    /// Appends numbers as a view and an accessor of their own, and returns the accessor's row.
+    /// Appends numbers with a buffer view and an accessor, and returns the accessor's index.
     fn put(
         &mut self,
         numbers: impl Iterator<Item = [u8; 4]>,
@@ -187,7 +187,7 @@ mod tests {
     use city::CitySettings;
 
     #[test]
-    fn the_file_is_what_the_specification_asks_and_has_every_triangle() {
+    fn the_file_follows_the_specification_and_has_every_triangle() {
         let city = City::generate(&CitySettings::default()).unwrap();
         let bytes = glb(&city);
         let word = |at: usize| u32::from_le_bytes(bytes[at..at + 4].try_into().unwrap()) as usize;
@@ -198,7 +198,7 @@ mod tests {
         let list = |name: &str| json[name].as_array().unwrap().clone();
         let (accessors, views, meshes) = (list("accessors"), list("bufferViews"), list("meshes"));
         let number = |value: &Value| value.as_u64().unwrap() as usize;
-        // accessors lie in their views, the views one after the other in the body
+        // Accessors fill their buffer views, which are contiguous in the body.
         let mut end = 0;
         for (accessor, view) in accessors.iter().zip(&views) {
             let width = match accessor["type"].as_str().unwrap() {
@@ -211,7 +211,7 @@ mod tests {
             end += number(&view["byteLength"]);
         }
         assert_eq!(end, body.len());
-        // every corner is one, every material is there, and all triangles are
+        // All indices and materials are in range, and no triangle is missing.
         let mut triangles = Vec::new();
         for mesh in &meshes {
             let mut count = 0;
@@ -228,9 +228,9 @@ mod tests {
         }
         assert_eq!(triangles.iter().sum::<usize>(), city.assets.iter().map(|a| a.mesh.triangles.len()).sum::<usize>());
         let nodes = list("nodes");
-        let worn = nodes.iter().filter(|node| node["mesh"].is_u64()).count();
+        let actor_nodes = nodes.iter().filter(|node| node["mesh"].is_u64()).count();
         let full = |actor: &&city::Actor| !city.assets[motion::asset_at(actor, 0.0) as usize].mesh.triangles.is_empty();
-        assert_eq!(worn, city.actors.iter().filter(full).count());
-        assert_eq!(nodes.last().unwrap()["children"].as_array().unwrap().len(), worn);
+        assert_eq!(actor_nodes, city.actors.iter().filter(full).count());
+        assert_eq!(nodes.last().unwrap()["children"].as_array().unwrap().len(), actor_nodes);
     }
 }

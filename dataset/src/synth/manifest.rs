@@ -1,4 +1,4 @@
-//! `manifest.json`: what a folder was made with, and, once all is there, what is in it.
+//! `manifest.json`: the settings of a synthetic capture and, once it is complete, its contents.
 
 use std::fs;
 use std::io::ErrorKind;
@@ -9,10 +9,11 @@ use scene::BadInput;
 use serde_json::{Value, json};
 use store::file::{SaveError, save};
 
-use super::{Settings, Summary, SynthError, make};
+use super::output::create_folder;
+use super::settings::{Settings, Summary, SynthError};
 
 const NAME: &str = "manifest.json";
-/// Everything else that a rehearsal writes.
+/// All folders of a synthetic capture.
 const FOLDERS: [&str; 13] = [
     "images",
     "masks",
@@ -28,53 +29,54 @@ const FOLDERS: [&str; 13] = [
     "radar",
     "occupancy",
 ];
-/// See [`FOLDERS`].
+/// All files of a synthetic capture except the manifest.
 const FILES: [&str; 6] =
     ["transforms.json", "sparse_pc.ply", "reference_lla.json", "tracks.json", "boxes3d.json", "city.glb"];
 
-/// Makes the folder, and says in it what is being made. A folder that has anything else in it is refused: nothing of
-/// anybody's is overwritten, and no photo of another city stays between the new ones.
-pub(super) fn claim(out: &Path, settings: &Settings) -> Result<(), SynthError> {
-    make(out)?;
+/// Creates the folder and an incomplete manifest in it. A folder with other contents is refused: no other file is overwritten,
+/// and no photo of another city remains between the new ones.
+pub(super) fn begin(out: &Path, settings: &Settings) -> Result<(), SynthError> {
+    create_folder(out)?;
     let is_empty = fs::read_dir(out).map_err(|e| SaveError::new(out, &e))?.next().is_none();
-    if !is_empty && made_with(out) != Some(json!(settings)) {
-        let problem = "is not empty, and holds no rehearsal of the same settings";
+    if !is_empty && existing_settings(out) != Some(json!(settings)) {
+        let problem = "is not empty, and holds no synthetic capture of the same settings";
         return Err(BadInput::new(out.display().to_string(), problem, "give another folder, or empty it").into());
     }
-    put(out, &json!({ "complete": false, "settings": settings }))?;
+    write(out, &json!({ "complete": false, "settings": settings }))?;
     Ok(())
 }
 
-/// Removes what a rehearsal of other settings left, and nothing else.
-pub(super) fn forget(out: &Path, settings: &Settings) -> Result<(), SaveError> {
-    if made_with(out).is_none_or(|made| made == json!(settings)) {
+/// Removes the files of a synthetic capture of other settings, and nothing else.
+pub(super) fn remove_other(out: &Path, settings: &Settings) -> Result<(), SaveError> {
+    if existing_settings(out).is_none_or(|made| made == json!(settings)) {
         return Ok(());
     }
-    let gone = |path: &Path, done: std::io::Result<()>| match done {
+    let ignore_missing = |path: &Path, removed: std::io::Result<()>| match removed {
         Err(error) if error.kind() != ErrorKind::NotFound => Err(SaveError::new(path, &error)),
         _ => Ok(()),
     };
     for name in FOLDERS {
         let path = out.join(name);
-        gone(&path, fs::remove_dir_all(&path))?;
+        ignore_missing(&path, fs::remove_dir_all(&path))?;
     }
-    // The manifest last: until then what is left is a rehearsal's.
+    // The manifest last: an interrupted removal can then be repeated.
     for name in FILES.into_iter().chain([NAME]) {
         let path = out.join(name);
-        gone(&path, fs::remove_file(&path))?;
+        ignore_missing(&path, fs::remove_file(&path))?;
     }
     Ok(())
 }
 
-/// The settings of the rehearsal that a folder holds.
-fn made_with(out: &Path) -> Option<Value> {
+/// The settings in the folder's manifest.
+fn existing_settings(out: &Path) -> Option<Value> {
     let text = fs::read(out.join(NAME)).ok()?;
     serde_json::from_slice::<Value>(&text).ok()?.get("settings").cloned()
 }
 
-/// Says that all is there, and what numbers in label images mean.
+/// Writes the complete manifest, with the classes and materials of label images.
 pub(super) fn complete(out: &Path, settings: &Settings, city: &City, summary: &Summary) -> Result<(), SaveError> {
-    let classes: Vec<Value> = (0..=u8::MAX).filter_map(|row| Some(json!({ "id": row, "name": class(row)? }))).collect();
+    let classes: Vec<Value> =
+        (0..=u8::MAX).filter_map(|row| Some(json!({ "id": row, "name": class_name(row)? }))).collect();
     let manifest = json!({
         "complete": true,
         "made_by": concat!("plat ", env!("CARGO_PKG_VERSION")),
@@ -85,16 +87,16 @@ pub(super) fn complete(out: &Path, settings: &Settings, city: &City, summary: &S
         "classes": classes,
         "materials": city.materials,
     });
-    put(out, &manifest)
+    write(out, &manifest)
 }
 
-fn put(out: &Path, manifest: &Value) -> Result<(), SaveError> {
+fn write(out: &Path, manifest: &Value) -> Result<(), SaveError> {
     let text = serde_json::to_string_pretty(manifest).expect("plain data") + "\n";
     save(&out.join(NAME), text.as_bytes())
 }
 
-/// The name of the class that a label image shows as this number.
-fn class(row: u8) -> Option<String> {
+/// The name of the class with this value in label images.
+fn class_name(row: u8) -> Option<String> {
     let class = Class::ALL.iter().find(|class| **class as u8 == row)?;
     json!(class).as_str().map(str::to_owned)
 }

@@ -1,5 +1,4 @@
-//! What the cars' lidar and radar measure, wherever a photo of theirs is kept: readings in the formats of KITTI, the truth
-//! beside them.
+//! Writes lidar and radar sweeps of the cars at each station: readings in the formats of KITTI, with ground truth beside them.
 
 use std::fmt::Write;
 use std::path::Path;
@@ -17,10 +16,11 @@ use scene::{Rigid, npy};
 use serde_json::json;
 use store::file::{SaveError, save};
 
-use super::views::Station;
-use super::{Progress, Settings, SynthError, impossible, make};
+use super::output::create_folder;
+use super::settings::{Progress, Settings, SynthError, unsupported};
+use super::shots::Station;
 
-/// Writes `lidar/` and `radar/`, as far as they are asked for.
+/// Writes `lidar/` and `radar/`, as far as the settings enable them.
 pub(super) fn write(
     out: &Path,
     world: &World,
@@ -32,34 +32,34 @@ pub(super) fn write(
     let seed = settings.city.seed;
     if settings.lidar {
         let lidar = Lidar { seed, ..Lidar::default() };
-        let turn = |station: &Station, pose: &Rigid, motion: &Motion, folder: &Path| {
+        let lidar_sweep = |station: &Station, pose: &Rigid, motion: &Motion, folder: &Path| {
             let sweep = lidar.sweep(world, pose, motion, station.seconds, &settings.faults);
-            let sweep = sweep.map_err(|e: SenseError| impossible(&e))?;
-            let read: Vec<&Return> = sweep.returns.iter().filter(|point| !point.lost).collect();
-            save_points(folder, station, &read)?;
-            Ok::<_, SynthError>(read.len())
+            let sweep = sweep.map_err(|e: SenseError| unsupported(&e))?;
+            let returns: Vec<&Return> = sweep.returns.iter().filter(|point| !point.lost).collect();
+            save_points(folder, station, &returns)?;
+            Ok::<_, SynthError>(returns.len())
         };
-        sense("lidar", &lidar.mount, out, legs, stations, settings, progress, &turn)?;
+        run_sensor("lidar", &lidar.mount, out, legs, stations, settings, progress, &lidar_sweep)?;
     }
     if settings.radar {
         let radar = Radar { seed, ..Radar::default() };
-        let look = |station: &Station, pose: &Rigid, motion: &Motion, folder: &Path| {
+        let radar_sweep = |station: &Station, pose: &Rigid, motion: &Motion, folder: &Path| {
             let found = radar.sweep(&world.at(station.seconds), pose, motion, &settings.faults);
-            let found = found.map_err(|e: SenseError| impossible(&e))?;
-            save(&folder.join(format!("{}.csv", station.name)), table(&found).as_bytes())?;
+            let found = found.map_err(|e: SenseError| unsupported(&e))?;
+            save(&folder.join(format!("{}.csv", station.name)), radar_csv(&found).as_bytes())?;
             Ok(found.len())
         };
-        sense("radar", &radar.mount, out, legs, stations, settings, progress, &look)?;
+        run_sensor("radar", &radar.mount, out, legs, stations, settings, progress, &radar_sweep)?;
     }
     Ok(())
 }
 
-/// Measures at a station, writes what was measured into a folder, and says how much it was.
+/// Measures at a station, writes the readings into a folder, and returns their number.
 type Measure<'a> = &'a (dyn Fn(&Station, &Rigid, &Motion, &Path) -> Result<usize, SynthError> + Sync);
 
-/// Measures at all stations where the sensor is not silent, and writes when and where that was.
-fn sense(
-    what: &'static str,
+/// Measures at all stations where the sensor has not dropped out, and writes its poses to `poses.jsonl`.
+fn run_sensor(
+    sensor: &'static str,
     mount: &Mount,
     out: &Path,
     legs: &[Vec<Waypoint>],
@@ -68,13 +68,14 @@ fn sense(
     progress: Progress,
     measure: Measure,
 ) -> Result<(), SynthError> {
-    let folder = out.join(what);
-    make(&folder)?;
+    let folder = out.join(sensor);
+    create_folder(&folder)?;
     let done = AtomicUsize::new(0);
     let one = |station: &Station| -> Result<Option<String>, SynthError> {
-        progress(what, done.fetch_add(1, Ordering::Relaxed) + 1, stations.len());
-        let place = legs.get(station.leg).and_then(|leg| sensor_pose_at(leg, mount, station.seconds));
-        let Some((pose, motion)) = place.filter(|_| !faults::is_dropped_out(&settings.faults, what, station.seconds)) else {
+        progress(sensor, done.fetch_add(1, Ordering::Relaxed) + 1, stations.len());
+        let pose = legs.get(station.leg).and_then(|leg| sensor_pose_at(leg, mount, station.seconds));
+        let Some((pose, motion)) = pose.filter(|_| !faults::is_dropped_out(&settings.faults, sensor, station.seconds))
+        else {
             return Ok(None);
         };
         let readings = measure(station, &pose, &motion, &folder)?;
@@ -88,7 +89,7 @@ fn sense(
         });
         Ok(Some(format!("{line}\n")))
     };
-    // all of them first, then the first failure in their order, whichever thread is faster
+    // All results first, then the first error in station order, whichever thread is faster.
     let lines: Vec<_> = stations.par_iter().map(one).collect();
     let mut poses = String::new();
     for line in lines {
@@ -98,24 +99,24 @@ fn sense(
     Ok(())
 }
 
-fn save_points(folder: &Path, station: &Station, read: &[&Return]) -> Result<(), SaveError> {
+fn save_points(folder: &Path, station: &Station, returns: &[&Return]) -> Result<(), SaveError> {
     let (mut points, mut labels, mut truth) = (Vec::new(), Vec::new(), Vec::new());
-    for point in read {
-        let place = point.direction * point.range;
-        place.to_array().into_iter().chain([point.intensity]).for_each(|value| points.extend(value.to_le_bytes()));
+    for point in returns {
+        let position = point.direction * point.range;
+        position.to_array().into_iter().chain([point.intensity]).for_each(|value| points.extend(value.to_le_bytes()));
         labels.extend((point.class as u32 | (point.instance & 0xFFFF) << 16).to_le_bytes());
         truth.extend(point.point.to_array());
         let through_glass = f64::from(u8::from(point.through_glass));
-        let after = point.seconds - station.seconds;
-        truth.extend([point.true_range, f64::from(point.true_intensity), after, through_glass]);
+        let delay = point.seconds - station.seconds;
+        truth.extend([point.true_range, f64::from(point.true_intensity), delay, through_glass]);
     }
     let path = |extension: &str| folder.join(format!("{}.{extension}", station.name));
     save(&path("bin"), &points)?;
     save(&path("label"), &labels)?;
-    save(&path("npy"), &npy::write(&[read.len(), 7], &truth))
+    save(&path("npy"), &npy::write(&[returns.len(), 7], &truth))
 }
 
-fn table(found: &[Detection]) -> String {
+fn radar_csv(found: &[Detection]) -> String {
     let mut text = String::from(
         "range,azimuth,velocity,power,ghost,true_range,true_azimuth,true_velocity,x,y,z,class,instance,material\n",
     );
@@ -137,7 +138,7 @@ fn table(found: &[Detection]) -> String {
             d.instance,
             d.material,
         );
-        row.expect("a string takes all");
+        row.expect("writing to a string cannot fail");
     }
     text
 }

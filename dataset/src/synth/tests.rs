@@ -38,7 +38,7 @@ fn files(root: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
 }
 
 #[test]
-fn a_rehearsal_opens_as_a_capture_and_its_points_are_where_views_see_them() {
+fn a_synthetic_capture_opens_and_its_points_agree_with_its_views() {
     let (folder, summary) = written(&small(), 2);
     let source = open(folder.path(), &OpenOptions::default()).unwrap();
     let capture = &source.capture;
@@ -48,7 +48,7 @@ fn a_rehearsal_opens_as_a_capture_and_its_points_are_where_views_see_them() {
     assert!(capture.points.len() > 200 && summary.points == capture.points.len(), "{summary:?}");
     capture.check().unwrap();
 
-    // the same frames and points as nerfstudio reads them
+    // transforms.json has the same frames and points.
     let frames = open(&folder.path().join("transforms.json"), &OpenOptions::default()).unwrap();
     assert_eq!(frames.capture.views.len(), 24);
     assert_eq!(frames.capture.points.len(), capture.points.len());
@@ -62,7 +62,7 @@ fn a_rehearsal_opens_as_a_capture_and_its_points_are_where_views_see_them() {
     assert_eq!((aerial, street), (12, 12));
     let quarter = |p: DVec3| usize::from(p.x > 0.0) + 2 * usize::from(p.y > 0.0);
     let mut quarters = [0; 4];
-    // of the air, what they look at
+    // Aerial views count at the ground that they show.
     let half = 0.5 * small().city.extent_metres();
     let place = |view: &scene::View| {
         let (centre, forward) = (view.camera.centre(), view.camera.forward());
@@ -71,7 +71,7 @@ fn a_rehearsal_opens_as_a_capture_and_its_points_are_where_views_see_them() {
     capture.views.iter().for_each(|view| quarters[quarter(place(view))] += 1);
     assert!(capture.views.iter().all(|view| place(view).truncate().abs().max_element() < 1.1 * half));
     assert!(quarters.iter().all(|&n| n >= 3), "{quarters:?}");
-    // photos from the air show the city, not what lies around it
+    // Aerial photos show the city, not its surroundings.
     let share = |view: &scene::View| {
         let (pose, k) = (view.camera.camera_from_world.inverse(), view.camera.pinhole);
         let places = (0..64).map(|i| (DVec2::new(f64::from(i % 8), f64::from(i / 8)) + 0.5) / 8.0);
@@ -87,7 +87,7 @@ fn a_rehearsal_opens_as_a_capture_and_its_points_are_where_views_see_them() {
     assert!(shares.iter().all(|&share| share > 0.5), "{shares:?}");
     assert!(shares.iter().sum::<f64>() > 0.7 * shares.len() as f64, "{shares:?}");
 
-    // what was found in a picture, against where the noisy point falls in it
+    // Reprojection errors of the noisy points against the true surfaces.
     let bytes = fs::read(folder.path().join("truth/shots.jsonl")).unwrap();
     let shots: Vec<city::sense::Shot> =
         bytes.split(|&b| b == b'\n').filter(|l| !l.is_empty()).map(|l| serde_json::from_slice(l).unwrap()).collect();
@@ -104,7 +104,7 @@ fn a_rehearsal_opens_as_a_capture_and_its_points_are_where_views_see_them() {
             let hit = world
                 .at(shot.seconds)
                 .cast(&city::trace::Ray::new(centre.as_vec3(), towards), city::trace::RayMask::Opaque);
-            // the surface along the ray, put where the point's own depth is: how far is it from there, in pixels?
+            // The distance between the surface along the ray and the point, in pixels at the point's depth.
             let Some(hit) = hit else { continue };
             let footprint = shot.camera.project(point).1 / shot.camera.pinhole.fx;
             all += 1;
@@ -114,7 +114,7 @@ fn a_rehearsal_opens_as_a_capture_and_its_points_are_where_views_see_them() {
     }
     errors.sort_by(f64::total_cmp);
     assert!(errors[errors.len() / 2] < 1.0, "{}", errors[errors.len() / 2]);
-    // a noisy point at an edge may fall beside it; a point behind a house may not
+    // Noise may move a point at an edge off the surface, but few points may be occluded.
     assert!(hidden * 50 < all, "{hidden} of {all}");
 }
 
@@ -132,7 +132,7 @@ fn the_same_settings_give_the_same_bytes_on_any_number_of_threads() {
         a[Path::new("sparse/0/points3D.bin")]
     );
 
-    // the same again is fine, other settings over it are not
+    // Writing again with the same settings succeeds, with other settings it is refused.
     assert_eq!(write(two.0.path(), &settings, &|_, _, _| ()).unwrap(), two.1);
     assert_eq!(files(two.0.path()), a);
     let refusal = write(two.0.path(), &other, &|_, _, _| ()).unwrap_err().to_string();
@@ -140,14 +140,14 @@ fn the_same_settings_give_the_same_bytes_on_any_number_of_threads() {
 }
 
 #[test]
-fn faults_reach_the_capture_and_the_truth_stays() {
+fn faults_change_the_capture_but_not_the_ground_truth() {
     let fault = |kind| Fault { kind, strength: 1.0, seed: 3 };
     let clean = Settings { views: 12, width: 48, height: 32, ..small() };
     let spoilt = |kind| Settings { faults: vec![fault(kind)], ..clean.clone() };
     let (a, noisy) = (written(&clean, 2), written(&spoilt(FaultKind::PoseNoise), 2));
     let (a, noisy) = (files(a.0.path()), files(noisy.0.path()));
-    let [model, told] = ["sparse/0/images.bin", "truth/transforms.json"].map(Path::new);
-    assert!(a[model] != noisy[model] && a[told] == noisy[told]);
+    let [model, true_frames] = ["sparse/0/images.bin", "truth/transforms.json"].map(Path::new);
+    assert!(a[model] != noisy[model] && a[true_frames] == noisy[true_frames]);
     let sparse = Settings { views: 60, ..spoilt(FaultKind::SparseViews) };
     let views = written(&sparse, 2).1.views;
     assert!((1..20).contains(&views), "{views}");
@@ -162,7 +162,7 @@ fn faults_reach_the_capture_and_the_truth_stays() {
 }
 
 #[test]
-fn settings_out_of_range_are_refused_before_anything_is_made() {
+fn settings_out_of_range_are_refused_before_anything_is_written() {
     let folder = tempfile::tempdir().unwrap();
     let out = folder.path().join("out");
     for wrong in [
@@ -182,7 +182,7 @@ fn settings_out_of_range_are_refused_before_anything_is_made() {
     }
 }
 
-/// Everything that can be written, small.
+/// All outputs enabled, at a small size.
 fn everything() -> Settings {
     Settings {
         views: 12,
@@ -197,8 +197,8 @@ fn everything() -> Settings {
     }
 }
 
-/// What is taken around places, from their files: the middles of voxels in the world, with classes.
-fn taken_around(places: &[Around], voxel: f64) -> Vec<Vec<(DVec3, u8)>> {
+/// Occupied voxels of regions, read from their files: world centres with classes.
+fn occupied_voxels(places: &[VoxelRegion], voxel: f64) -> Vec<Vec<(DVec3, u8)>> {
     let settings =
         Settings { views: 1, width: 16, height: 16, occupancy: Some(voxel), around: places.to_vec(), ..small() };
     let (folder, _) = written(&settings, 2);
@@ -228,21 +228,21 @@ fn taken_around(places: &[Around], voxel: f64) -> Vec<Vec<(DVec3, u8)>> {
 }
 
 #[test]
-fn voxels_around_a_pose_are_the_citys_turned_and_at_its_moment() {
+fn voxels_of_a_region_follow_its_heading_and_time() {
     let city = City::generate(&small().city).unwrap();
     let mover = city.actors.iter().find(|actor| actor.trajectory.is_some() && actor.class == city::Class::Car).unwrap();
     let path = &mover.trajectory.as_ref().unwrap().waypoints;
     let (first, seconds) = (path[0].world_from_asset.translation, path[path.len() / 2].seconds);
     let then = city::trace::motion::pose_at(mover, seconds).translation;
-    let at = |place: DVec3, heading_degrees, seconds| Around { place, radius: 3.0, heading_degrees, seconds };
+    let at = |place: DVec3, heading_degrees, seconds| VoxelRegion { place, radius: 3.0, heading_degrees, seconds };
     let places = [at(then, 0.0, seconds), at(then, 30.0, seconds), at(first, 0.0, path[0].seconds)];
-    let taken = taken_around(&places, 0.25);
+    let taken = occupied_voxels(&places, 0.25);
     assert_eq!(taken.len(), 3);
     let world = World::new(&city).unwrap();
     for (place, taken) in places.iter().zip(&taken) {
         let car = taken.iter().filter(|(_, class)| *class == city::Class::Car as u8).count();
         assert!(car > 200, "{car} voxels of a car at {place:?}");
-        // straight down onto the middle of the cube: the first voxel that is met holds what the ray meets
+        // A ray straight down onto the middle of the cube hits a surface inside an occupied voxel.
         let moment = world.at(place.seconds);
         let from = place.place + DVec3::Z * 2.99;
         let ray = city::trace::Ray::new(from.as_vec3(), -glam::Vec3::Z);
@@ -251,13 +251,13 @@ fn voxels_around_a_pose_are_the_citys_turned_and_at_its_moment() {
         assert!(taken.iter().any(|(p, _)| p.distance(met) < 0.22), "{met}");
         assert!(taken.iter().all(|(p, _)| (*p - place.place).abs().max_element() < 3.0 * 1.5));
     }
-    // the turned cube's corners reach out of the straight one
+    // The corners of the rotated cube lie outside the axis-aligned one.
     let beyond = |taken: &[(DVec3, u8)]| taken.iter().any(|(p, _)| (*p - then).abs().max_element() > 3.1);
     assert!(!beyond(&taken[0]) && beyond(&taken[1]));
 }
 
 #[test]
-fn truth_agrees_with_itself_across_files() {
+fn ground_truth_is_consistent_across_files() {
     let (folder, _) = written(&everything(), 2);
     let root = folder.path();
     let all = files(root);
@@ -265,7 +265,7 @@ fn truth_agrees_with_itself_across_files() {
     let manifest = json("manifest.json");
     assert_eq!(manifest["complete"], true);
 
-    // a label image's things are those of boxes3d.json, and lie in their boxes
+    // The instances of a label image are those of boxes3d.json, and their points lie in the boxes.
     let boxes = json("boxes3d.json");
     let images = boxes["images"].as_array().unwrap();
     assert_eq!(images.len(), 12);
@@ -311,7 +311,7 @@ fn truth_agrees_with_itself_across_files() {
     }
     assert!(checked > 20, "{checked}");
 
-    // tracks are of those that move
+    // Moving actors have tracks.
     let tracks = json("tracks.json");
     let moving = manifest["summary"]["moving"].as_u64().unwrap() as usize;
     assert_eq!(tracks["tracks"].as_array().unwrap().len(), moving);
@@ -319,7 +319,7 @@ fn truth_agrees_with_itself_across_files() {
 }
 
 #[test]
-fn sweeps_and_voxels_are_what_their_formats_say() {
+fn sweeps_and_voxels_follow_their_formats() {
     let (folder, _) = written(&everything(), 2);
     let all = files(folder.path());
     let of = |start: &str, end: &str| -> Vec<(&PathBuf, &Vec<u8>)> {
@@ -343,7 +343,7 @@ fn sweeps_and_voxels_are_what_their_formats_say() {
     }
     errors.sort_by(f64::total_cmp);
     let median = errors[errors.len() / 2];
-    // half of normal errors of 2 cm are under 1.35 cm
+    // The median of normal errors with a standard deviation of 2 cm is 1.35 cm.
     assert!(errors.len() > 1000 && (0.012..0.015).contains(&median), "{median} of {}", errors.len());
     let radar = of("radar", ".csv");
     let columns = |line: &str| line.split(',').count();
@@ -380,10 +380,10 @@ fn sweeps_and_voxels_are_what_their_formats_say() {
 #[test]
 fn the_gallery_shows_every_layout_label_and_fault() {
     let settings = Settings { width: 96, height: 54, ..small() };
-    let told = std::sync::Mutex::new((0, 0));
-    let sheet = gallery(&settings, &|_, done, total| *told.lock().unwrap() = (done, total)).unwrap();
+    let last_progress = std::sync::Mutex::new((0, 0));
+    let sheet = gallery(&settings, &|_, done, total| *last_progress.lock().unwrap() = (done, total)).unwrap();
     let tiles = 2 * Layout::ALL.len() + 8 + FaultKind::ALL.len();
-    assert_eq!(*told.lock().unwrap(), (tiles, tiles));
+    assert_eq!(*last_progress.lock().unwrap(), (tiles, tiles));
     assert_eq!(sheet.dimensions(), (6 * 98, tiles.div_ceil(6) as u32 * 66));
     let tile = |i: usize| {
         let (left, top) = (i as u32 % 6 * 98, i as u32 / 6 * 66 + 12);
@@ -408,10 +408,10 @@ fn the_gallery_shows_every_layout_label_and_fault() {
     };
     let (left, right) = (light(0, 48) / clean_light(0, 48), light(48, 96) / clean_light(48, 96));
     assert!(left > 1.1 && right < 0.9, "the exposure drifts to {left} and {right} of the bytes");
-    // every pane is drawn, and no layout twice
+    // Every pane is drawn, and no layout appears twice.
     for (i, a) in all.iter().enumerate() {
         assert!(a.pixels().any(|p| p != a.get_pixel(0, 0)), "pane {i} is of one colour");
         let before = &all[..if i < 2 * Layout::ALL.len() { i } else { 0 }];
-        assert!(before.iter().all(|b| differs(a, b) > 0.05), "pane {i} is there twice");
+        assert!(before.iter().all(|b| differs(a, b) > 0.05), "pane {i} appears twice");
     }
 }

@@ -1,4 +1,4 @@
-//! Files of every codec: the real ones of `../shared/data`, where that is there, and what plat's own writers make.
+//! Seed files of every codec: real ones from `../shared/data`, if present, and files made by plat's writers.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -6,7 +6,7 @@ use std::rc::Rc;
 
 use city::{CitySettings, Traffic};
 use dataset::ingest;
-use dataset::mips;
+use dataset::mip_tiles;
 use dataset::open::{self, OpenOptions};
 use dataset::synth::{self, Settings};
 use glam::Vec3;
@@ -18,19 +18,19 @@ use scene::{npy, ply, spz, transforms};
 
 use crate::readers::*;
 
-/// What keeps damage from getting further than a checksum, and is made to fit again most of the time.
+/// The checksum or compression of a file, which stops damage early. It is restored after most mutations.
 #[derive(Clone, Copy, PartialEq)]
 pub(crate) enum Seal {
     None,
     /// A frame of plat: its checksum.
     Frame,
-    /// gzip: what is inside is damaged.
+    /// gzip: the decompressed bytes are damaged.
     Gzip,
     /// PNG: the checksum of each chunk.
     Png,
 }
 
-/// What reading may take, bytes: `base` and `factor` times the file.
+/// Memory that reading may take, bytes: `base` plus `factor` times the file.
 #[derive(Clone, Copy)]
 pub(crate) struct Budget {
     pub(crate) factor: usize,
@@ -38,12 +38,12 @@ pub(crate) struct Budget {
 }
 
 const PLAIN: Budget = Budget { factor: 16, base: 16 << 20 };
-/// SPZ is compressed; its reader's own bound on what a file can hold.
+/// SPZ is compressed: the reader's own limit applies.
 const COMPRESSED: Budget = Budget { factor: 20, base: 34 << 20 };
-/// A photo's pixels several times over; what it may claim is bounded by `photo::FREE_PIXELS`.
+/// Several times a photo's pixels, which `photo::BASE_PIXELS` limits.
 const PHOTO: Budget = Budget { factor: 0, base: 256 << 20 };
 
-/// Of the photos that are written here: their TIFF, which is not compressed, fits a fuzzer's seed.
+/// Size of the photos written here, such that an uncompressed TIFF fits a fuzzer's seed.
 pub(crate) const PHOTO_SIZE: (u32, u32) = (80, 60);
 
 pub(crate) struct Seed {
@@ -65,7 +65,7 @@ pub(crate) fn seeds() -> Vec<Seed> {
     corpus.0
 }
 
-/// Files that try to take many times their length, each in its own way. None of them is read.
+/// Decompression bombs: files that claim many times their length. All are refused.
 pub(crate) fn swelling() -> Vec<Seed> {
     let mut corpus = Corpus(Vec::new());
     let ones = |n: usize| "1,".repeat(n) + "1";
@@ -126,7 +126,7 @@ impl Corpus {
         self.put(name, bytes, read, seal, PHOTO);
     }
 
-    /// From `../shared/data`; a file that is not there any more is a failure.
+    /// From `../shared/data`. A missing file fails the test.
     fn real(&mut self, data: &Path) {
         let read = |name: &str| fs::read(data.join(name)).unwrap_or_else(|error| panic!("{name}: {error}"));
         let [cameras, images, points] = colmap_binary();
@@ -139,7 +139,7 @@ impl Corpus {
         for (name, codec) in ["cameras", "images", "points3D"].into_iter().zip(&colmap_text()) {
             let name = format!("drive_kitti_sfnd_lidar/sparse/0/{name}.txt");
             let bytes = read(&name);
-            // The first lines alone too, without the comments that count them: small files go through more cases.
+            // Also the first lines alone, without the comments that count them: small files go through more cases.
             let lines = bytes.split_inclusive(|&b| b == b'\n').filter(|line| !line.starts_with(b"#"));
             self.plain(&format!("{name} (head)"), lines.take(100).collect::<Vec<_>>().concat(), codec);
             self.plain(&name, bytes, codec);
@@ -154,7 +154,7 @@ impl Corpus {
             self.put(&format!("inria as {version:?} spz"), bytes, &spz_codec(), Seal::Gzip, COMPRESSED);
         }
         self.plain("guitar.compressed.ply", read("splats/playcanvas/guitar.compressed.ply"), &ply_codec());
-        // Of version 4: zstd streams, no gzip.
+        // Version 4: zstd streams instead of gzip.
         self.put("biker.spz", read("splats/playcanvas/biker.spz"), &spz_codec(), Seal::None, COMPRESSED);
         let scan = read("drive_kitti_sfnd_lidar/lidar_frontal/0000000010.bin");
         self.plain("0000000010.bin (Velodyne)", scan, &kitti_codecs()[4]);
@@ -243,10 +243,10 @@ impl Corpus {
         let id = scene::ArtefactId::of(b"city");
         let plan = blocks::plan(&source.capture, id, &settings, "cpu").expect("a city can be planned");
         self.put("plan", plan.to_frame(), &plan_codec(source.capture.clone()), Seal::Frame, PLAIN);
-        // Of the size that its fuzz target expects.
+        // The size that the fuzz target expects.
         let bytes = (0..3 * 150 * 140).map(|i| (i * 7 / 11) as u8).collect();
         let pixels = Pixels { width: 150, height: 140, rgb: bytes, mask: None };
-        self.plain("mip", mips::encode(&pixels).expect("an image"), &mip_codec());
+        self.plain("mip", mip_tiles::encode(&pixels).expect("an image"), &mip_codec());
 
         let [photo, mask] = [photo_codec(false), photo_codec(true)];
         let image =

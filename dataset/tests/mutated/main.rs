@@ -1,7 +1,7 @@
-//! Every reader against damaged files: each case ends in a value or in one line of refusal, never in a panic, and never
-//! takes more memory than the size of the file justifies.
+//! Mutation tests of every reader: a damaged file gives a value or a one-line error, never a panic, within a memory limit that
+//! depends on the file's size.
 //!
-//! `PLAT_FUZZ_CASES` says how many cases (2,000), `PLAT_FUZZ_SEED` which (0). A failure prints file, seed and case; with
+//! `PLAT_FUZZ_CASES` sets the number of cases (2,000), `PLAT_FUZZ_SEED` the random seed (0). A failure prints file, seed and case; with
 //! `PLAT_FUZZ_SEED=seed PLAT_FUZZ_FROM=case PLAT_FUZZ_CASES=1` that case runs alone.
 
 mod corpus;
@@ -18,21 +18,21 @@ use std::time::{Duration, Instant};
 use corpus::{Seal, Seed};
 use mutate::Random;
 
-/// Files under this may not take more than [`MOST_BYTES`].
+/// Files under this may not take more than [`MAX_BYTES`].
 const SMALL_FILE: usize = 10 << 20;
-const MOST_BYTES: usize = 256 << 20;
-/// A file of this length has all of its cases, one of twice the length half of them.
+const MAX_BYTES: usize = 256 << 20;
+/// A file of this length gets all of its cases, one of twice the length half of them.
 const QUICK_FILE: usize = 64 << 10;
-/// Fuzzers get no further into long files.
+/// Maximum length of a fuzzer's seed.
 const LARGEST_SEED: usize = 16 << 10;
 /// Bytes of a frame before its header.
 const FRAME_PREFIX: usize = 40;
 
-/// Memory is counted for the whole process.
+/// Serialises tests: memory is counted for the whole process.
 static ONE_AT_A_TIME: Mutex<()> = Mutex::new(());
 
 #[test]
-fn nothing_swells() {
+fn decompression_bombs_are_refused_within_the_memory_limit() {
     let _alone = ONE_AT_A_TIME.lock();
     for file in corpus::swelling() {
         let (outcome, peak) = memory::peak_of(|| file.reader.read(&file.bytes));
@@ -40,7 +40,7 @@ fn nothing_swells() {
         assert!(line.len() < 16 << 10 && !line.contains(char::is_control), "{}: {line:?}", file.name);
         let budget = file.budget.base + file.budget.factor * file.bytes.len();
         println!("{}: {} bytes, {peak} in memory of {budget}: {line:.80}", file.name, file.bytes.len());
-        assert!(peak <= budget.min(MOST_BYTES), "{}: {peak} bytes for a file of {}", file.name, file.bytes.len());
+        assert!(peak <= budget.min(MAX_BYTES), "{}: {peak} bytes for a file of {}", file.name, file.bytes.len());
     }
 }
 
@@ -82,7 +82,7 @@ fn damaged_files_are_refused_or_read() {
         }
         let budget = file.budget.base + file.budget.factor * bytes.len();
         assert!(peak <= budget, "{}: {peak} bytes for a file of {}", what(), bytes.len());
-        assert!(peak <= MOST_BYTES || bytes.len() >= SMALL_FILE, "{}: {peak} bytes", what());
+        assert!(peak <= MAX_BYTES || bytes.len() >= SMALL_FILE, "{}: {peak} bytes", what());
         if took > slowest.0 {
             slowest = (took, what());
         }
@@ -95,7 +95,7 @@ fn damaged_files_are_refused_or_read() {
     println!("largest {:.1} MB: {}", largest.0 as f64 / 1e6, largest.1);
 }
 
-/// The files as seeds of the fuzz targets, without what guards them: the targets put that back.
+/// Writes the files as seeds of the fuzz targets, without checksums, which the targets restore.
 fn write_seeds(folder: &Path, seeds: &[Seed]) {
     for (i, file) in seeds.iter().enumerate() {
         let mut bytes = opened(file);
@@ -106,7 +106,7 @@ fn write_seeds(folder: &Path, seeds: &[Seed]) {
     }
 }
 
-/// What is inside of a seal.
+/// The content of a file inside its checksum or compression.
 fn opened(file: &Seed) -> Vec<u8> {
     match file.seal {
         Seal::None | Seal::Png => file.bytes.clone(),
@@ -119,7 +119,7 @@ fn opened(file: &Seed) -> Vec<u8> {
     }
 }
 
-/// Any of the files, long ones less often.
+/// A random file; long ones are less likely.
 fn choose<'a>(seeds: &'a [Seed], random: &mut Random) -> &'a Seed {
     loop {
         let file = &seeds[random.below(seeds.len())];
@@ -129,7 +129,7 @@ fn choose<'a>(seeds: &'a [Seed], random: &mut Random) -> &'a Seed {
     }
 }
 
-/// The damaged file, and what was done to it. What guards it is made good again, most of the time.
+/// A damaged file and a description of the damage. Checksums are restored in most cases.
 fn damaged(file: &Seed, other: &[u8], random: &mut Random) -> (Vec<u8>, String) {
     let sealed = file.seal != Seal::None && random.below(4) > 0;
     let mut bytes = if sealed && file.seal == Seal::Gzip { opened(file) } else { file.bytes.clone() };
@@ -145,7 +145,7 @@ fn seal(seal: Seal, bytes: &mut Vec<u8>) {
         Seal::None => {}
         Seal::Frame if bytes.len() < FRAME_PREFIX => {}
         Seal::Frame => {
-            // The lengths of header and bulk stay as they are where they fit, else the header takes what is there.
+            // The lengths of header and bulk are kept if they fit, else the header takes all bytes.
             let length = |bytes: &[u8]| bytes.iter().rev().fold(0u64, |n, b| n << 8 | u64::from(*b));
             let (header, bulk) = (length(&bytes[12..16]), length(&bytes[16..24]));
             if header.checked_add(bulk) != Some((bytes.len() - FRAME_PREFIX) as u64) && header < 1 << 20 {

@@ -1,9 +1,9 @@
-//! How much of the heap a call takes at its peak.
+//! Measures the peak heap memory of a call.
 
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 
-/// Counts what Rust code allocates, on all threads. (zstd's own C code is not seen.)
+/// Counts allocations of Rust code on all threads; those of zstd's C code are not counted.
 struct Counting;
 
 #[global_allocator]
@@ -16,17 +16,17 @@ fn grow(bytes: usize) {
     PEAK.fetch_max(NOW.fetch_add(bytes, Relaxed) + bytes, Relaxed);
 }
 
-// SAFETY: every call is handed to the system's allocator as it came; counting touches no memory but two atomics.
+// SAFETY: every call is forwarded unchanged to the system's allocator; counting touches only two atomics.
 unsafe impl GlobalAlloc for Counting {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
         grow(layout.size());
-        // SAFETY: the caller's promises are those that System asks for.
+        // SAFETY: the caller upholds the contract of System.
         unsafe { System.alloc(layout) }
     }
 
     unsafe fn alloc_zeroed(&self, layout: Layout) -> *mut u8 {
         grow(layout.size());
-        // SAFETY: as above. Zeroed pages count although the system may not have touched them yet.
+        // SAFETY: as above. Zeroed pages count although the system may not have mapped them yet.
         unsafe { System.alloc_zeroed(layout) }
     }
 
@@ -37,7 +37,7 @@ unsafe impl GlobalAlloc for Counting {
     }
 
     unsafe fn realloc(&self, at: *mut u8, layout: Layout, size: usize) -> *mut u8 {
-        // While it moves, both may be there.
+        // Both blocks may exist during the move.
         grow(size);
         NOW.fetch_sub(layout.size(), Relaxed);
         // SAFETY: as above.
@@ -45,7 +45,7 @@ unsafe impl GlobalAlloc for Counting {
     }
 }
 
-/// What the call answers, and the bytes that it took beyond what there was before, at most. One call at a time.
+/// The result of a call, and its peak heap memory beyond that before, bytes. Not reentrant.
 pub(crate) fn peak_of<T>(call: impl FnOnce() -> T) -> (T, usize) {
     let before = NOW.load(Relaxed);
     PEAK.store(before, Relaxed);

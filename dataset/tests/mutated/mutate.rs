@@ -1,6 +1,6 @@
-//! Damage to files: what disks, networks, other programs and bad people do to them.
+//! Mutations of files: bit flips, truncation, insertions, and extreme numbers in counts and sizes.
 
-/// SplitMix64: a number for every count, the same for ever.
+/// SplitMix64.
 pub(crate) struct Random(pub(crate) u64);
 
 impl Random {
@@ -11,7 +11,7 @@ impl Random {
         z ^ (z >> 31)
     }
 
-    /// Below `n`, which is not zero.
+    /// A number below `n`, which is not zero.
     pub(crate) fn below(&mut self, n: usize) -> usize {
         (self.next() % n as u64) as usize
     }
@@ -21,7 +21,7 @@ impl Random {
     }
 }
 
-/// Numbers that counts and lengths are not.
+/// Extreme values for counts and lengths.
 const COUNTS: [u64; 14] = [
     0,
     1,
@@ -63,7 +63,7 @@ const WORDS: [&str; 20] = [
     "1 1",
 ];
 
-/// Damages the bytes one to three times and says how.
+/// Mutates the bytes one to three times and returns a description.
 pub(crate) fn mutate(bytes: &mut Vec<u8>, other: &[u8], random: &mut Random) -> String {
     let times = random.pick(&[1, 1, 1, 2, 3]);
     (0..times).map(|_| once(bytes, other, random)).collect::<Vec<_>>().join(", ")
@@ -103,7 +103,7 @@ fn once(bytes: &mut Vec<u8>, other: &[u8], random: &mut Random) -> String {
             format!("float {value} at {at}")
         }
         5 => {
-            // A piece of a file, of this kind or not, over or between what is there.
+            // A piece of a file of any format, overwritten or inserted.
             let from = place(other.len().max(1), random).min(other.len());
             let piece = &other[from..other.len().min(from + 1 + random.below(200))];
             let end = if random.below(2) == 0 { at } else { bytes.len().min(at + piece.len()) };
@@ -122,7 +122,7 @@ fn once(bytes: &mut Vec<u8>, other: &[u8], random: &mut Random) -> String {
             format!("{at}..{end} twice")
         }
         _ => {
-            // A number of a text becomes another word.
+            // A number in a text is replaced by another word.
             let is_number = |b: u8| b.is_ascii_digit() || matches!(b, b'-' | b'+' | b'.' | b'e');
             let Some(start) = (at..bytes.len()).take(4096).find(|&i| bytes[i].is_ascii_digit()) else {
                 return "nothing".into();
@@ -135,13 +135,13 @@ fn once(bytes: &mut Vec<u8>, other: &[u8], random: &mut Random) -> String {
     }
 }
 
-/// Half the time among the first bytes, where counts and sizes stand.
+/// A position; half the time among the first bytes, which hold counts and sizes.
 fn place(length: usize, random: &mut Random) -> usize {
     let near = if random.below(2) == 0 { 256 } else { usize::MAX };
     random.below(length.min(near))
 }
 
-/// Overwrites, at a multiple of four half the time.
+/// Overwrites bytes, half the time at a multiple of four.
 fn put(bytes: &mut [u8], at: usize, word: &[u8], random: &mut Random) {
     let at = if random.below(2) == 0 { at & !3 } else { at };
     let end = bytes.len().min(at + word.len());

@@ -1,10 +1,10 @@
-//! The readers that are tested, each with what it promises of what it accepts.
+//! The readers under test, each with a check of the values that it accepts.
 
 use std::fs;
 use std::rc::Rc;
 
 use dataset::ingest::{self, IngestOptions};
-use dataset::mips;
+use dataset::mip_tiles;
 use dataset::open::{self, OpenOptions};
 use glam::{DQuat, DVec3};
 use image::{ImageFormat, RgbImage};
@@ -31,13 +31,13 @@ impl Reader {
         Rc::new(Self { target, call: Box::new(call) })
     }
 
-    /// Reads the bytes and checks that what comes out is what the reader promises; one line if it refuses them.
+    /// Reads the bytes and checks the value; a one-line error if the reader refuses them.
     pub(crate) fn read(&self, bytes: &[u8]) -> Result<(), String> {
         (self.call)(bytes)
     }
 }
 
-/// A refusal in one line, or a promise that was kept.
+/// A reader with a check of its values.
 fn codec<T: 'static>(target: &'static str, read: fn(&[u8]) -> Result<T, CodecError>, kept: fn(T) -> bool) -> Read {
     Reader::new(target, move |bytes| {
         let value = read(bytes).map_err(|error| error.to_string())?;
@@ -147,7 +147,7 @@ pub(crate) fn npy_codec() -> Read {
     codec("npy", npy::read_f32, |(shape, data)| shape.iter().product::<usize>() == data.len())
 }
 
-/// With the capture that it may or may not be a plan of.
+/// A plan with a capture that it may or may not belong to.
 pub(crate) fn plan_codec(capture: Capture) -> Read {
     Reader::new("frames", move |bytes| {
         let plan = blocks::Plan::from_frame(bytes).map_err(|error| error.to_string())?;
@@ -163,7 +163,7 @@ pub(crate) fn plan_codec(capture: Capture) -> Read {
     })
 }
 
-/// Through the store, as programs do; then what they ask of a capture.
+/// Loads a capture through the store and plans it.
 pub(crate) fn capture_codec() -> Read {
     let store = Store::open("memory://").expect("memory").blocking();
     Reader::new("frames", move |bytes| {
@@ -172,7 +172,7 @@ pub(crate) fn capture_codec() -> Read {
         let id = store.put(bytes.to_vec()).expect("memory takes it");
         let capture = ingest::load_capture(&store, id).map_err(|error| error.to_string())?;
         let settings = blocks::PlanSettings { budget: 1000, ..Default::default() };
-        // Whether there is a plan is not asked, as the numbers may be wild.
+        // Planning may fail: the values may be extreme.
         let _ = blocks::plan(&capture, id, &settings, "cpu").map_err(|error| error.to_string())?;
         Ok(())
     })
@@ -180,7 +180,7 @@ pub(crate) fn capture_codec() -> Read {
 
 pub(crate) fn mip_codec() -> Read {
     Reader::new("mips", |bytes| {
-        let layout = mips::Layout { width: 150, height: 140, masked: false };
+        let layout = mip_tiles::MipLayout { width: 150, height: 140, masked: false };
         let index = layout.index(bytes.get(..layout.index_len()).unwrap_or(bytes)).map_err(|e| e.to_string())?;
         let rect = Rect { x: 100, y: 100, width: 50, height: 40 };
         let ranges = index.ranges(rect).expect("the window is inside");
@@ -190,7 +190,7 @@ pub(crate) fn mip_codec() -> Read {
     })
 }
 
-/// A capture whose photo, or whose mask, is the file: opened and ingested.
+/// Opens and ingests a capture whose photo, or mask, is the file.
 pub(crate) fn photo_codec(as_mask: bool) -> Read {
     let folder = tempfile::tempdir().expect("a folder");
     let frame = |x: f64, mask: bool| Frame {

@@ -1,4 +1,4 @@
-//! Captures of other tools, written here as those tools would.
+//! Captures in the formats of other tools, written as those tools do.
 
 use std::fs;
 use std::path::Path;
@@ -15,7 +15,7 @@ fn write(path: &Path, bytes: impl AsRef<[u8]>) {
     fs::write(path, bytes).unwrap();
 }
 
-/// OpenCV camera_from_world of a camera at `at` that looks at `to`, up being z.
+/// OpenCV `camera_from_world` of a camera at `at` that looks at `to`, with z up.
 fn looking(at: DVec3, to: DVec3) -> Rigid {
     let z = (to - at).normalize();
     let x = z.cross(DVec3::Z).normalize();
@@ -28,8 +28,8 @@ fn centred(points: &[DVec3], middle: DVec3, radius: f64) -> f64 {
 }
 
 #[test]
-fn captures_in_splits_are_whole_and_get_points() {
-    // As NeRF's synthetic scenes: three files, an angle for a lens, names without extension, no points.
+fn captures_in_splits_are_merged_and_get_sampled_points() {
+    // As the synthetic scenes of NeRF: three files, a field of view as lens, names without extension, no points.
     let folder = tempfile::tempdir().unwrap();
     let middle = DVec3::new(1.0, -2.0, 0.5);
     for (split, count) in [("train", 20), ("val", 4), ("test", 6)] {
@@ -59,7 +59,7 @@ fn captures_in_splits_are_whole_and_get_points() {
     // 4 m away the cameras see 2.9 m of height.
     assert!(points.len() > 5000 && centred(points, middle, 2.5) > 0.9, "{}", points.len());
     assert_eq!(points, &opened(folder.path()).unwrap().capture.points.positions);
-    // A split alone, by its name; and a frame that is in two splits is one.
+    // A split opened by its file name; a frame in two splits counts once.
     let test = folder.path().join("transforms_test.json");
     assert_eq!(opened(&test).unwrap().capture.views.len(), 6);
     fs::copy(&test, folder.path().join("transforms_val.json")).unwrap();
@@ -69,8 +69,8 @@ fn captures_in_splits_are_whole_and_get_points() {
 }
 
 #[test]
-fn made_points_lie_where_the_city_is() {
-    // So many that every place is seen from several sides, as in a capture.
+fn sampled_points_cover_the_city() {
+    // Enough views that every place is seen from several sides.
     let folder = city_of(96);
     let true_points = opened(folder.path()).unwrap().capture.points.positions;
     for name in ["points3D.bin", "points3D.txt"] {
@@ -79,7 +79,7 @@ fn made_points_lie_where_the_city_is() {
     let source = opened(folder.path()).unwrap();
     let points = &source.capture.points.positions;
     assert!(source.format == "colmap without points" && points.len() > 2000);
-    // The city is 220 m wide: of its true points nearly all have a made one near.
+    // The city is 220 m wide. Nearly all true points have a sampled one nearby.
     let near = true_points.iter().filter(|p| points.iter().any(|q| p.distance(*q) < 8.0)).count();
     assert!(near as f64 > 0.9 * true_points.len() as f64, "{near} of {}", true_points.len());
 }
@@ -148,9 +148,9 @@ fn drive() -> tempfile::TempDir {
         &at("calibration/calib_cam_to_pose.txt"),
         "image_00: 0 0 1 1 1 0 0 0 0 1 0 0\nimage_01: 0 0 1 1 1 0 0 0.6 0 1 0 0\nimage_02: 0 0 1 1 1 0 0 0 0 1 0 0\n",
     );
-    // The scanner's are forward, left, up; it stands 0.5 m above the first camera.
+    // The scanner's axes are forward, left, up; it is 0.5 m above the first camera.
     write(&at("calibration/calib_cam_to_velo.txt"), "0 0 1 0 -1 0 0 0 0 -1 0 -0.5\n");
-    // It drives along the world's x, which is forward: right is -y, down is -z.
+    // The vehicle drives along the world's x axis: right is -y, down is -z.
     let pose = |frame: u32| format!("{frame} 1 0 0 {} 0 -1 0 7 0 0 -1 2\n", 10 * frame);
     write(&at("data_poses/drive_a/poses.txt"), pose(1) + &pose(2) + &pose(5));
     for camera in ["image_00", "image_01"] {
@@ -190,7 +190,7 @@ fn kitti_360_is_opened_in_its_own_layout() {
     let scan = folder.path().join("data_3d_raw/drive_a/velodyne_points/data/0000000002.bin");
     write(&scan, [0; 17]);
     refused(folder.path(), &["0000000002.bin", "cut short"]);
-    // Poses of camera 00 alone, and neither scans nor points.
+    // Poses of camera 00 only, without scans and points.
     fs::remove_file(folder.path().join("data_poses/drive_a/poses.txt")).unwrap();
     let pose = |frame: u32| format!("{frame} 0 0 1 {} -1 0 0 7 0 -1 0 2 0 0 0 1\n", 10 * frame);
     write(&folder.path().join("data_poses/drive_a/cam0_to_world.txt"), pose(1) + &pose(2));
@@ -241,7 +241,7 @@ fn masks_are_found_by_every_convention() {
 }
 
 #[test]
-fn fisheyes_become_pinholes() {
+fn fisheye_cameras_become_pinholes() {
     let folder = city();
     let path = folder.path().join("sparse/0/cameras.bin");
     let mut cameras = scene::colmap::read_cameras_bin(&fs::read(&path).unwrap()).unwrap();
@@ -255,7 +255,7 @@ fn fisheyes_become_pinholes() {
     for (view, photo) in source.capture.views.iter().zip(&source.photos) {
         let k = view.camera.pinhole;
         assert!(photo.model.is_fisheye() && k.fx == photo.model.focal_and_centre()[0]);
-        // The same pixels look further out through a pinhole, whose picture is wider therefore.
+        // The same field of view takes more pixels in a pinhole, so its image is wider.
         assert!(k.width > photo.width && k.height >= photo.height, "{k:?}");
     }
 }

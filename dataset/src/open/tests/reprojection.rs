@@ -1,4 +1,4 @@
-//! Real keypoints of COLMAP against the points that they are of, through the lens, the undistortion and the pinhole.
+//! Reprojection errors of real COLMAP keypoints, through the lens model, the undistortion and the pinhole.
 
 use std::collections::BTreeMap;
 
@@ -6,10 +6,10 @@ use glam::DVec2;
 use scene::colmap;
 
 use super::{opened, shared};
-use crate::lens;
+use crate::undistortion;
 
 #[test]
-fn real_keypoints_are_where_their_points_project_to() {
+fn points_project_to_their_real_keypoints() {
     for name in ["fox/opencv_270", "fox/pinhole_270", "street_lund", "aerial_caliterra", "building_sceaux"] {
         let Some(path) = shared(name) else { return };
         let source = opened(&path).unwrap();

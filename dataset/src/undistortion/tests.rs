@@ -29,7 +29,7 @@ fn undistort_is_the_inverse_of_distort() {
 }
 
 #[test]
-fn the_slope_is_that_of_differences() {
+fn the_jacobian_agrees_with_finite_differences() {
     for lens in lenses() {
         let (at, step) = (DVec2::new(0.4, -0.3), 1e-6);
         let slope = jacobian(&lens, at);
@@ -41,7 +41,7 @@ fn the_slope_is_that_of_differences() {
 }
 
 #[test]
-fn no_pixel_is_empty_and_none_more_would_fit_all_around() {
+fn the_ideal_image_lies_inside_the_photo_and_is_maximal() {
     for lens in lenses() {
         let undistorter = Undistorter::new(&lens, WIDTH, HEIGHT).unwrap();
         let k = undistorter.pinhole();
@@ -66,7 +66,7 @@ fn no_pixel_is_empty_and_none_more_would_fit_all_around() {
 }
 
 #[test]
-fn pictures_are_resampled_where_the_lens_sends_them() {
+fn photos_and_masks_are_resampled_at_the_distorted_positions() {
     for lens in lenses() {
         let undistorter = Undistorter::new(&lens, WIDTH, HEIGHT).unwrap();
         let k = undistorter.pinhole();
@@ -84,7 +84,7 @@ fn pictures_are_resampled_where_the_lens_sends_them() {
 }
 
 #[test]
-fn ideal_lenses_stay_and_impossible_ones_are_refused() {
+fn undistorted_lenses_are_kept_and_invalid_ones_refused() {
     let pinhole = CameraModel::Pinhole([150.0, 151.0, -5.0, 60.0]);
     let undistorter = Undistorter::new(&pinhole, WIDTH, HEIGHT).unwrap();
     assert!(undistorter.is_identity());
@@ -106,30 +106,30 @@ fn ideal_lenses_stay_and_impossible_ones_are_refused() {
 }
 
 #[test]
-fn a_lens_that_folds_over_in_the_corners_keeps_the_middle() {
-    // The model reaches out to 0.72 focal lengths; the middle of the sides lies at 0.66, the corners at 0.77.
+fn a_lens_that_folds_over_in_the_corners_keeps_the_centre() {
+    // The model folds over at 0.72 focal lengths; the middle of the sides lies at 0.66, the corners at 0.77.
     let lens = CameraModel::SimpleRadial([150.0, 100.0, 60.0, -0.286]);
     let k = ideal_pinhole(&lens, WIDTH, HEIGHT);
     assert!(k.is_some_and(|k| k.width > WIDTH / 2 && k.height > HEIGHT / 2), "{k:?}");
 }
 
 #[test]
-fn a_fisheye_of_half_a_space_keeps_110_degrees() {
+fn a_fisheye_of_a_half_space_keeps_110_degrees() {
     let lens = CameraModel::OpenCvFisheye([64.0, 64.0, 100.0, 100.0, 0.0, 0.0, 0.0, 0.0]);
     let k = ideal_pinhole(&lens, 200, 200).unwrap();
     let angle = |side: f64| (side / k.fx).atan().to_degrees();
     for side in [k.cx, f64::from(k.width) - k.cx, k.cy, f64::from(k.height) - k.cy] {
         assert!((54.0..55.5).contains(&angle(side)), "{k:?}");
     }
-    // The ideal plane has no place for what lies at a right angle and beyond.
+    // The ideal plane has no point at a right angle to the axis or beyond.
     assert_eq!(undistort(&lens, DVec2::new(1.6, 0.0)), None);
     let ideal = undistort(&lens, DVec2::new(0.0, 1.0)).unwrap();
     assert!((ideal - DVec2::new(0.0, 1.0f64.tan())).length() < 1e-9, "{ideal}");
 }
 
-/// Where a pixel of the photo looks, on the plane `z = 1`; the lens models written down once more, from their
-/// documentation, and undone by fixed points and bisection.
-fn looks_at(lens: &CameraModel, pixel: DVec2) -> DVec2 {
+/// Reference implementation: the point on the plane `z = 1` that a pixel of the photo shows. The lens models are written from
+/// their documentation and inverted by fixed-point iteration and bisection.
+fn unprojected(lens: &CameraModel, pixel: DVec2) -> DVec2 {
     let undo = |[fx, fy, cx, cy]: [f64; 4], [k1, k2, p1, p2, k3, k4, k5, k6]: [f64; 8]| {
         let bent = DVec2::new((pixel.x - cx) / fx, (pixel.y - cy) / fy);
         let mut at = bent;
@@ -168,7 +168,7 @@ fn looks_at(lens: &CameraModel, pixel: DVec2) -> DVec2 {
     }
 }
 
-/// Waves over the plane `z = 1`, 40 pixels long; longer for a fisheye, whose photo shows them shorter at its edge.
+/// Waves on the plane `z = 1`, 40 pixels long; 80 for a fisheye, whose photo shows them shorter at its edge.
 fn pattern(lens: &CameraModel, at: DVec2) -> [f64; 3] {
     let length = if lens.is_fisheye() { 80.0 } else { 40.0 };
     let DVec2 { x, y } = at * (150.0 / length * std::f64::consts::TAU);
@@ -176,13 +176,13 @@ fn pattern(lens: &CameraModel, at: DVec2) -> [f64; 3] {
 }
 
 #[test]
-fn a_pattern_seen_through_each_lens_becomes_the_one_that_the_pinhole_sees() {
+fn a_pattern_photographed_through_each_lens_is_resampled_to_that_of_the_pinhole() {
     let ideal = [CameraModel::SimplePinhole([150.0, 101.0, 58.5]), CameraModel::Pinhole([150.0, 151.0, 99.0, 61.0])];
     for lens in ideal.into_iter().chain(lenses()) {
         let centre = |x: u32, y: u32| DVec2::new(f64::from(x) + 0.5, f64::from(y) + 0.5);
         let mut photo = Vec::new();
         for (y, x) in (0..HEIGHT).flat_map(|y| (0..WIDTH).map(move |x| (y, x))) {
-            photo.extend(pattern(&lens, looks_at(&lens, centre(x, y))).map(|v| v.round() as u8));
+            photo.extend(pattern(&lens, unprojected(&lens, centre(x, y))).map(|v| v.round() as u8));
         }
         let undistorter = Undistorter::new(&lens, WIDTH, HEIGHT).unwrap();
         let k = undistorter.pinhole();
@@ -192,7 +192,7 @@ fn a_pattern_seen_through_each_lens_becomes_the_one_that_the_pinhole_sees() {
             let expected = pattern(&lens, DVec2::new((at.x - k.cx) / k.fx, (at.y - k.cy) / k.fy));
             worst = pixel.iter().zip(expected).map(|(&a, b)| (f64::from(a) - b).abs()).fold(worst, f64::max);
         }
-        // Half a level for each rounding, one and a half for bilinear steps; a tenth of a pixel would be as much again.
+        // Half a level for each rounding, 1.5 for bilinear interpolation. A shift of a tenth of a pixel would double the error.
         assert!(worst < 2.5, "{lens:?}: {worst}");
     }
 }

@@ -1,29 +1,30 @@
-//! Initial points for a capture that has none: spread over what several views see.
+//! Samples initial points for a capture without sparse points, in the volume that several views see.
 //!
-//! How far away things are follows from the cameras alone. Where optical axes meet, things are about there; else
-//! neighbouring cameras, which are made to overlap, stand a fraction of the distance apart. Points are drawn in the
-//! frusta of views between a nearest and a farthest depth, evenly in inverse depth (a Halton sequence: the same for
-//! ever), and those stay that many views see. They are grey: no pixel was decoded.
+//! The depth range is estimated from the cameras alone. Where optical axes converge, the subject lies near their common point;
+//! otherwise its distance is assumed to be a multiple of the spacing of neighbouring cameras, whose views overlap. RawPoints are
+//! sampled in the frusta of views, uniformly in inverse depth (a Halton sequence, so the result is deterministic), and points
+//! that many views see are kept. They are grey, because no pixel is decoded.
 
 use glam::{DMat3, DVec3};
 use rayon::prelude::*;
 use scene::{Camera, SparsePoints};
 
-/// Points that are made at most, and that are drawn to choose from.
-const POINTS: usize = 20_000;
-const DRAWN: usize = 80_000;
-/// Fewer are of no use.
-const FEWEST: usize = 100;
-/// Views that are looked at, evenly spread over the names.
-const VIEWS: usize = 256;
-/// A point has to be seen by this share of the views that see a well seen one.
-const SHARE: f64 = 0.3;
+/// Maximum of points returned.
+const MAX_POINTS: usize = 20_000;
+/// Candidates sampled.
+const CANDIDATES: usize = 80_000;
+/// With fewer points the views are taken not to overlap.
+const MIN_POINTS: usize = 100;
+/// Maximum of views used, evenly spread over the names.
+const MAX_VIEWS: usize = 256;
+/// A point is kept if at least this share of the 90th percentile of view counts sees it.
+const MIN_VIEW_SHARE: f64 = 0.3;
 
-/// Points without tracks; `None` where views do not overlap, or are fewer than two.
-pub(super) fn points(cameras: &[Camera]) -> Option<SparsePoints> {
-    let cameras: Vec<Camera> = cameras.iter().step_by(cameras.len().div_ceil(VIEWS).max(1)).copied().collect();
-    let (near, far) = depths(&cameras)?;
-    let draw = |i: usize| {
+/// RawPoints without tracks; `None` if views do not overlap, or there are fewer than two.
+pub(super) fn sample(cameras: &[Camera]) -> Option<SparsePoints> {
+    let cameras: Vec<Camera> = cameras.iter().step_by(cameras.len().div_ceil(MAX_VIEWS).max(1)).copied().collect();
+    let (near, far) = depth_range(&cameras)?;
+    let candidate = |i: usize| {
         let [x, y, z, which] = [2, 3, 5, 7].map(|base| radical_inverse(i + 1, base));
         let camera = &cameras[((which * cameras.len() as f64) as usize).min(cameras.len() - 1)];
         let k = &camera.pinhole;
@@ -38,21 +39,21 @@ pub(super) fn points(cameras: &[Camera]) -> Option<SparsePoints> {
         };
         (cameras.iter().filter(sees).count(), point)
     };
-    let drawn: Vec<(usize, DVec3)> = (0..DRAWN).into_par_iter().map(draw).collect();
-    let mut counts: Vec<usize> = drawn.iter().map(|&(count, _)| count).collect();
+    let candidates: Vec<(usize, DVec3)> = (0..CANDIDATES).into_par_iter().map(candidate).collect();
+    let mut counts: Vec<usize> = candidates.iter().map(|&(count, _)| count).collect();
     counts.sort_unstable();
-    let enough = (SHARE * counts[counts.len() * 9 / 10] as f64).max(2.0);
-    let seen = drawn.into_iter().filter(|&(count, point)| count as f64 >= enough && point.is_finite());
-    let positions: Vec<DVec3> = seen.map(|(_, point)| point).take(POINTS).collect();
+    let min_views = (MIN_VIEW_SHARE * counts[counts.len() * 9 / 10] as f64).max(2.0);
+    let seen = candidates.into_iter().filter(|&(count, point)| count as f64 >= min_views && point.is_finite());
+    let positions: Vec<DVec3> = seen.map(|(_, point)| point).take(MAX_POINTS).collect();
     let colours = vec![[128; 3]; positions.len()];
-    (positions.len() >= FEWEST).then_some(SparsePoints { positions, colours, ..Default::default() })
+    (positions.len() >= MIN_POINTS).then_some(SparsePoints { positions, colours, ..Default::default() })
 }
 
-/// The nearest and the farthest depth at which things are looked for.
-fn depths(cameras: &[Camera]) -> Option<(f64, f64)> {
+/// The nearest and the farthest depth at which points are sampled.
+fn depth_range(cameras: &[Camera]) -> Option<(f64, f64)> {
     if let Some(focus) = focus(cameras) {
         let depths = sorted(cameras.iter().map(|camera| (focus - camera.centre()).dot(camera.forward())));
-        // Cameras that turn their back on it do not look at it.
+        // The focus counts only if at most a fifth of the cameras have it behind them.
         let (middle, behind) = (depths[depths.len() / 2], depths[depths.len() / 5]);
         if behind > 0.0 {
             return Some((0.25 * middle, 2.0 * middle));
@@ -71,7 +72,7 @@ fn depths(cameras: &[Camera]) -> Option<(f64, f64)> {
         .then(|| (2.0 * spacing, (20.0 * spacing).max(extent.min(100.0 * spacing))))
 }
 
-/// The point nearest to all optical axes, where these are not nearly parallel.
+/// The least-squares intersection of the optical axes; `None` if they are nearly parallel.
 fn focus(cameras: &[Camera]) -> Option<DVec3> {
     let (mut matrix, mut vector) = (DMat3::ZERO, DVec3::ZERO);
     for camera in cameras {
@@ -90,7 +91,7 @@ fn sorted(values: impl Iterator<Item = f64>) -> Vec<f64> {
     values
 }
 
-/// The digits of `i` in this base, mirrored at the point: a sequence that fills 0 to 1 evenly.
+/// The radical inverse of `i` in a base: a low-discrepancy sequence in 0 to 1.
 fn radical_inverse(mut i: usize, base: usize) -> f64 {
     let (mut value, mut place) = (0.0, 1.0 / base as f64);
     while i > 0 {

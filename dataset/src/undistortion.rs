@@ -1,34 +1,33 @@
-//! Undistortion: from the photo that a lens took to the photo that an ideal pinhole in its place would have taken.
+//! Undistortion: resamples photos of a distorting lens to an ideal pinhole camera.
 //!
-//! The pinhole keeps the focal lengths and the pixel grid of the photo, so that pixels near the principal point, where
-//! lenses hardly bend rays, stay what they are. Its rectangle is the largest around the principal point that has no
-//! pixel outside the photo; of a fisheye, which may see more than a half space, at most 55° to either side.
-//! Positions are computed, not stored: a table of them would be larger than the photo.
+//! The pinhole keeps the focal lengths and the pixel grid of the photo, so that pixels near the principal point hardly change.
+//! Its image is the largest rectangle around the principal point without a pixel outside the photo; for a fisheye, which may
+//! see more than a half space, at most 55° to either side. Source positions are computed per pixel: a table of them would be
+//! larger than the photo.
 
 use glam::{DMat2, DVec2};
 use scene::{CameraModel, Pinhole};
 
-/// The ideal pinhole grows to at most this many times the photo's sides on either side of the principal point.
-const LARGEST: f64 = 2.0;
-/// A rectangle whose shorter side is less than this share of the photo's is no photo any more.
-const SMALLEST: f64 = 0.25;
-/// Tangent of the half field of view, along each axis, that is kept of a fisheye: beyond 55° a pinhole stretches pixels
-/// to more than three times their width.
-const FISHEYE_REACH: f64 = 1.428;
-/// Largest angle to the axis, radians, that is looked for in a fisheye: the ideal plane ends at a right angle.
-const FISHEYE_ANGLE: f64 = 1.55;
-/// Points on each edge of the photo that are followed to the ideal plane; edges bend smoothly.
+/// The ideal image extends at most this many times as far from the principal point as the photo, on each side.
+const MAX_GROWTH: f64 = 2.0;
+/// A lens that leaves less than this share of the photo's width or height is refused.
+const MIN_SHARE: f64 = 0.25;
+/// Tangent of the half field of view kept of a fisheye along each axis. Beyond 55° a pinhole stretches pixels to more than
+/// three times their width.
+const FISHEYE_MAX_TANGENT: f64 = 1.428;
+/// Largest angle to the axis, radians, that the fisheye inversion searches: the ideal plane ends at a right angle.
+const FISHEYE_MAX_ANGLE: f64 = 1.55;
+/// Points on each edge of the photo that are undistorted to find its extent on the ideal plane.
 const EDGE_SAMPLES: u32 = 200;
 
-/// The ideal pinhole camera of a lens: the very same intrinsics where the lens is not distorted. `None` where focal
-/// lengths are not positive, the principal point of a distorted lens lies outside the photo, or its distortion folds
-/// over inside.
+/// The ideal pinhole camera of a lens; the same intrinsics if the lens has no distortion. `None` if a focal length is not
+/// positive, the principal point of a distorted lens lies outside the photo, or its distortion folds over inside.
 pub fn ideal_pinhole(model: &CameraModel, width: u32, height: u32) -> Option<Pinhole> {
     Undistorter::new(model, width, height).map(|undistorter| undistorter.pinhole)
 }
 
-/// The point of the ideal image plane (`x/z, y/z`) that a lens sends to `distorted`; `None` where none is found, or
-/// only one beyond the radius at which the model folds over.
+/// Inverse of [`CameraModel::distort`]: the point of the ideal image plane (`x/z, y/z`) that the lens maps to `distorted`. `None`
+/// if none is found, or only one beyond the radius at which the model folds over.
 pub fn undistort(model: &CameraModel, distorted: DVec2) -> Option<DVec2> {
     if !model.is_distorted() {
         return Some(distorted);
@@ -36,7 +35,7 @@ pub fn undistort(model: &CameraModel, distorted: DVec2) -> Option<DVec2> {
     if let CameraModel::OpenCvFisheye([.., k1, k2, k3, k4]) = *model {
         return undistort_fisheye([k1, k2, k3, k4], distorted).filter(|&ideal| !folds(model, ideal));
     }
-    // Newton's method, damped: a step that does not bring the point nearer is halved.
+    // Damped Newton: a step that does not reduce the error is halved.
     let mut ideal = distorted;
     let mut error = model.distort(ideal) - distorted;
     for _ in 0..50 {
@@ -58,7 +57,7 @@ pub fn undistort(model: &CameraModel, distorted: DVec2) -> Option<DVec2> {
     (error.length() < 1e-10 * distorted.length().max(1.0) && !folds(model, ideal)).then_some(ideal)
 }
 
-/// By halving the range of angles, as only their polynomial has to be undone.
+/// Inverts the fisheye polynomial of the angle by bisection.
 fn undistort_fisheye([k1, k2, k3, k4]: [f64; 4], distorted: DVec2) -> Option<DVec2> {
     let bent = distorted.length();
     let bend = |a: f64| {
@@ -68,9 +67,9 @@ fn undistort_fisheye([k1, k2, k3, k4]: [f64; 4], distorted: DVec2) -> Option<DVe
     if bent < 1e-12 {
         return Some(distorted);
     }
-    // The first of the angles that reach so far, should the polynomial turn back.
+    // The first angle that reaches the radius, in case the polynomial is not monotonic.
     const STEPS: u32 = 64;
-    let angle = |step: u32| FISHEYE_ANGLE * f64::from(step) / f64::from(STEPS);
+    let angle = |step: u32| FISHEYE_MAX_ANGLE * f64::from(step) / f64::from(STEPS);
     let step = (1..=STEPS).find(|&step| bend(angle(step)) >= bent)?;
     let (mut low, mut high) = (angle(step - 1), angle(step));
     for _ in 0..60 {
@@ -114,14 +113,15 @@ fn jacobian(model: &CameraModel, ideal: DVec2) -> DMat2 {
     )
 }
 
-/// True if the lens turns the image inside out somewhere between the principal point and here.
+/// Whether the distortion folds the image over somewhere between the principal point and `ideal`: the determinant or the trace
+/// of its Jacobian is not positive there.
 fn folds(model: &CameraModel, ideal: DVec2) -> bool {
     const STEPS: u32 = 16;
-    let unfolded = |step| {
+    let is_unfolded = |step| {
         let slope = jacobian(model, ideal * (f64::from(step) / f64::from(STEPS)));
         slope.determinant() > 1e-6 && slope.col(0).x + slope.col(1).y > 0.0
     };
-    !(1..=STEPS).all(unfolded)
+    !(1..=STEPS).all(is_unfolded)
 }
 
 /// Resamples the photos of one lens to its ideal pinhole.
@@ -154,7 +154,7 @@ impl Undistorter {
         self.pinhole
     }
 
-    /// True where the result would equal the photo.
+    /// Whether the lens has no distortion, so that the result equals the photo.
     pub fn is_identity(&self) -> bool {
         !self.model.is_distorted()
     }
@@ -191,8 +191,8 @@ impl Undistorter {
         self.pinhole.width as usize * self.pinhole.height as usize
     }
 
-    /// For each pixel of the result, by rows: where its centre lies in the photo, counted in pixels from the centre of
-    /// the first, within `0 ..= width - 1` and `0 ..= height - 1`.
+    /// Calls `each` for each pixel of the result, by rows, with the position of its centre in the photo, in pixels from the centre
+    /// of the first pixel, clamped to `0 ..= width - 1` and `0 ..= height - 1`.
     fn for_each_source(&self, mut each: impl FnMut(f64, f64)) {
         let last = DVec2::new(f64::from(self.width - 1), f64::from(self.height - 1));
         for y in 0..self.pinhole.height {
@@ -204,7 +204,7 @@ impl Undistorter {
         }
     }
 
-    /// Where in the photo a place of the ideal image comes from, both in pixels.
+    /// The position in the photo of a position in the ideal image, both in pixels.
     fn source(&self, ideal: DVec2) -> DVec2 {
         let [fx, fy, cx, cy] = self.model.focal_and_centre();
         let k = &self.pinhole;
@@ -219,10 +219,10 @@ impl Undistorter {
         if !(1.0..w - 1.0).contains(&cx) || !(1.0..h - 1.0).contains(&cy) {
             return None;
         }
-        // How far the photo reaches to the left, right, top and bottom of the principal point, on the ideal plane.
-        let mut reach = [LARGEST * cx, LARGEST * (w - cx), LARGEST * cy, LARGEST * (h - cy)];
+        // Extent of the photo to the left, right, top and bottom of the principal point on the ideal plane, pixels.
+        let mut reach = [MAX_GROWTH * cx, MAX_GROWTH * (w - cx), MAX_GROWTH * cy, MAX_GROWTH * (h - cy)];
         if self.model.is_fisheye() {
-            let [x, y] = [FISHEYE_REACH * fx, FISHEYE_REACH * fy];
+            let [x, y] = [FISHEYE_MAX_TANGENT * fx, FISHEYE_MAX_TANGENT * fy];
             reach.iter_mut().zip([x, x, y, y]).for_each(|(reach, most)| *reach = reach.min(most));
         }
         let mut limit = |x: f64, y: f64, side: usize| {
@@ -239,15 +239,15 @@ impl Undistorter {
             limit(x, 0.5, 2);
             limit(x, h - 0.5, 3);
         }
-        // Between the samples, and with lenses that fold over near the corners, pixels may still lie outside.
+        // Pixels may still lie outside, between the samples or where the lens folds over near the corners.
         let mut shrink = 0.5;
         for _ in 0..60 {
             let [left, right, top, bottom] = reach;
-            // The first and last pixel centres that lie within reach, counted on the photo's grid.
+            // The first and last pixel centres within reach, on the photo's grid.
             let (x0, x1) = ((cx - left - 0.5).ceil(), (cx + right - 0.5).floor());
             let (y0, y1) = ((cy - top - 0.5).ceil(), (cy + bottom - 0.5).floor());
             let (wide, high) = (x1 - x0 + 1.0, y1 - y0 + 1.0);
-            if wide < (SMALLEST * w).max(1.0) || high < (SMALLEST * h).max(1.0) {
+            if wide < (MIN_SHARE * w).max(1.0) || high < (MIN_SHARE * h).max(1.0) {
                 break;
             }
             let pinhole = Pinhole { width: wide as u32, height: high as u32, fx, fy, cx: cx - x0, cy: cy - y0 };
@@ -260,7 +260,7 @@ impl Undistorter {
         None
     }
 
-    /// True if every pixel on the border of the ideal image comes from inside the photo, without a fold on the way.
+    /// Whether every pixel on the border of the ideal image comes from inside the photo, without a fold on the way.
     fn is_inside(&self) -> bool {
         let Pinhole { width, height, fx, fy, cx, cy } = self.pinhole;
         let inside = |x: u32, y: u32| {

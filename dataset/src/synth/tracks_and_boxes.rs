@@ -1,5 +1,5 @@
-//! What moves and what photos show of things that are counted: `tracks.json` and `boxes3d.json`. Both have a line for each
-//! entry, so that they can be read piece by piece.
+//! Writes `tracks.json`, the trajectories of moving actors, and `boxes3d.json`, the objects visible in each photo. Both have one
+//! line per entry, so that they can be read incrementally.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -12,10 +12,10 @@ use scene::Rigid;
 use serde_json::{Value, json};
 use store::file::{SaveError, save};
 
-/// Poses of a track are of the time in which photos are taken, and of so many seconds before and after.
+/// Tracks cover the time of the photos and this many seconds before and after.
 const MARGIN_SECONDS: f64 = 2.0;
 
-/// The classes that have boxes.
+/// The classes with boxes.
 const BOXED: [Class; 9] = [
     Class::TrafficLight,
     Class::TrafficSign,
@@ -28,18 +28,18 @@ const BOXED: [Class; 9] = [
     Class::Bicycle,
 ];
 
-/// Writes the tracks of everything that moves.
-pub(super) fn tracks(out: &Path, city: &City, shots: &[Shot]) -> Result<(), SaveError> {
+/// Writes the tracks of all moving actors.
+pub(super) fn write_tracks(out: &Path, city: &City, shots: &[Shot]) -> Result<(), SaveError> {
     let seconds = |start: f64, pick: fn(f64, f64) -> f64| shots.iter().map(|shot| shot.seconds).fold(start, pick);
     let (from, to) = (seconds(f64::INFINITY, f64::min), seconds(f64::NEG_INFINITY, f64::max));
     let track = |actor: &Actor| {
         let path = &actor.trajectory.as_ref()?.waypoints;
-        // one pose before and one after what is wanted, so that it can be interpolated
+        // One more pose on each side, for interpolation.
         let first = path.partition_point(|w| w.seconds < from - MARGIN_SECONDS).saturating_sub(1);
         let last = (path.partition_point(|w| w.seconds <= to + MARGIN_SECONDS) + 1).min(path.len());
         let poses = path.get(first..last)?.iter().map(|w| {
             let Rigid { rotation: q, translation: t } = w.world_from_asset;
-            json!([round(w.seconds, 1e3), metres(t), turn(q)])
+            json!([round(w.seconds, 1e3), metres(t), quaternion(q)])
         });
         let (low, high) = bounds(city, actor.asset)?;
         Some(json!({
@@ -54,33 +54,33 @@ pub(super) fn tracks(out: &Path, city: &City, shots: &[Shot]) -> Result<(), Save
     let lines = city.actors.iter().filter_map(track).map(|value| value.to_string());
     let about = "poses: [seconds, [x, y, z], quaternion [x, y, z, w]], world_from_object, straight and by slerp between \
                  them; low, high: the object's corners in its own axes (x ahead, y left, z up), metres";
-    save(&out.join("tracks.json"), listed("tracks", about, lines).as_bytes())
+    save(&out.join("tracks.json"), json_lines("tracks", about, lines).as_bytes())
 }
 
-/// Writes the boxes, of which [`Instances::boxes`] made a line for each shot.
-pub(super) fn boxes(out: &Path, lines: &[String]) -> Result<(), SaveError> {
+/// Writes the lines made by [`Instances::boxes`], one per shot.
+pub(super) fn write_boxes(out: &Path, lines: &[String]) -> Result<(), SaveError> {
     let about = "centre, size and rotation (quaternion [x, y, z, w]) of world_from_box, metres; x ahead, y left, z up; \
                  velocity in the world, m/s; pixels: how many show it; box2d: [left, top, right, bottom] of those";
-    save(&out.join("boxes3d.json"), listed("images", about, lines.iter().cloned()).as_bytes())
+    save(&out.join("boxes3d.json"), json_lines("images", about, lines.iter().cloned()).as_bytes())
 }
 
-/// An object with a word about it and a list, a line for each entry.
-fn listed(name: &str, about: &str, lines: impl Iterator<Item = String>) -> String {
+/// A JSON object with a description and a list, one line per entry.
+fn json_lines(name: &str, about: &str, lines: impl Iterator<Item = String>) -> String {
     let lines: Vec<String> = lines.collect();
     format!("{{\"about\": {}, \"{name}\": [\n{}\n]}}\n", json!(about), lines.join(",\n"))
 }
 
-/// The city's things by their instance.
+/// The city's actors with boxes, by instance.
 pub(super) struct Instances<'a> {
     city: &'a City,
     actors: BTreeMap<u32, &'a Actor>,
 }
 
-/// What a photo shows of a thing.
-struct Shown {
-    pixels: u32,
-    /// Left, top, right and bottom; the last two are one beyond.
-    around: [u32; 4],
+/// The visible pixels of an actor in a photo.
+struct VisiblePixels {
+    count: u32,
+    /// Left, top, right and bottom; the last two exclusive.
+    bounds: [u32; 4],
 }
 
 impl<'a> Instances<'a> {
@@ -89,21 +89,22 @@ impl<'a> Instances<'a> {
         Self { city, actors: boxed.map(|actor| (actor.instance, actor)).collect() }
     }
 
-    /// A line about what the photo shows, by instance.
+    /// The boxes of the objects visible in a photo, as a line of `boxes3d.json`.
     pub(super) fn boxes(&self, shot: &Shot, frame: &Frame) -> String {
-        let mut shown: BTreeMap<u32, Shown> = BTreeMap::new();
+        let mut visible: BTreeMap<u32, VisiblePixels> = BTreeMap::new();
         for (i, instance) in (0..).zip(&frame.first.instance).filter(|(_, instance)| **instance > 0) {
             let (x, y) = (i % frame.width, i / frame.width);
-            let thing = shown.entry(*instance).or_insert(Shown { pixels: 0, around: [x, y, x, y] });
-            let [left, top, right, bottom] = thing.around;
-            thing.pixels += 1;
-            thing.around = [left.min(x), top.min(y), right.max(x + 1), bottom.max(y + 1)];
+            let pixels = visible.entry(*instance).or_insert(VisiblePixels { count: 0, bounds: [x, y, x, y] });
+            let [left, top, right, bottom] = pixels.bounds;
+            pixels.count += 1;
+            pixels.bounds = [left.min(x), top.min(y), right.max(x + 1), bottom.max(y + 1)];
         }
-        let boxes: Vec<Value> = shown.iter().filter_map(|(instance, shown)| self.one(shot, *instance, shown)).collect();
+        let boxes: Vec<Value> =
+            visible.iter().filter_map(|(instance, visible)| self.box_of(shot, *instance, visible)).collect();
         json!({ "image": format!("images/{}.png", shot.name), "seconds": shot.seconds, "boxes": boxes }).to_string()
     }
 
-    fn one(&self, shot: &Shot, instance: u32, shown: &Shown) -> Option<Value> {
+    fn box_of(&self, shot: &Shot, instance: u32, visible: &VisiblePixels) -> Option<Value> {
         let actor = self.actors.get(&instance)?;
         let pose = motion::pose_at(actor, shot.seconds);
         let (low, high) = bounds(self.city, motion::asset_at(actor, shot.seconds))?;
@@ -114,15 +115,15 @@ impl<'a> Instances<'a> {
             "moves": actor.trajectory.is_some(),
             "centre": metres(centre),
             "size": metres((high - low).as_dvec3()),
-            "rotation": turn(pose.rotation),
+            "rotation": quaternion(pose.rotation),
             "velocity": metres(motion::velocity_at(actor, shot.seconds, centre)),
-            "pixels": shown.pixels,
-            "box2d": shown.around,
+            "pixels": visible.count,
+            "box2d": visible.bounds,
         }))
     }
 }
 
-/// Lowest and highest corner of an asset, in its own axes.
+/// Bounding box of an asset in its own axes.
 fn bounds(city: &City, asset: u32) -> Option<(Vec3, Vec3)> {
     let positions = &city.assets.get(asset as usize)?.mesh.positions;
     let first = *positions.first()?;
@@ -133,7 +134,7 @@ fn metres(v: DVec3) -> [f64; 3] {
     v.to_array().map(|c| round(c, 1e3))
 }
 
-fn turn(q: DQuat) -> [f64; 4] {
+fn quaternion(q: DQuat) -> [f64; 4] {
     [q.x, q.y, q.z, q.w].map(|c| round(c, 1e6))
 }
 

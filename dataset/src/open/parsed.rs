@@ -1,0 +1,63 @@
+//! A capture as its files describe it, common to all formats.
+
+use std::collections::BTreeMap;
+
+use scene::transforms::Intrinsics;
+use scene::{GeoOrigin, Rigid, SparsePoints};
+
+/// How to open a capture.
+#[derive(Debug, Clone, Default)]
+pub struct OpenOptions {
+    /// Folder of the photos, relative to the capture. `None` searches the usual ones.
+    pub images: Option<String>,
+    /// Reads cameras only: photos and points may be missing.
+    pub cameras_only: bool,
+}
+
+/// A capture as parsed from its files, before its photos are found.
+pub(super) struct ParsedCapture {
+    pub(super) format: &'static str,
+    pub(super) images: Vec<PosedImage>,
+    pub(super) points: RawPoints,
+    pub(super) origin: Option<GeoOrigin>,
+    /// Names of images that are not used, with the reason.
+    pub(super) left_out: Vec<(String, String)>,
+}
+
+/// An image of the capture with its lens and pose.
+pub(super) struct PosedImage {
+    pub(super) id: u32,
+    pub(super) name: String,
+    /// Path of the image file, relative to the capture.
+    pub(super) file: String,
+    /// Path of its mask, relative to the capture, if the capture names one.
+    pub(super) mask: Option<String>,
+    pub(super) intrinsics: Intrinsics,
+    pub(super) camera_from_world: Rigid,
+}
+
+/// Sparse points whose tracks hold ids of [`PosedImage`]s instead of indices of views.
+#[derive(Default)]
+pub(super) struct RawPoints(pub(super) SparsePoints);
+
+impl RawPoints {
+    /// Converts tracks of image ids to sorted tracks of view indices. `ids` are those of the views, in order; other images are
+    /// dropped from the tracks.
+    pub(super) fn with_view_indices(self, ids: impl Iterator<Item = u32>) -> SparsePoints {
+        let index: BTreeMap<u32, u32> = ids.zip(0..).collect();
+        let mut points = SparsePoints { track_start: vec![0], seen_by: Vec::new(), ..self.0 };
+        let tracks = SparsePoints { track_start: self.0.track_start, seen_by: self.0.seen_by, ..Default::default() };
+        for i in 0..points.len() {
+            let ids = tracks.track(i).unwrap_or_default();
+            let mut track: Vec<u32> = ids.iter().filter_map(|id| index.get(id).copied()).collect();
+            track.sort_unstable();
+            track.dedup();
+            points.seen_by.extend(track);
+            points.track_start.push(points.seen_by.len() as u32);
+        }
+        if points.seen_by.is_empty() {
+            points.track_start.clear();
+        }
+        points
+    }
+}

@@ -1,0 +1,156 @@
+//! Settings, results and errors of a synthetic capture.
+
+use city::CitySettings;
+use city::faults::Fault;
+use city::occupancy::Grid;
+use glam::{DQuat, DVec3};
+use scene::{BadInput, Rigid};
+use serde::Serialize;
+use store::file::SaveError;
+
+/// Subject of errors about settings.
+pub(super) const SUBJECT: &str = "the synthetic capture";
+
+/// Settings of a synthetic capture. Equal settings give equal bytes.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Settings {
+    /// The city.
+    pub city: CitySettings,
+    /// Number of photos, 1 to 50,000, before faults remove some.
+    pub views: u32,
+    /// Photo width, pixels: 16 to 8,192.
+    pub width: u32,
+    /// Photo height, pixels: 16 to 8,192.
+    pub height: u32,
+    /// Share of aerial photos, 0 to 1: nadir and four oblique directions.
+    pub aerial: f64,
+    /// Share of photos from fixed cameras on posts, ten each: 0 to 1 - `aerial`. The rest are taken from cars.
+    pub fixed: f64,
+    /// Faults to apply.
+    pub faults: Vec<Fault>,
+    /// Whether to write depths, normals and labels of every photo.
+    pub truth: bool,
+    /// Whether cars carry a lidar.
+    pub lidar: bool,
+    /// Whether cars carry a radar.
+    pub radar: bool,
+    /// Whether to write the city's mesh.
+    pub mesh: bool,
+    /// Voxel size of the occupancy grids, metres, 0.05 to 10. `None` writes no grids.
+    pub occupancy: Option<f64>,
+    /// Regions of the occupancy grids, 1,000 at most. Empty covers the whole city.
+    pub around: Vec<VoxelRegion>,
+}
+
+impl Default for Settings {
+    fn default() -> Self {
+        Self {
+            city: CitySettings::default(),
+            views: 200,
+            width: 480,
+            height: 270,
+            aerial: 0.5,
+            fixed: 0.0,
+            faults: Vec::new(),
+            truth: false,
+            lidar: false,
+            radar: false,
+            mesh: false,
+            occupancy: None,
+            around: Vec::new(),
+        }
+    }
+}
+
+impl Settings {
+    /// Checks all ranges.
+    ///
+    /// # Errors
+    /// The first setting out of range, in one line.
+    pub fn check(&self) -> Result<(), BadInput> {
+        self.city.check()?;
+        let refuse = |what: &str, range: &str| Err(BadInput::new(SUBJECT, format!("{what} is out of range"), range));
+        match self {
+            s if !(1..=50_000).contains(&s.views) => refuse("the number of views", "choose 1 to 50,000"),
+            s if !(16..=8192).contains(&s.width) => refuse("the photo width", "choose 16 to 8,192 pixels"),
+            s if !(16..=8192).contains(&s.height) => refuse("the photo height", "choose 16 to 8,192 pixels"),
+            s if !(0.0..=1.0).contains(&s.aerial) => refuse("the share of aerial photos", "choose 0 to 1"),
+            s if !(0.0..=1.0).contains(&s.fixed) => refuse("the share of fixed cameras", "choose 0 to 1"),
+            s if s.aerial + s.fixed > 1.0 => refuse("the sum of both shares", "choose shares that sum to at most 1"),
+            s if s.occupancy.is_some_and(|voxel| !(0.05..=10.0).contains(&voxel)) => {
+                refuse("the side of a voxel", "choose 0.05 to 10 metres")
+            }
+            s if s.around.len() > 1000 => refuse("the number of places to fill with voxels", "choose 1,000 at most"),
+            s if s.faults.iter().any(|f| !f.is_valid()) => refuse("the strength of a fault", "choose 0 to 1"),
+            s => s
+                .occupancy
+                .map_or(Ok(()), |voxel| s.around.iter().try_for_each(|region| region.grid(voxel).map(|_| ()))),
+        }
+    }
+}
+
+/// A cube of which voxels are written.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct VoxelRegion {
+    /// Centre, world metres.
+    pub place: DVec3,
+    /// Half of the cube's side, metres.
+    pub radius: f64,
+    /// Direction of the cube's x axis, degrees from east towards north.
+    pub heading_degrees: f64,
+    /// City time, which determines the poses of moving actors.
+    pub seconds: f64,
+}
+
+impl VoxelRegion {
+    /// The grid of the cube in the cube's axes.
+    ///
+    /// # Errors
+    /// A value out of range, or more voxels than a grid may have.
+    pub(super) fn grid(&self, voxel: f64) -> Result<Grid, BadInput> {
+        let refuse = |problem: String| BadInput::new(SUBJECT, problem, "choose another place, radius or voxel");
+        if !(self.radius > 0.0 && self.heading_degrees.is_finite() && self.seconds.abs() <= 1e9) {
+            return Err(refuse("a place to fill with voxels is out of range".into()));
+        }
+        let rotation = DQuat::from_rotation_z(self.heading_degrees.to_radians());
+        let half = DVec3::splat(self.radius);
+        Grid::new(Rigid { rotation, translation: self.place }, -half, half, voxel)
+            .map_err(|e| refuse(format!("voxels around a place: {e}")))
+    }
+}
+
+/// Contents of a written capture.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Summary {
+    /// Number of photos.
+    pub views: usize,
+    /// Number of sparse points.
+    pub points: usize,
+    /// Mean number of views per point.
+    pub mean_track: f64,
+    /// Actors: objects that stand, lie or move in the city.
+    pub actors: usize,
+    /// Moving actors.
+    pub moving: usize,
+    /// Triangles of the city; those of shared assets count once per actor.
+    pub triangles: usize,
+}
+
+/// A synthetic capture that could not be written.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum SynthError {
+    /// A setting is out of range, or the folder holds something else.
+    #[error(transparent)]
+    BadInput(#[from] BadInput),
+    /// A file or folder could not be written.
+    #[error(transparent)]
+    Save(#[from] SaveError),
+}
+
+/// Called from any thread with the name of a stage, the items done and the items in total.
+pub type Progress<'a> = &'a (dyn Fn(&'static str, usize, usize) + Sync);
+
+/// The error of a sensor or the ray tracer that refuses settings which passed [`Settings::check`].
+pub(super) fn unsupported(error: &dyn std::error::Error) -> BadInput {
+    BadInput::new(SUBJECT, error.to_string(), "change the settings")
+}
