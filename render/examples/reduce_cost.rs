@@ -1,12 +1,13 @@
-//! What a fixed order of the backward's sums costs against float atomics, and what subgroups and half precision save:
+//! Measures the cost of the ordered gradient reduction against float atomics, and the gain of subgroups and half
+//! precision:
 //!
 //! ```sh
 //! cargo run --release -p render --example reduce_cost -- [ROUNDS] [SPLATS]...
 //! ```
-//! Each round times, for every path that the adapter has, both ways from the pixels' gradients to the splats' sums
-//! (`rasterize_backward` and `reduce` in order, `rasterize_backward` alone by atomics) and the whole of a step's drawing and going
-//! back, one after the other, so that whatever else the machine does falls on all. Printed are the shortest wall times and the medians
-//! of the process's CPU times: the first count on a GPU, the others where a CPU plays one on a machine with other work.
+//! Each round times, for every path of the adapter, both reductions (`rasterize_backward` and `reduce`;
+//! `rasterize_backward` with atomics) and a whole forward and backward pass. The runs are interleaved, so that other
+//! load affects all of them alike. The example prints the shortest wall times, which are relevant on a GPU, and the
+//! median CPU times of the process, which are relevant for a software adapter on a busy machine.
 
 use std::error::Error;
 use std::sync::Arc;
@@ -36,46 +37,46 @@ fn main() -> Result<(), Box<dyn Error>> {
     }
     for &count in counts {
         let splats = random_splats(count);
-        let mut sides = gpus.iter().map(|gpu| Timed::new(gpu, &splats)).collect::<Result<Vec<_>, _>>()?;
-        // The first round warms up.
+        let mut timed = gpus.iter().map(|gpu| Timed::new(gpu, &splats)).collect::<Result<Vec<_>, _>>()?;
+        // Round 0 warms up.
         for round in 0..=rounds {
-            for side in &mut sides {
-                side.round(round > 0)?;
+            for path in &mut timed {
+                path.round(round > 0)?;
             }
         }
-        for side in &mut sides {
-            for (clock, [step, ordered, atomic]) in [("wall", side.wall_millis()), ("CPU", side.cpu_millis())] {
+        for path in &mut timed {
+            for (clock, [step, ordered, atomic]) in [("wall", path.wall_millis()), ("CPU", path.cpu_millis())] {
                 println!(
-                    "{count} splats, {WIDTH}×{HEIGHT}, {}, {rounds} rounds: {clock} forward and backward {step:.2} ms, sums in order \
-                     {ordered:.2} ms, by atomics {atomic:.2} ms: order takes {:.3} of atomics",
-                    side.gpu.name(),
+                    "{count} splats, {WIDTH}×{HEIGHT}, {}, {rounds} rounds: {clock} forward and backward {step:.2} ms, ordered sums \
+                     {ordered:.2} ms, atomic sums {atomic:.2} ms, ratio {:.3}",
+                    path.gpu.name(),
                     ordered / atomic,
                 );
             }
         }
-        let (usual, others) = sides.split_at_mut(1);
+        let (baseline, others) = timed.split_at_mut(1);
         for other in others {
-            let [name, usual_name] = [other.gpu.name(), usual[0].gpu.name()];
+            let [name, baseline_name] = [other.gpu.name(), baseline[0].gpu.name()];
             let compare = |clock: &str, [a_step, a, _]: [f64; 3], [b_step, b, _]: [f64; 3]| {
                 println!(
-                    "{count} splats, {clock}: {name} takes {:.3} of the sums of {usual_name}, {:.3} of the whole",
+                    "{count} splats, {clock}: {name} takes {:.3} of the time of {baseline_name} for the sums, {:.3} for the whole pass",
                     a / b,
                     a_step / b_step
                 );
             };
-            compare("wall", other.wall_millis(), usual[0].wall_millis());
-            compare("CPU", other.cpu_millis(), usual[0].cpu_millis());
+            compare("wall", other.wall_millis(), baseline[0].wall_millis());
+            compare("CPU", other.cpu_millis(), baseline[0].cpu_millis());
         }
     }
     Ok(())
 }
 
-/// A renderer on one path and what it took.
+/// A renderer on one path and its times.
 struct Timed {
     gpu: Arc<Gpu>,
     renderer: GpuRenderer,
     splats: GpuSplats,
-    /// Wall and CPU times of the whole, of sums in order and by atomics.
+    /// Wall and CPU times of the whole pass, of the ordered sums and of the atomic sums.
     millis: [Vec<[f64; 2]>; 3],
 }
 
@@ -88,7 +89,7 @@ impl Timed {
         Ok(Self { gpu: Arc::clone(gpu), renderer, splats, millis: Default::default() })
     }
 
-    fn round(&mut self, counts: bool) -> Result<(), GpuError> {
+    fn round(&mut self, is_recorded: bool) -> Result<(), GpuError> {
         let Self { gpu, renderer, splats, millis } = self;
         let planes = UpstreamPlanes::default();
         let mut time = |which: usize, encode: &mut dyn FnMut(&mut wgpu::CommandEncoder) -> Result<(), GpuError>| {
@@ -98,7 +99,7 @@ impl Timed {
             let (start, cpu) = (Instant::now(), cpu_millis());
             gpu.submit(encoder)?;
             gpu.wait()?;
-            if counts {
+            if is_recorded {
                 millis[which].push([1e3 * start.elapsed().as_secs_f64(), cpu_millis() - cpu]);
             }
             Ok::<(), GpuError>(())
@@ -132,14 +133,14 @@ fn cpu_millis() -> f64 {
     1e3 * time.tv_sec as f64 + 1e-6 * time.tv_nsec as f64
 }
 
-/// A camera that sees the box.
+/// A camera that sees the whole box.
 fn camera() -> Camera {
     let pinhole = Pinhole { width: WIDTH, height: HEIGHT, fx: 480.0, fy: 480.0, cx: 240.0, cy: 135.0 };
     let camera_from_world = Rigid { rotation: DQuat::IDENTITY, translation: DVec3::new(0.0, 0.0, 8.0) };
     Camera { pinhole, camera_from_world }
 }
 
-/// Random splats in a box before the camera, of sizes that cover it a few times, as those of `plat bench kernels`.
+/// Random splats in a box in front of the camera, as in `plat bench kernels`; their sizes cover the image a few times.
 fn random_splats(count: usize) -> Splats {
     let mut splats = Splats::new(3);
     let mut state = 1u64;

@@ -1,14 +1,16 @@
-//! The differentiable 3D Gaussian splat renderer: colour, depth and transmittance of a view, and the gradient of every parameter.
+//! The differentiable 3D Gaussian splat renderer: colour, depth and transmittance of a view, and the gradient of every
+//! parameter.
 //!
-//! [`cpu`] (SIMD and rayon) and `gpu` (feature `gpu`, wgpu) are independent backends with the same stages: project, sort, bin, rasterize,
-//! rasterize_backward, reduce, project_backward. [`ForwardIntermediates`] and [`BackwardIntermediates`] compare them stage by stage.
+//! [`cpu`] (SIMD and rayon) and `gpu` (feature `gpu`, wgpu) are independent backends with the same stages: project,
+//! sort, bin, rasterize, rasterize_backward, reduce, project_backward. [`ForwardIntermediates`] and
+//! [`BackwardIntermediates`] compare them stage by stage.
 //!
-//! Conventions are gsplat's (DESIGN section 4): EWA projection with 0.3 px² added to the 2D covariance, pixel centres at
-//! `+½`, `α = min(0.999, o·exp(-½ dᵀΣ'⁻¹d))`, skipped under 1/255, front to back until `T·(1-α) ≤ 1e-4`,
-//! colour `max(SH + ½, 0)`, background blended with the remaining transmittance.
+//! Conventions are gsplat's (DESIGN section 4): EWA projection with 0.3 px² added to the 2D covariance, pixel centres
+//! at `+½`, `α = min(0.999, o·exp(-½ dᵀΣ'⁻¹d))`, skipped under 1/255, front to back until `T·(1-α) ≤ 1e-4`, colour
+//! `max(SH + ½, 0)`, background blended with the remaining transmittance.
 //!
-//! Architecture invariant: no files, no network, no clock. Results are bit-identical for the same input and instruction set, whatever the
-//! number of threads.
+//! Architecture invariant: no files, no network, no clock. Results are bit-identical for the same input and instruction
+//! set, whatever the number of threads.
 
 pub mod cpu;
 #[cfg(feature = "gpu")]
@@ -28,8 +30,8 @@ pub const TRANSMITTANCE_MIN: f32 = 1e-4;
 /// Rendering options.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Options {
-    /// Compensates opacity for the low-pass filter (Mip-Splatting's 2D filter, Yu et al. 2024), so that a splat smaller than a pixel
-    /// fades instead of growing. Off: the classic 3DGS rasterizer.
+    /// Compensates opacity for the low-pass filter (Mip-Splatting's 2D filter, Yu et al. 2024), so that a splat smaller
+    /// than a pixel fades instead of growing. Off: the classic 3DGS rasterizer.
     pub antialiased: bool,
     /// SH degree in use; clamped to that of the splats.
     pub sh_degree: u8,
@@ -104,8 +106,8 @@ pub struct BackwardIntermediates {
 /// The gradient of a loss with respect to the trainable splats, and statistics for densification and pruning.
 #[derive(Debug, Clone, Default)]
 pub struct Gradients {
-    /// Columns as in [`scene::Splats`]; zero where a splat is not visible. Columns of coefficients above the SH degree in use are
-    /// not written.
+    /// Columns as in [`scene::Splats`]; zero where a splat is not visible. Columns of coefficients above the SH degree
+    /// in use are not written.
     pub columns: Vec<Vec<f32>>,
     /// Bit `i % 16` of word `i / 16`: splat `i` is visible.
     pub seen: Vec<u16>,
@@ -119,12 +121,14 @@ pub struct Gradients {
     pub pose: [f32; 6],
 }
 
-/// Contribution of each trainable splat to a view; sums over pixels, each times its weight. Zero where a splat is not visible.
+/// Contribution of each trainable splat to a view; sums over pixels, each times its weight. Zero where a splat is not
+/// visible.
 #[derive(Debug, Clone, Default)]
 pub struct Contributions {
     /// Σ αT.
     pub weight: Vec<f32>,
-    /// Σ (dI/dg)² over pixels and channels, with g the splat's Gaussian value before opacity (Speedy-Splat, Hanson et al. 2025).
+    /// Σ (dI/dg)² over pixels and channels, with g the splat's Gaussian value before opacity (Speedy-Splat, Hanson et
+    /// al. 2025).
     pub squared: Vec<f32>,
     /// Σ δ² over pixels and channels, with δ the exact change of the pixel if this splat alone is removed.
     pub energy: Vec<f32>,

@@ -1,4 +1,4 @@
-//! What each splat means to a view, against renders with and without it.
+//! Contributions of splats against renders with and without them.
 
 mod reference;
 
@@ -22,7 +22,7 @@ fn splats(seed: u64, count: usize) -> (Splats, Camera) {
     (splats, camera)
 }
 
-/// What each pixel counts, 0 to 1.
+/// Random pixel weights, 0 to 1.
 fn weights(seed: u64) -> Vec<f32> {
     Random(seed).plane(AREA).iter().map(|value| value.abs().min(1.0)).collect()
 }
@@ -34,44 +34,48 @@ fn contributions(splats: &Splats, context: Option<&Splats>, camera: &Camera, wei
 }
 
 #[test]
-fn energy_is_how_far_the_picture_is_from_that_without_the_splat() {
+fn energy_is_the_squared_error_of_the_frame_without_the_splat() {
     for seed in 1..4 {
         let ((splats, camera), (context, _)) = (self::splats(seed, 40), self::splats(seed + 50, 10));
         let weights = weights(seed);
         let mut renderer = Renderer::default();
         let mut draw = |splats: &Splats| renderer.forward(splats, Some(&context), &camera, &OPTIONS).colour.clone();
         let all = draw(&splats);
-        let said = contributions(&splats, Some(&context), &camera, &weights).energy;
-        assert_eq!(said.len(), splats.len());
-        let mut strong = 0;
+        let computed = contributions(&splats, Some(&context), &camera, &weights).energy;
+        assert_eq!(computed.len(), splats.len());
+        let mut significant = 0;
         for i in 0..splats.len() {
             let pairs = all.iter().zip(draw(&splats.filter(|k| k != i))).enumerate();
             let energy: f64 = pairs.map(|(k, (a, b))| f64::from(weights[k % AREA]) * f64::from(a - b).powi(2)).sum();
-            assert!((energy - f64::from(said[i])).abs() < 1e-4 + 1e-3 * energy, "{seed} {i}: {energy} {}", said[i]);
-            strong += usize::from(energy > 0.1);
+            assert!(
+                (energy - f64::from(computed[i])).abs() < 1e-4 + 1e-3 * energy,
+                "{seed} {i}: {energy} {}",
+                computed[i]
+            );
+            significant += usize::from(energy > 0.1);
         }
-        assert!(strong > 10, "the scene must be able to tell");
+        assert!(significant > 10, "the scene has too few significant splats");
     }
 }
 
 #[test]
-fn weights_add_up_to_what_is_covered() {
+fn weights_sum_to_the_covered_pixels() {
     let ((splats, camera), weights) = (splats(7, 40), weights(7));
-    let said = contributions(&splats, None, &camera, &weights).weight;
+    let computed = contributions(&splats, None, &camera, &weights).weight;
     let mut renderer = Renderer::default();
     let rest = &renderer.forward(&splats, None, &camera, &OPTIONS).transmittance;
     let covered: f64 = rest.iter().zip(&weights).map(|(rest, weight)| f64::from((1.0 - rest) * weight)).sum();
-    let sum: f64 = said.iter().map(|weight| f64::from(*weight)).sum();
+    let sum: f64 = computed.iter().map(|weight| f64::from(*weight)).sum();
     assert!((sum / covered - 1.0).abs() < 1e-4, "{sum} {covered}");
 }
 
 #[test]
-fn squared_is_the_energy_with_the_falloff_taken_out() {
+fn squared_is_energy_without_the_falloff() {
     let ((splats, camera), weights) = (splats(8, 30), weights(8));
     let mut checked = 0;
     for i in 0..splats.len() {
         let one = splats.filter(|k| k == i);
-        let said = contributions(&one, None, &camera, &weights);
+        let computed = contributions(&one, None, &camera, &weights);
         let mut renderer = Renderer::default();
         let rest = &renderer.forward(&one, None, &camera, &OPTIONS).transmittance;
         let drawn = || rest.iter().zip(&weights).filter(|(rest, _)| **rest < 1.0);
@@ -81,15 +85,19 @@ fn squared_is_the_energy_with_the_falloff_taken_out() {
             continue;
         }
         let opacity = 1.0 / (1.0 + (-f64::from(one.col(column::OPACITY)[0])).exp());
-        let expected = f64::from(said.energy[0]) / alphas * opacity * opacity * counted;
-        assert!((f64::from(said.squared[0]) / expected - 1.0).abs() < 1e-3, "{i}: {} {expected}", said.squared[0]);
+        let expected = f64::from(computed.energy[0]) / alphas * opacity * opacity * counted;
+        assert!(
+            (f64::from(computed.squared[0]) / expected - 1.0).abs() < 1e-3,
+            "{i}: {} {expected}",
+            computed.squared[0]
+        );
         checked += 1;
     }
     assert!(checked > 10);
 }
 
 #[test]
-fn threads_do_not_change_a_bit_and_an_earlier_view_leaves_nothing() {
+fn contributions_do_not_depend_on_threads_or_on_earlier_views() {
     let (splats, camera) = splats(9, 200);
     let run = |threads: usize| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();

@@ -1,4 +1,4 @@
-//! The same bits whatever the number of threads.
+//! Bit-identical results for every number of threads.
 
 mod reference;
 
@@ -29,7 +29,7 @@ fn bits(isa: Isa, threads: usize, antialiased: bool) -> Vec<u32> {
     pool.install(|| {
         let mut renderer = Renderer::new(isa);
         let mut all = Vec::new();
-        // Twice: a renderer that has been used gives the same again.
+        // Twice, to cover reused buffers.
         for _ in 0..2 {
             let frame = renderer.forward(&splats, Some(&context), &camera, &options);
             for plane in [&frame.colour, &frame.transmittance, &frame.depth, &frame.trainable_alpha] {
@@ -54,9 +54,9 @@ fn one_two_and_five_threads_give_the_same_bits() {
     for isa in Isa::available() {
         for antialiased in [false, true] {
             let one = bits(isa, 1, antialiased);
-            assert!(one.iter().filter(|&&v| v != 0).count() > one.len() / 2, "mostly zeros compare nothing");
+            assert!(one.iter().filter(|&&v| v != 0).count() > one.len() / 2, "most values are zero");
             for threads in [2, 5] {
-                // Not assert_eq: a million numbers help nobody.
+                // Not assert_eq, which would print a million numbers.
                 assert!(one == bits(isa, threads, antialiased), "{} with {threads} threads differs", isa.name());
             }
         }

@@ -11,10 +11,10 @@ use scene::{Camera, Splats, column};
 
 /// Half the distance of a central difference; parameters are of order one.
 const STEP: f64 = 1e-6;
-/// No pixel may come nearer to a cut, in relative terms: a step moves α by about 1e-5, f32 errs by less.
-const CLEAR: f64 = 1e-4;
+/// Smallest relative distance to a threshold: a step changes α by about 1e-5, and f32 errors are smaller.
+const MIN_MARGIN: f64 = 1e-4;
 
-/// A scene that is smooth within a step of where it stands.
+/// A scene whose loss is smooth within the step of a central difference.
 struct Smooth {
     splats: Splats,
     context: Option<Splats>,
@@ -24,14 +24,14 @@ struct Smooth {
     scene: Scene,
 }
 
-/// The first seed's scene in which nothing is near a decision.
+/// The scene of the first seed without a pixel near a threshold.
 fn smooth(fill: impl Fn(&mut Random, &Camera) -> (Splats, Option<Splats>), options: Options) -> Smooth {
     let camera = camera(37, 26, 40.0);
     for seed in 1..1000 {
         let mut random = Random(seed);
         let (splats, context) = fill(&mut random, &camera);
         let scene = Scene::new(&splats, context.as_ref(), &camera, &options);
-        if scene.render().nearest() > CLEAR {
+        if scene.render().nearest() > MIN_MARGIN {
             let area = 37 * 26;
             let upstream = Upstream {
                 colour: random.plane(3 * area),
@@ -73,33 +73,33 @@ fn losses(image: &Image, upstream: &Upstream) -> Vec<f64> {
         .collect()
 }
 
-/// dL/dx per pixel, when `put(scene, x)` moves x.
-fn slopes(scene: &Scene, upstream: &Upstream, put: &dyn Fn(&mut Scene, f64)) -> Vec<f64> {
+/// dL/dx per pixel, by central differences; `add(scene, x)` adds x to the parameter.
+fn slopes(scene: &Scene, upstream: &Upstream, add: &dyn Fn(&mut Scene, f64)) -> Vec<f64> {
     let at = |x: f64| {
         let mut moved = scene.clone();
-        put(&mut moved, x);
+        add(&mut moved, x);
         losses(&moved.render(), upstream)
     };
     at(STEP).iter().zip(at(-STEP)).map(|(up, down)| (up - down) / (2.0 * STEP)).collect()
 }
 
-fn slope(scene: &Scene, upstream: &Upstream, put: &dyn Fn(&mut Scene, f64)) -> f64 {
-    slopes(scene, upstream, put).iter().sum()
+fn slope(scene: &Scene, upstream: &Upstream, add: &dyn Fn(&mut Scene, f64)) -> f64 {
+    slopes(scene, upstream, add).iter().sum()
 }
 
-/// `ours` is `truth` but for rounding: direction, length, and every element.
-fn assert_agrees(what: &str, ours: &[f32], truth: &[f64], tolerance: f64) {
-    assert_eq!(ours.len(), truth.len(), "{what}");
+/// Asserts that `ours` equals `expected` up to rounding, in direction, norm and every element.
+fn assert_agrees(what: &str, ours: &[f32], expected: &[f64], tolerance: f64) {
+    assert_eq!(ours.len(), expected.len(), "{what}");
     let norm = |v: &mut dyn Iterator<Item = f64>| v.map(|v| v * v).sum::<f64>().sqrt();
-    let length = norm(&mut truth.iter().copied());
-    let error = norm(&mut ours.iter().zip(truth).map(|(&a, b)| f64::from(a) - b));
-    let dot: f64 = ours.iter().zip(truth).map(|(&a, b)| f64::from(a) * b).sum();
+    let length = norm(&mut expected.iter().copied());
+    let error = norm(&mut ours.iter().zip(expected).map(|(&a, b)| f64::from(a) - b));
+    let dot: f64 = ours.iter().zip(expected).map(|(&a, b)| f64::from(a) * b).sum();
     let cosine = dot / (length * norm(&mut ours.iter().map(|&a| f64::from(a))));
     println!("{what}: relative error {:.2e}, cosine {cosine:.9}", error / length);
     assert!(length > 0.0, "{what}: nothing to compare");
     assert!(cosine > 0.9999 && error / length < tolerance, "{what}: relative error {}", error / length);
-    let largest = truth.iter().fold(0.0, |m: f64, v| m.max(v.abs()));
-    for (i, (&a, b)) in ours.iter().zip(truth).enumerate() {
+    let largest = expected.iter().fold(0.0, |m: f64, v| m.max(v.abs()));
+    for (i, (&a, b)) in ours.iter().zip(expected).enumerate() {
         assert!((f64::from(a) - b).abs() < 2.0 * tolerance * largest, "{what}, element {i}: {a} against {b}");
     }
 }
@@ -123,7 +123,9 @@ fn classes(sh_degree: u8) -> Vec<(&'static str, usize, usize)> {
 /// Central differences of every column in use, for the trainable splats.
 fn column_slopes(scene: &Scene, upstream: &Upstream) -> Vec<Vec<f64>> {
     let used = column::SH + 3 * sh_coefficients(scene.options.sh_degree);
-    (0..used).map(|k| (0..scene.trainable).map(|i| slope(scene, upstream, &|s, x| s.columns[k][i] += x)).collect()).collect()
+    (0..used)
+        .map(|k| (0..scene.trainable).map(|i| slope(scene, upstream, &|s, x| s.columns[k][i] += x)).collect())
+        .collect()
 }
 
 /// Central differences of ξ in `camera_from_world ← exp(ξ)·camera_from_world`, one component at a time.
@@ -159,19 +161,20 @@ fn check(name: &str, s: &Smooth, upstream: &Upstream, tolerance: f64) {
         let (_, gradients) = analytic(isa, s, upstream);
         for (class, from, to) in classes(s.options.sh_degree) {
             let what = format!("{name} {} {class}", isa.name());
-            let truth = columns[from..to].concat();
-            // A class on which this loss does not depend at all (colour, for a loss of depth) must be zero here too.
-            if truth.iter().all(|t| t.abs() < 1e-7) {
+            let expected = columns[from..to].concat();
+            // If the loss does not depend on a class at all (colour, for a loss of depth), its gradient must be exactly
+            // zero.
+            if expected.iter().all(|t| t.abs() < 1e-7) {
                 assert!(gradients.columns[from..to].iter().flatten().all(|&g| g == 0.0), "{what} should be zero");
             } else {
-                assert_agrees(&what, &gradients.columns[from..to].concat(), &truth, tolerance);
+                assert_agrees(&what, &gradients.columns[from..to].concat(), &expected, tolerance);
             }
         }
         assert_agrees(&format!("{name} {} pose", isa.name()), &gradients.pose, &pose, tolerance);
     }
 }
 
-/// What is measured is 1e-6 to 1e-5.
+/// Measured errors are 1e-6 to 1e-5.
 const TOLERANCE: f64 = 1e-4;
 
 #[test]
@@ -218,7 +221,7 @@ fn an_empty_plane_of_the_upstream_is_zero() {
 }
 
 #[test]
-fn beyond_the_clamps() {
+fn clamped_values() {
     // Opaque stacks (α clamped, early stop), a Jacobian clamped to the cone, colours clamped at zero.
     for antialiased in [false, true] {
         let fill = |random: &mut Random, camera: &Camera| {
@@ -243,7 +246,7 @@ fn beyond_the_clamps() {
         let image = s.scene.render();
         let stopped = image.transmittance.iter().filter(|&&t| t < 2e-3).count();
         assert!(stopped > 20, "the scene must be opaque somewhere, {stopped}");
-        check(&format!("beyond the clamps, antialiased {antialiased}"), &s, &s.upstream, TOLERANCE);
+        check(&format!("clamped values, antialiased {antialiased}"), &s, &s.upstream, TOLERANCE);
     }
 }
 
@@ -285,24 +288,29 @@ fn screen_gradients_and_weights() {
         for isa in Isa::available() {
             let (_, gradients) = analytic(isa, &s, &s.upstream);
             assert_agrees(&format!("{} screen", isa.name()), &gradients.screen_gradient, &screen, TOLERANCE);
-            assert_agrees(&format!("{} screen_abs", isa.name()), &gradients.screen_gradient_abs, &screen_abs, TOLERANCE);
+            assert_agrees(
+                &format!("{} screen_abs", isa.name()),
+                &gradients.screen_gradient_abs,
+                &screen_abs,
+                TOLERANCE,
+            );
             assert_agrees(&format!("{} weight", isa.name()), &gradients.weight, &weight, TOLERANCE);
         }
     }
 }
 
 #[test]
-fn the_comparison_can_fail() {
-    // The gradient of a scene whose splat moved by a twentieth of a pixel is no longer within the tolerance.
+fn the_comparison_detects_a_moved_splat() {
+    // Moving a splat by a twentieth of a pixel must exceed the tolerance.
     let s = smooth(|random, camera| (soft(random, camera, 9, 0), None), options(false, 0));
     let columns = column_slopes(&s.scene, &s.upstream);
     let mut moved = Smooth { splats: s.splats.clone(), context: None, upstream: s.upstream.clone(), ..s };
     moved.splats.columns_mut()[column::MEAN][0] += 0.005;
     let (_, gradients) = analytic(Isa::detect(), &moved, &moved.upstream);
-    let (ours, truth) = (gradients.columns[..3].concat(), columns[..3].concat());
+    let (ours, expected) = (gradients.columns[..3].concat(), columns[..3].concat());
     let error = |ours: &[f32]| -> f64 {
         let norm = |v: &mut dyn Iterator<Item = f64>| v.map(|v| v * v).sum::<f64>().sqrt();
-        norm(&mut ours.iter().zip(&truth).map(|(&a, b)| f64::from(a) - b)) / norm(&mut truth.iter().copied())
+        norm(&mut ours.iter().zip(&expected).map(|(&a, b)| f64::from(a) - b)) / norm(&mut expected.iter().copied())
     };
-    assert!(error(&ours) > TOLERANCE, "a moved splat goes unnoticed: {}", error(&ours));
+    assert!(error(&ours) > TOLERANCE, "a moved splat is within the tolerance: {}", error(&ours));
 }

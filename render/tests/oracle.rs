@@ -1,5 +1,5 @@
-//! The CPU backend against float64 reference tensors made by an independent program (gsplat's pure-PyTorch projection,
-//! dense compositing, autograd), kept outside the repository.
+//! The CPU backend against float64 tensors of an independent program (gsplat's PyTorch projection, dense compositing,
+//! autograd). The tensors are stored outside the repository.
 
 mod reference;
 
@@ -21,8 +21,8 @@ fn images_and_gradients_agree_with_the_float64_oracle() {
 }
 
 #[test]
-fn tensors_left_out_are_seen_to_matter() {
-    // The comparison above must be able to fail: a splat moved by a pixel is far outside its tolerance.
+fn the_comparison_detects_a_moved_splat() {
+    // Checks the test above: moving one splat must exceed its tolerance.
     let Some(Case { mut splats, camera, options, arrays }) = case("small.npz") else { return };
     splats.columns_mut()[column::MEAN][0] += 0.05;
     let frame = Renderer::default().forward(&splats, None, &camera, &options).clone();

@@ -1,9 +1,9 @@
 //! The WGSL of the GPU backend, and the `repr(C)` layouts that WGSL and Rust share.
 //!
-//! A [`Stage`] is one shader module: a file of `wgsl/` with the snippets that it uses concatenated before it. A module may have several
-//! entry points. Snippets that profit from subgroups exist twice; [`SUBGROUPS`] lists the modules built from the subgroup versions, and
-//! [`HALF`] those that also store pixel terms in half precision.
-//! A test parses every module with naga and compares every struct with its Rust counterpart.
+//! A [`Stage`] is one shader module: a file of `wgsl/` with the snippets that it uses concatenated before it. A module
+//! may have several entry points. Snippets that profit from subgroups exist twice; [`SUBGROUPS`] lists the modules
+//! built from the subgroup versions, and [`HALF`] those that also store pixel terms in half precision. A test parses
+//! every module with naga and compares every struct with its Rust counterpart.
 //!
 //! Architecture invariant: text and layouts only; no dependency on wgpu or on a device.
 
@@ -114,8 +114,8 @@ const SCAN_TEXT: &str = include_str!("../wgsl/scan.wgsl");
 const RADIX_TEXT: &str = include_str!("../wgsl/radix.wgsl");
 const BACKWARD_TEXT: &str = include_str!("../wgsl/rasterize_backward.wgsl");
 
-/// As [`RASTERIZE_BACKWARD`], but with the moments of a pair added atomically to its splat's: the baseline that the ordered reduction is
-/// measured against.
+/// As [`RASTERIZE_BACKWARD`], but with the moments of a pair added atomically to its splat's: the baseline that the
+/// ordered reduction is measured against.
 pub const RASTERIZE_BACKWARD_ATOMICS: Stage = Stage::new(
     "rasterize_backward_atomics",
     &[VIEW, BLEND, THREAD_INDEX[0], PIXEL_TERMS[0], REDUCE_PARTS[0], MOMENTS_ATOMIC, BACKWARD_TEXT],
@@ -138,7 +138,8 @@ pub const SUBGROUPS: &[Stage] = &[
     ),
 ];
 
-/// Replacements of stages of [`SUBGROUPS`] where half precision is requested. Frames stay bit-identical; gradients lose precision.
+/// Replacements of stages of [`SUBGROUPS`] where half precision is requested. Frames stay bit-identical; gradients lose
+/// precision.
 pub const HALF: &[Stage] = &[Stage::new(
     RASTERIZE_BACKWARD.name,
     &[VIEW, BLEND, THREAD_INDEX[1], PIXEL_TERMS[1], REDUCE_PARTS[1], MOMENTS_PER_PAIR, BACKWARD_TEXT],
@@ -243,8 +244,8 @@ pub struct PassConstants {
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Pod, Zeroable)]
 #[repr(C)]
 pub struct Status {
-    /// 1: a forward pass had more pairs than the buffers hold. Sticky: until the host clears it, nothing is drawn and no gradient
-    /// is computed.
+    /// 1: a forward pass had more pairs than the buffers hold. Sticky: until the host clears it, nothing is drawn and
+    /// no gradient is computed.
     pub overflow: u32,
     /// 1: `project` and `emit` counted different tiles for a splat. An internal error.
     pub fault: u32,

@@ -1,11 +1,11 @@
-// Stage `adam`: a step of the splats that the step's views have seen; a thread a splat, a dispatch a bank of columns. A splat outside
-// of them keeps its parameters and its moments: its gradient is not zero, it is unknown.
+// Stage `adam`: an Adam update of the splats that the step's views see; one thread per splat, one dispatch per bank of
+// columns. Invisible splats keep their parameters and moments: a missing observation is not a zero gradient.
 
 @group(0) @binding(0) var<uniform> adam: AdamConstants;
 @group(0) @binding(1) var<storage, read> status: Status;
 @group(0) @binding(2) var<storage, read> state: OptimiserState;
 @group(0) @binding(3) var<storage, read> visible: array<u32>;
-// A bank of the splats' columns, of both moments and of the gradient.
+// One bank of the columns of splats, moments and gradients.
 @group(0) @binding(4) var<storage, read_write> values: array<f32>;
 @group(0) @binding(5) var<storage, read_write> first_moment: array<f32>;
 @group(0) @binding(6) var<storage, read_write> second_moment: array<f32>;
@@ -15,10 +15,10 @@ const BETA1: f32 = 0.9;
 const EPSILON: f32 = 1e-15;
 const F32_MAX: f32 = 3.4028234e38;
 const LN_10: f32 = 2.3025851;
-// No splat's index.
+// Marks a thread without a splat.
 const NO_SPLAT: u32 = 0xffffffffu;
 
-// By multiplication alone, so that it depends on nothing but its arguments.
+// base^exponent by multiplications only, which rounds alike on every device.
 fn power(base: f32, exponent: u32) -> f32 {
     var result = 1.0;
     var square = base;
@@ -31,13 +31,13 @@ fn power(base: f32, exponent: u32) -> f32 {
     return result;
 }
 
-// 1 / (1 - beta^t) of both moments.
+// Bias corrections 1 / (1 - beta^t) of both moments.
 fn corrections() -> vec2<f32> {
     let t = state.adam_steps;
     return vec2<f32>(1.0 / (1.0 - power(BETA1, t)), 1.0 / (1.0 - power(adam.beta2, t)));
 }
 
-// Column k of the bank.
+// Updates column k of the bank.
 fn update_column(k: u32, i: u32, correction: vec2<f32>, rate: f32, regulariser: f32, low: f32, high: f32) {
     let at = k * adam.stride + i;
     let value = values[at];
@@ -45,7 +45,7 @@ fn update_column(k: u32, i: u32, correction: vec2<f32>, rate: f32, regulariser: 
     let m = fma(BETA1, first_moment[at], (1.0 - BETA1) * gradient);
     let v = fma(adam.beta2, second_moment[at], (1.0 - adam.beta2) * gradient * gradient);
     let next = value - rate * correction.x * m / (sqrt(v * correction.y) + EPSILON);
-    // A gradient that is not finite moves nothing.
+    // A non-finite gradient or value skips the update.
     if is_finite(gradient) && is_finite(next) {
         values[at] = clamp(next, low, high);
         first_moment[at] = m;
@@ -59,7 +59,7 @@ fn splat_of_thread(group: vec3<u32>, groups: vec3<u32>, local: u32) -> u32 {
         return NO_SPLAT;
     }
     let i = visible[entry] / adam.views;
-    // What other views saw of the same splat lies beside it: the first_moment of them is its thread.
+    // The visible entries of a splat are adjacent; the first of them updates the splat.
     if entry > 0u && visible[entry - 1u] / adam.views == i {
         return NO_SPLAT;
     }

@@ -1,4 +1,4 @@
-// What both directions of the rasterizer compute: whose a tile is, and a splat's opacity at a pixel.
+// Shared by both rasterizer stages: the view of a tile, and alpha of a splat at a pixel.
 
 fn view_of_tile(tile: u32) -> u32 {
     var v = 0u;
@@ -9,8 +9,9 @@ fn view_of_tile(tile: u32) -> u32 {
 }
 
 struct PixelAlpha {
+    // Pixel minus mean.
     delta: vec2<f32>,
-    // Before it is clamped at ALPHA_MAX; below ALPHA_MIN the splat is skipped.
+    // Not yet clamped to ALPHA_MAX; below ALPHA_MIN the splat is skipped.
     alpha: f32,
 }
 

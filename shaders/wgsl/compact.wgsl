@@ -1,4 +1,4 @@
-// Stage `compact`: the visible entries in their order, with their depths as keys to sort by.
+// Stage `compact`: stream compaction of the visible entries, with their depths as sort keys.
 
 @group(0) @binding(0) var<uniform> views: Views;
 @group(0) @binding(1) var<storage, read> is_visible: array<u32>;

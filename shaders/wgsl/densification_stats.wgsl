@@ -1,13 +1,14 @@
-// Stage `densification_stats`: what the views of a step say of the splats that they have seen, for the next refinement; a thread a splat.
+// Stage `densification_stats`: accumulates the screen-space gradients and weights of the splats that the step's views
+// see; one thread per splat.
 
 @group(0) @binding(0) var<uniform> adam: AdamConstants;
 @group(0) @binding(1) var<storage, read> status: Status;
 @group(0) @binding(2) var<storage, read> state: OptimiserState;
 @group(0) @binding(3) var<storage, read> visible: array<u32>;
-// Of each entry: length of the mean's gradient in pixels, the same summed without cancellation, sum of alpha T, pixels of the view,
-// which undo the loss's mean.
+// For each visible trainable entry: norm of the mean's gradient in pixels, the same with absolute values summed, sum of
+// alpha T, pixels of the view. The last undoes the loss's mean over pixels.
 @group(0) @binding(4) var<storage, read> statistics: array<vec4<f32>>;
-// Columns: sum of that gradient without cancellation, largest sum of alpha T.
+// Columns: sum of the absolute screen-space gradient, largest sum of alpha T.
 @group(0) @binding(5) var<storage, read_write> accumulated: array<f32>;
 @group(0) @binding(6) var<storage, read_write> views: array<u32>;
 
@@ -23,7 +24,7 @@ fn densification_stats(
     }
     let i = visible[first] / adam.views;
     if first > 0u && visible[first - 1u] / adam.views == i {
-        return; // another thread's
+        return; // the thread of the splat's first visible entry handles it
     }
     let n = adam.stride;
     for (var entry = first; entry < status.visible_trainable && visible[entry] / adam.views == i; entry++) {

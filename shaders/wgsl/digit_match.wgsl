@@ -1,13 +1,13 @@
-// Who has which digit: each thread says so itself.
+// Digit counts and bit masks of a workgroup by atomics, one per thread.
 
-// Adds a thread's digit to the counts, if it has one.
+// Adds the digit of this thread to the counts, if it has a key.
 fn count_digit(digit: u32, has_key: bool, thread: Thread) {
     if has_key {
         atomicAdd(&counts[digit], 1u);
     }
 }
 
-// Sets a thread's bit among the digit_masks of its digit, if it has one. The order in which threads do so does not matter.
+// Sets this thread's bit in the mask of its digit, if it has a key. The order of the threads does not matter.
 fn mark_digit(digit: u32, has_key: bool, thread: Thread) {
     let local = local_index(thread);
     if has_key {

@@ -1,7 +1,7 @@
-// Who has which digit: of the lanes of a subgroup with the same one, the first says so for all. Keys of neighbours are often match_digit,
-// and then every lane would wait for every other.
+// Digit counts and bit masks of a workgroup, one atomic per distinct digit of a subgroup: lanes with equal digits elect
+// a leader. Keys of neighbours are often equal, and then one atomic per lane would serialise the subgroup.
 
-// The threads of this one's subgroup and word of 32 that have its digit: bit t % 32 is thread t.
+// Mask of the threads with the same digit, among this thread's subgroup and word of 32 threads: bit t % 32 is thread t.
 fn match_digit(digit: u32, has_key: bool, thread: Thread) -> u32 {
     var lanes = subgroupBallot(has_key);
     for (var bit = 0u; bit < 8u; bit++) {
@@ -9,7 +9,7 @@ fn match_digit(digit: u32, has_key: bool, thread: Thread) -> u32 {
         let ones = subgroupBallot(mine);
         lanes &= select(~ones, ones, mine);
     }
-    // A subgroup is a part of a word, or several words.
+    // A subgroup is a part of a word or several words.
     return lanes[thread.lane / 32u] << ((thread.subgroup * thread.size) % 32u);
 }
 
@@ -18,7 +18,7 @@ fn is_leader(threads: u32, thread: Thread) -> bool {
     return (threads & (bit - 1u)) == 0u;
 }
 
-// Adds a thread's digit to the counts, if it has one; all threads must come here.
+// Adds the digit of this thread to the counts, if it has a key. Needs uniform control flow.
 fn count_digit(digit: u32, has_key: bool, thread: Thread) {
     let threads = match_digit(digit, has_key, thread);
     if has_key && is_leader(threads, thread) {
@@ -26,7 +26,7 @@ fn count_digit(digit: u32, has_key: bool, thread: Thread) {
     }
 }
 
-// Sets a thread's bit among the digit_masks of its digit, if it has one; all threads must come here.
+// Sets this thread's bit in the mask of its digit, if it has a key. Needs uniform control flow.
 fn mark_digit(digit: u32, has_key: bool, thread: Thread) {
     let threads = match_digit(digit, has_key, thread);
     if has_key && is_leader(threads, thread) {

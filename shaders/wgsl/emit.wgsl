@@ -1,10 +1,10 @@
-// Stage `emit`: the pairs of splat and tile, in the order of depth and then of tiles; a thread a visible entry.
+// Stage `emit`: the pairs of entries and tiles, in depth order and then in tile order; one thread per visible entry.
 
 @group(0) @binding(0) var<uniform> views: Views;
 @group(0) @binding(1) var<storage, read_write> status: Status;
 @group(0) @binding(2) var<storage, read> records: array<Record>;
 @group(0) @binding(3) var<storage, read> order: array<u32>;
-// Exclusive sums of the tiles of the splats in this order.
+// Exclusive prefix sum of the tile counts in depth order.
 @group(0) @binding(4) var<storage, read> sums: array<u32>;
 @group(0) @binding(5) var<storage, read_write> first_pair: array<u32>;
 @group(0) @binding(6) var<storage, read_write> pair_splat: array<u32>;
@@ -43,6 +43,6 @@ fn emit(
         }
     }
     if pair != end {
-        status.fault = 1u; // whoever finds it writes the same
+        status.fault = 1u; // every thread writes the same value
     }
 }

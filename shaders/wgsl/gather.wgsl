@@ -1,4 +1,4 @@
-// Stage `gather`: the tile counts of the visible entries in the order of depth, to be summed up.
+// Stage `gather`: the tile counts of the visible entries in depth order, for the prefix sum.
 
 @group(0) @binding(0) var<storage, read> status: Status;
 @group(0) @binding(1) var<storage, read> order: array<u32>;

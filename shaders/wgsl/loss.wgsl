@@ -1,22 +1,23 @@
-// Stage `loss`: (1 - lambda) L1 + lambda (1 - SSIM) of each view of a step against its photo_words, and the gradient of that. A workgroup is a
-// tile of one colour plane; photos are smoothed along rows, then along columns, in workgroup memory.
+// Stage `loss`: (1 - lambda) L1 + lambda (1 - SSIM) of each view of a step against its photo, and its gradient. A
+// workgroup handles one tile of one colour plane; the SSIM window is separable, applied along rows, then along columns,
+// in workgroup memory.
 //
-//   loss_forward → SSIM's derivatives, sums of tiles → finish_loss → loss, scales → loss_backward → upstream
+//   loss_forward → SSIM derivatives, sums per tile → finish_loss → loss, gradient scales → loss_backward → upstream
 
 @group(0) @binding(0) var<uniform> photos: Photos;
-// Of each view planes: red, green, blue, transmittance and, where pixels count by share, depth and own.
+// Planes per view: red, green, blue, transmittance and, if pixels are weighted by share, depth and trainable alpha.
 @group(0) @binding(1) var<storage, read> frame: array<f32>;
-// Bytes of each: red, green and blue planes, then the mask where there is one.
+// Bytes per photo: red, green and blue planes, then the mask if there is one.
 @group(0) @binding(2) var<storage, read> photo_words: array<u32>;
-// Of each view dSSIM/dmu, dSSIM/dE[x^2], dSSIM/dE[xy], each times the pixel's weight; three colour planes each.
+// Per view: dSSIM/dmu, dSSIM/dE[x^2], dSSIM/dE[xy], each times the pixel's weight; three colour planes each.
 @group(0) @binding(3) var<storage, read_write> partials: array<f32>;
-// Of each tile of each colour of each view: sums of w |x - y|, of w SSIM and, of the first colour, of w.
+// Per tile, colour and view: sums of w |x - y|, of w SSIM and, for the first colour, of w.
 @group(0) @binding(4) var<storage, read_write> sums: array<vec4<f32>>;
 @group(0) @binding(5) var<storage, read_write> state: OptimiserState;
 @group(0) @binding(6) var<storage, read_write> upstream: array<f32>;
 @group(0) @binding(7) var<storage, read> status: Status;
 
-// The one that this workgroup is at.
+// The photo of this workgroup.
 var<private> photo: Photo;
 
 const C1: f32 = 0.0001;
@@ -25,7 +26,7 @@ const C2: f32 = 0.0009;
 var<workgroup> halo_x: array<f32, 676>;
 var<workgroup> halo_y: array<f32, 676>;
 var<workgroup> halo_z: array<f32, 676>;
-// Smoothed along rows: 26 rows of 16, five quantities or three.
+// After the row pass: 26 rows of 16, of five quantities (forward) or three (backward).
 var<workgroup> rows: array<array<f32, 416>, 5>;
 var<workgroup> totals: array<vec4<f32>, 256>;
 
@@ -34,12 +35,12 @@ fn photo_byte(i: u32) -> u32 {
     return byte_of(photo_words[at / 4u], at);
 }
 
-// Pixel i of the frame's planes.
+// Value i of the planes of this view.
 fn frame_value(i: u32) -> f32 {
     return frame[frame_planes(photos.share_weighted) * photo.first_pixel + i];
 }
 
-// Of a colour plane, 0 to 1.
+// Value i of the colour planes of the photo, 0 to 1.
 fn photo_value(i: u32) -> f32 {
     return f32(photo_byte(i)) * (1.0 / 255.0);
 }
@@ -48,8 +49,8 @@ fn is_masked(pixel: u32) -> bool {
     return photo.masked != 0u && photo_byte(3u * photo.width * photo.height + pixel) < 128u;
 }
 
-// What a pixel counts: nothing under a mask; else the share of what is frame_value there that the block's own splats explain,
-// squared. What nothing explains yet is half the block's.
+// Weight of a pixel: 0 under a mask; else, with share weighting, the square of the share of its alpha that trainable
+// splats contribute. Uncovered alpha counts half as trainable.
 fn weight(pixel: u32) -> f32 {
     if is_masked(pixel) {
         return 0.0;
@@ -67,7 +68,7 @@ fn weight(pixel: u32) -> f32 {
 struct PlaneTile {
     view: u32,
     colour: u32,
-    // Of the tile's first pixel.
+    // Coordinates of the tile's first pixel.
     x: u32,
     y: u32,
 }
@@ -85,9 +86,9 @@ fn plane_tile(group: vec3<u32>, groups: vec3<u32>) -> PlaneTile {
     return PlaneTile(v, tile / tiles, of_plane % photo.tiles_x * TILE, of_plane / photo.tiles_x * TILE);
 }
 
-// The pixel at entry k of a tile's surroundings, or one past all where that is outside the image.
+// Pixel at entry k of the tile with halo; the number of pixels if it is outside the image.
 fn halo_pixel(at: PlaneTile, k: u32) -> u32 {
-    // Below zero wraps around to far outside.
+    // Negative coordinates wrap around to outside the image.
     let x = at.x + k % HALO_SIDE - RADIUS;
     let y = at.y + k / HALO_SIDE - RADIUS;
     let inside = x < photo.width && y < photo.height;
@@ -109,7 +110,7 @@ fn loss_forward(
         let i = halo_pixel(at, k);
         var x = 0.0;
         var y = 0.0;
-        // Hidden pixels are to SSIM what lies outside the image: zero in both.
+        // Masked pixels are zero in both images, like pixels outside them.
         if i < area && !is_masked(i) {
             x = frame_value(at.colour * area + i);
             y = photo_value(at.colour * area + i);
@@ -178,7 +179,7 @@ fn loss_forward(
     }
 }
 
-// The sum over a workgroup, halving it: always in the same order.
+// Sum over a workgroup by halving, in a fixed order.
 fn workgroup_sum(value: vec4<f32>, local: u32) -> vec4<f32> {
     totals[local] = value;
     workgroupBarrier();
@@ -191,7 +192,8 @@ fn workgroup_sum(value: vec4<f32>, local: u32) -> vec4<f32> {
     return totals[0];
 }
 
-// One workgroup: the loss, and whether the step counts. Without room for the views' pairs the step is not over.
+// One workgroup: the loss, and whether the step is valid. After an overflow of pairs the step is not done, and the host
+// repeats it.
 @compute @workgroup_size(256)
 fn finish_loss(@builtin(local_invocation_index) local: u32) {
     var loss = 0.0;
@@ -203,7 +205,7 @@ fn finish_loss(@builtin(local_invocation_index) local: u32) {
             total += sums[3u * here.first_tile + k];
         }
         total = workgroup_sum(total, local);
-        // Nothing counts: there is no loss either. Not so of NaN.
+        // Without weighted pixels the loss is zero. NaN takes this branch and makes the step invalid.
         if !(is_finite(total.z) && total.z <= 0.0) {
             let norm = 1.0 / (3.0 * total.z);
             l1 += total.x * norm;
@@ -214,7 +216,7 @@ fn finish_loss(@builtin(local_invocation_index) local: u32) {
         } else if local == 0u {
             state.gradient_scales[v] = vec2<f32>(0.0);
         }
-        workgroupBarrier(); // the sum is taken before the next one begins
+        workgroupBarrier(); // protects `totals` until all threads have read the sum
     }
     if local != 0u {
         return;

@@ -1,10 +1,11 @@
-// Where a pair's sums go: straight to its splat's, in whatever order tiles come. WGSL has no atomic addition of floats, so that a
-// thread tries until nobody came between. To be measured against `in_order.wgsl`, not to be trained with: other bits every time.
+// Output of moments: atomic addition to the splat's sums, in the order in which tiles finish. WGSL has no atomic
+// addition of floats, so it is a compare-exchange loop. Results differ from run to run: only a baseline for
+// `moments_per_pair.wgsl`.
 
-// MOMENTS floats a splat, as bits.
+// MOMENTS floats per entry, as bits.
 @group(0) @binding(9) var<storage, read_write> moments: array<atomic<u32>>;
 
-// Whose sums those of this pair are.
+// Index of the moments that this pair writes.
 fn output_slot(pair: u32, splat: u32) -> u32 {
     return splat;
 }
@@ -23,6 +24,6 @@ fn write_moment(at: u32, total: f32) {
     }
 }
 
-// Pairs that no pixel blended add nothing.
+// Pairs without a blended pixel add nothing.
 fn clear_moments(first: u32, end: u32, local: u32) {
 }

@@ -1,9 +1,9 @@
-// Where a pair's sums go: to a place of their own, which stage `reduce` adds up in the order of the splat's tiles.
+// Output of moments: a slot per pair; stage `reduce` sums the slots in the order of the tiles.
 
-// MOMENTS floats a pair.
+// MOMENTS floats per pair.
 @group(0) @binding(9) var<storage, read_write> moments: array<f32>;
 
-// Whose sums those of this pair are.
+// Index of the moments that this pair writes.
 fn output_slot(pair: u32, splat: u32) -> u32 {
     return pair;
 }
@@ -12,7 +12,7 @@ fn write_moment(at: u32, total: f32) {
     moments[at] = total;
 }
 
-// Pairs that no pixel blended.
+// Clears the moments of pairs without a blended pixel.
 fn clear_moments(first: u32, end: u32, local: u32) {
     let words = (end - first) * MOMENTS;
     for (var word = local; word < words; word += 256u) {

@@ -1,8 +1,9 @@
-// Stage `plan_dispatch`: one thread decides, between the stages, how many workgroups the next ones take.
+// Stage `plan`: one thread computes the sizes of the indirect dispatches of the following stages.
 
 @group(0) @binding(0) var<uniform> views: Views;
 @group(0) @binding(1) var<storage, read_write> status: Status;
-// Exclusive sums of `visible_trainable` over all entries (plan_visible) or of the visible ones' tiles (plan_pairs).
+// Exclusive prefix sum of the visibility flags over all entries (plan_visible), or of the tile counts of visible
+// entries (plan_pairs).
 @group(0) @binding(2) var<storage, read_write> sums: array<u32>;
 @group(0) @binding(3) var<storage, read_write> args: array<u32>;
 
@@ -16,7 +17,7 @@ fn blocks(count: u32, block: u32) -> u32 {
     return count / block + select(0u, 1u, count % block != 0u);
 }
 
-// Dispatch `slot` covers `count` entries, `block` a workgroup.
+// Indirect dispatch `slot` covers `count` entries, `block` per workgroup.
 fn plan_dispatch(slot: u32, count: u32, block: u32) {
     let groups = blocks(count, block);
     let columns = clamp(groups, 1u, MAX_GROUPS_X);
@@ -25,17 +26,17 @@ fn plan_dispatch(slot: u32, count: u32, block: u32) {
     args[3u * slot + 2u] = 1u;
 }
 
-// Before the first scan.
+// Runs before the first scan.
 @compute @workgroup_size(1)
 fn plan_start() {
     sums[views.entries] = 0u;
     status.entry_scan_len = views.entries + 1u;
 }
 
-// After the first scan.
+// Runs after the first scan.
 @compute @workgroup_size(1)
 fn plan_visible() {
-    // After an overflow nothing is visible until the host has made room.
+    // After an overflow nothing is drawn until the host has grown the buffers.
     let drawn = status.overflow == 0u;
     let visible = select(0u, sums[views.entries], drawn);
     let visible_trainable = select(0u, sums[views.trainable_entries], drawn);
@@ -51,7 +52,7 @@ fn plan_visible() {
     plan_dispatch(8u, visible_trainable, REDUCE_SPLATS);
 }
 
-// After the second scan.
+// Runs after the second scan.
 @compute @workgroup_size(1)
 fn plan_pairs() {
     var pairs = 0u;

@@ -1,8 +1,8 @@
-// Stage `project`: splats in the world become ellipses in the view; a thread a splat in a view.
+// Stage `project`: EWA projection of splats to ellipses in the views; one thread per entry.
 
 @group(0) @binding(6) var<storage, read_write> records: array<Record>;
 @group(0) @binding(7) var<storage, read_write> is_visible: array<u32>;
-// The same as `is_visible`, to be summed up.
+// A copy of `is_visible`, scanned in place.
 @group(0) @binding(8) var<storage, read_write> sums: array<u32>;
 @group(0) @binding(9) var<storage, read_write> tiles: array<u32>;
 
@@ -28,16 +28,15 @@ fn project(
     }
 }
 
-// Whether the splat may touch the image, at a fraction of what knowing costs: as far as an opaque ball of its largest scale
-// reaches.
+// Conservative visibility: the splat is treated as an opaque sphere of its largest scale.
 fn near_image(i: u32, p: vec3<f32>) -> bool {
-    // sqrt(2 ln 255), and that times sqrt(LOW_PASS), with a little to spare for rounding.
+    // 3.34: sqrt(2 ln 255) with a margin for rounding; 1.9: the same times sqrt(LOW_PASS).
     let scales = column3(3u, i);
     let reach = exp2(max(scales.x, max(scales.y, scales.z)) * LOG2_E) * 3.34;
     let inv_z = 1.0 / max(p.z, NEAR_METRES);
     let ratio = p.xy * inv_z;
     let u = min(max(ratio, view.cone_min), view.cone_max);
-    // A row of J W is f/z sqrt(1 + u^2) long.
+    // A row of J W has norm f/z sqrt(1 + u^2).
     let half = fma(view.focal * inv_z * reach, 1.0 + abs(u), vec2<f32>(1.9));
     let centre = fma(view.focal, ratio, view.principal);
     return all(centre - half <= vec2<f32>(view.pixels)) && all(vec2<f32>(0.0) <= centre + half);
@@ -64,7 +63,7 @@ fn project_splat(i: u32, record: ptr<function, Record>) -> bool {
     let variance = e.cov.xz + LOW_PASS;
     let half = sqrt(max(reach * variance, vec2<f32>(0.0)));
     let centre = view.focal * p.xy * e.inv_z + view.principal;
-    // A pixel is touched when its centre lies in the box.
+    // The bounding box must contain a pixel centre.
     let size = vec2<f32>(view.pixels);
     let sane = is_finite(half.x + half.y) && is_finite(centre.x + centre.y) && is_finite(reach) && is_finite(e.det1)
         && is_finite(inv_det);
@@ -75,7 +74,7 @@ fn project_splat(i: u32, record: ptr<function, Record>) -> bool {
     }
 
     let raw = colour(i, direction(mean).xyz);
-    // Colours that are not finite, or absurd, would poison whole pixels: such splats are not drawn.
+    // Non-finite or huge colours would corrupt whole pixels: such splats are culled.
     if !(is_finite(raw.x) && is_finite(raw.y) && is_finite(raw.z)) || !all(abs(raw) < vec3<f32>(1e6)) {
         return false;
     }

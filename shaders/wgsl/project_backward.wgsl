@@ -1,18 +1,20 @@
-// Stage `project_backward`: from a splat's sums in the views that saw it to the gradient of its parameters; a thread a trainable
-// splat that was seen. The chain of `project` in reverse, recomputed from the parameters instead of stored.
+// Stage `project_backward`: from the moments of a splat in the views that see it to the gradients of its parameters;
+// one thread per visible trainable splat. The chain rule through `project` in reverse; intermediate values are
+// recomputed from the parameters.
 
 @group(0) @binding(6) var<storage, read> status: Status;
 @group(0) @binding(7) var<storage, read> visible: array<u32>;
 @group(0) @binding(8) var<storage, read> sums: array<f32>;
-// Banks as the splats'.
+// Gradient columns, in the banks of the splats.
 @group(0) @binding(9) var<storage, read_write> out_a: array<f32>;
 @group(0) @binding(10) var<storage, read_write> out_b: array<f32>;
 @group(0) @binding(11) var<storage, read_write> out_c: array<f32>;
 @group(0) @binding(12) var<storage, read_write> out_d: array<f32>;
-// Of each entry: length of the mean's gradient in pixels, the same summed without cancellation, sum of alpha T, pixels of the view.
+// For each visible trainable entry: norm of the mean's gradient in pixels, the same with absolute values summed, sum of
+// alpha T, pixels of the view.
 @group(0) @binding(13) var<storage, read_write> statistics: array<vec4<f32>>;
 
-// Whether a view before has left its gradient already, so that this one's is added to that.
+// Whether an earlier view has written the gradient, so that this view adds to it.
 var<private> accumulate: bool;
 
 fn write_gradient(k: u32, i: u32, value: f32) {
@@ -30,7 +32,7 @@ fn write_gradient3(k: u32, i: u32, value: vec3<f32>) {
     write_gradient(k + 2u, i, value.z);
 }
 
-// One basis function of coefficient b: writes its gradient; returns what the colour changes by along it.
+// Writes the gradient of SH coefficient b; returns the derivative of the loss along its basis function.
 fn write_coefficient(b: u32, i: u32, basis: f32, d_colour: vec3<f32>) -> f32 {
     let n = splats.stride;
     var d = d_colour * basis;
@@ -74,7 +76,7 @@ fn project_backward(
     }
     let i = visible[first] / views.count;
     if first > 0u && visible[first - 1u] / views.count == i {
-        return; // another thread's
+        return; // the thread of the splat's first visible entry handles it
     }
     for (var visible_at = first; visible_at < status.visible_trainable; visible_at++) {
         let entry = visible[visible_at];
@@ -87,14 +89,14 @@ fn project_backward(
     }
 }
 
-// A splat's gradient by one view.
+// Gradient of splat i in one view.
 fn splat_gradient(i: u32, visible_at: u32) {
     let s = visible_at * MOMENTS;
     let mean = column3(0u, i);
     let p = camera_point(mean);
     let e = ewa(i, p);
 
-    // The conic, and what follows from the moments.
+    // The conic and the gradient of the mean.
     let inv_det = 1.0 / e.det1;
     let conic = vec3<f32>(e.cov.z + LOW_PASS, -e.cov.y, e.cov.x + LOW_PASS) * inv_det;
     let d_mean = vec2<f32>(
@@ -129,7 +131,7 @@ fn splat_gradient(i: u32, visible_at: u32) {
         d_cov.z += d_ratio * (e.cov.x * inv_det - ratio * conic.z);
     }
 
-    // Through A = T axes.
+    // Chain rule through A = T axes.
     let d_a0 = 2.0 * (d_cov.x * e.a0 + d_cov.y * e.a1);
     let d_a1 = 2.0 * (d_cov.y * e.a0 + d_cov.z * e.a1);
     let d_t0 = e.axes * d_a0;
@@ -138,7 +140,7 @@ fn splat_gradient(i: u32, visible_at: u32) {
     let d_axis1 = fma(e.t0, vec3<f32>(d_a0.y), e.t1 * d_a1.y);
     let d_axis2 = fma(e.t0, vec3<f32>(d_a0.z), e.t1 * d_a1.z);
     write_gradient3(3u, i, vec3<f32>(dot3(d_axis0, e.axes[0]), dot3(d_axis1, e.axes[1]), dot3(d_axis2, e.axes[2])));
-    let r0 = d_axis0 * e.scale.x; // the rotation's gradient, by columns
+    let r0 = d_axis0 * e.scale.x; // gradient of the rotation, by columns
     let r1 = d_axis1 * e.scale.y;
     let r2 = d_axis2 * e.scale.z;
     let w = e.quat.x;
@@ -155,7 +157,7 @@ fn splat_gradient(i: u32, visible_at: u32) {
     write_gradient3(6u, i, d_quat.xyz);
     write_gradient(9u, i, d_quat.w);
 
-    // Through T = J W and the projection of the centre.
+    // Chain rule through T = J W and the projection of the centre.
     var d_p = vec3<f32>(0.0, 0.0, sums[s + 9u]);
     let third = view.rows[2].xyz;
     let d_t = array<vec3<f32>, 2>(d_t0, d_t1);
@@ -164,14 +166,14 @@ fn splat_gradient(i: u32, visible_at: u32) {
         let d_j0 = dot3(d_t[r], view.rows[r].xyz);
         let d_j2 = dot3(d_t[r], third);
         d_p.z += f_z * e.inv_z * (e.u[r] * d_j2 - d_j0);
-        // The ratio p_r / z, of the centre and (unless clamped) of the Jacobian.
+        // Gradient of the ratio p_r / z: of the centre and, unless clamped, of the Jacobian.
         let d_ratio = select(0.0, -(f_z * d_j2), e.free[r]) + view.focal[r] * d_mean[r];
         d_p[r] = d_ratio * e.inv_z;
         d_p.z -= d_ratio * p[r] * e.inv_z * e.inv_z;
     }
     var d_world = fma(view.rows[0].xyz, vec3<f32>(d_p.x), fma(view.rows[1].xyz, vec3<f32>(d_p.y), third * d_p.z));
 
-    // Colour; where it is clamped at zero there is no gradient.
+    // Colour; no gradient where it is clamped at zero.
     let to_splat = direction(mean);
     let d = to_splat.xyz;
     let is_unclamped = colour(i, d) > vec3<f32>(0.0);

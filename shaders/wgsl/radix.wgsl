@@ -1,5 +1,6 @@
-// Stage `radix`: one pass of a stable sort of keys with values, by eight bits. `radix_count` counts the digits of each
-// block of 4096 entries, `scan` turns the counts (digit by digit, block by block) into places, `radix_scatter` goes there.
+// Stage `radix`: one pass of a stable LSD radix sort of keys and values, by 8-bit digits. `radix_count` builds the
+// histogram of each block of 4096 entries, `scan` turns it (digit-major, then by block) into output offsets,
+// `radix_scatter` writes the entries there.
 
 struct PassConstants {
     len_word: u32,
@@ -19,7 +20,7 @@ const BLOCK: u32 = 4096u;
 const ROUNDS: u32 = 16u;
 
 var<workgroup> counts: array<atomic<u32>, 256>;
-// Bit t % 32 of word t / 32 of a digit: thread t has it in this round.
+// Bit t % 32 of word t / 32 of a digit: thread t has this digit in this round.
 var<workgroup> digit_masks: array<atomic<u32>, 2048>;
 var<workgroup> next_slot: array<u32, 256>;
 

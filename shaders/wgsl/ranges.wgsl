@@ -1,5 +1,5 @@
-// Stage `ranges`: where the pairs of each tile begin and end in the sorted list; a thread a pair. Tiles without pairs
-// keep the zeros that the host wrote.
+// Stage `ranges`: first and last pair of each tile in the sorted list; one thread per pair. Tiles without pairs keep
+// the zeros of a clear.
 
 @group(0) @binding(0) var<storage, read> status: Status;
 @group(0) @binding(1) var<storage, read> keys: array<u32>;

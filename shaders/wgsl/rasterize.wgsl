@@ -1,13 +1,13 @@
-// Stage `rasterize`: a workgroup draws a tile, a thread a pixel, front to back until every pixel is finished.
+// Stage `rasterize`: front-to-back blending; a workgroup per tile, a thread per pixel, until every pixel is finished.
 
 @group(0) @binding(0) var<uniform> views: Views;
 @group(0) @binding(1) var<storage, read> tile_ranges: array<vec2<u32>>;
 @group(0) @binding(2) var<storage, read> sorted: array<u32>;
 @group(0) @binding(3) var<storage, read> pair_splat: array<u32>;
 @group(0) @binding(4) var<storage, read> records: array<Record>;
-// Of each view planes: red, green, blue, transmittance and, with extras, depth and trainable_alpha.
+// Planes per view: red, green, blue, transmittance and, with extras, depth and trainable alpha.
 @group(0) @binding(5) var<storage, read_write> frame: array<f32>;
-// For each pixel the end of what was blended there: one past its last_pair pair, 0 if there was none.
+// For each pixel one past the last blended pair, 0 if there is none.
 @group(0) @binding(6) var<storage, read_write> last_pair: array<u32>;
 
 const BATCH: u32 = 256u;
@@ -25,7 +25,7 @@ fn rasterize(
     @builtin(num_workgroups) groups: vec3<u32>,
     @builtin(local_invocation_index) local: u32,
 ) {
-    // More workgroups than tiles: the last_pair ones find no pair and no pixel.
+    // The dispatch may have more workgroups than tiles; surplus ones have no pairs and no pixels.
     let tile = group.y * groups.x + group.x;
     let exists = tile < views.tiles;
     var range = vec2<u32>(0u);

@@ -1,10 +1,11 @@
-// Stage `rasterize_backward`: the gradient of each pair of a trainable splat and a tile, as sums over the tile's pixels.
+// Stage `rasterize_backward`: gradient moments of each pair of a trainable splat and a tile, as sums over the tile's
+// pixels.
 //
-// A workgroup walks its tile's output_slots front to back, as `rasterize` does, eight at a time, in two steps. First a thread is a
-// pixel: it replays its eight opacities, knows the colour behind each as "final minus seen so far", and leaves
-// v = alpha dL/dalpha and w = alpha T in workgroup memory. Then 32 threads are a pair: each adds up eight pixels of one
-// column, so that most moments need only the sums of v, v dy and v dy^2; 32 such parts are added in a fixed order
-// (`reduce_parts`). No atomics on floats: the same bits every time.
+// A workgroup walks its tile's pairs front to back, as `rasterize` does, in batches of eight, in two steps. First, with
+// a thread per pixel, it recomputes the eight alphas, derives the colour behind each as "final minus blended so far",
+// and stores v = alpha dL/dalpha and w = alpha T in workgroup memory. Then, with 32 threads per pair, each thread sums
+// eight pixels of one column, so that most moments need only the sums of v, v dy and v dy^2; `reduce_parts` adds the 32
+// parts in a fixed order. There are no float atomics: results are bit-identical from run to run.
 
 @group(0) @binding(0) var<uniform> views: Views;
 @group(0) @binding(1) var<storage, read> tile_ranges: array<vec2<u32>>;
@@ -13,17 +14,17 @@
 @group(0) @binding(4) var<storage, read> records: array<Record>;
 @group(0) @binding(5) var<storage, read> frame: array<f32>;
 @group(0) @binding(6) var<storage, read> last_pair: array<u32>;
-// Of each view planes: dL/d red, green, blue and, where `planes` says so, transmittance and depth; room for all five.
+// Planes per view: dL/d red, green, blue and, as `planes` says, transmittance and depth; all five have space.
 @group(0) @binding(7) var<storage, read> upstream: array<f32>;
 @group(0) @binding(8) var<uniform> planes: UpstreamPlanes;
-const PAIRS: u32 = 8u; // at a time
-const PARTS: u32 = 32u; // threads of a pair
-const PIXELS: u32 = 8u; // of a part
+const PAIRS: u32 = 8u; // of a batch
+const PARTS: u32 = 32u; // threads per pair
+const PIXELS: u32 = 8u; // per thread
 
 var<workgroup> means_ab: array<vec4<f32>, PAIRS>;
 var<workgroup> c_opacities: array<vec2<f32>, PAIRS>;
 var<workgroup> colours_depths: array<vec4<f32>, PAIRS>;
-// Of each pair, or of its splat, where its sums go.
+// Index of the output moments of each pair.
 var<workgroup> output_slots: array<u32, PAIRS>;
 var<workgroup> is_trainable: array<u32, PAIRS>;
 // dL/d colour and depth of each pixel.
@@ -55,8 +56,8 @@ fn rasterize_backward(
     let frame_at = frame_planes(views.extras) * view.first_pixel + pixel_of_view;
     let upstream_at = 5u * view.first_pixel + pixel_of_view;
 
-    // Of this thread's pixel: the upstream gradient, the end of what was blended, and what lies behind the splats seen so
-    // far, weighted by the gradient; at first all of it.
+    // This thread's pixel: the upstream gradient, the end of its blended pairs, and the dot product of the gradient
+    // with the colour behind the splats blended so far, initially with the final colour.
     var gradient = vec4<f32>(0.0);
     var end = 0u;
     var behind = 0.0;
@@ -116,7 +117,7 @@ fn rasterize_backward(
                     let colour_depth = colours_depths[k];
                     let d_weight = fma(gradient.x, colour_depth.x, fma(gradient.y, colour_depth.y, fma(gradient.z, colour_depth.z, gradient.w * colour_depth.w)));
                     behind = fma(-w, d_weight, behind);
-                    // alpha dL/dalpha = alpha (T d_weight - behind / (1 - alpha)); zero where clamped.
+                    // v = alpha dL/dalpha = alpha (T dL/dw - behind / (1 - alpha)); zero where clamped.
                     if sample.alpha < ALPHA_MAX {
                         v = alpha * (transmittance * d_weight - behind / (1.0 - alpha));
                     }
@@ -142,18 +143,18 @@ fn rasterize_backward(
         reduce_parts(moments_from(sums, dx), count, thread);
     }
 
-    // Pairs behind the last_pair one that any pixel blended.
+    // Clear the pairs behind the last blended one.
     var rest = max(stop, range.x);
     if stop > range.x {
-        // The loop above went to the end of a group of eight.
+        // The loop above processed whole batches of eight.
         rest = min(range.x + (stop - range.x + PAIRS - 1u) / PAIRS * PAIRS, range.y);
     }
     clear_moments(rest, range.y, local);
 }
 
-// What a pair hands to its splat, MOMENTS floats: v, v dx, v dy, v dx^2 | v dx dy, v dy^2, w red, w green | w blue, w depth, w,
-// |x| | |y|. The three colours and depth stand for the upstream gradients, |x| and |y| for the mean's gradient summed without
-// cancellation.
+// The MOMENTS floats of a pair, in order: v, v dx, v dy, v dx^2 | v dx dy, v dy^2, w red, w green | w blue, w depth, w,
+// |x| | |y|. Red, green, blue and depth are upstream gradients; |x| and |y| are the mean's gradient with absolute
+// values summed.
 struct Moments {
     a: vec4<f32>,
     b: vec4<f32>,
@@ -179,12 +180,13 @@ struct PartSums {
     d_weight: vec2<f32>,
 }
 
-// The sums over the eight pixels of a part: column part % 16, every second row from part / 16; dx and dy of the first.
+// Sums over the eight pixels of a part: column part % 16, every second row from part / 16; dx and dy are those of the
+// first pixel.
 fn sum_part(k: u32, part: u32, pixels: f32, dx: f32, dy: f32) -> PartSums {
     let a = means_ab[k].z;
     let b = means_ab[k].w;
     let c = c_opacities[k].x;
-    // dalpha/d(mean) / alpha: the exponent's derivative in natural units.
+    // (dalpha/d(mean)) / alpha: the derivative of the exponent, converted from base 2.
     let aa = 2.0 * LN_2 * a * a;
     let ab = 2.0 * LN_2 * a * b;
     let bc = 2.0 * LN_2 * fma(b, b, c * c);

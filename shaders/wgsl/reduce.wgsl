@@ -1,5 +1,5 @@
-// Stage `reduce`: adds up the pairs of each trainable splat in each view that saw it, in the order of its tiles. Sixteen threads
-// are such an entry, one a moment.
+// Stage `reduce`: sums the moments of the pairs of each visible trainable entry, in the order of its tiles; sixteen
+// threads per entry, one per moment.
 
 @group(0) @binding(0) var<storage, read> status: Status;
 @group(0) @binding(1) var<storage, read> visible: array<u32>;

@@ -1,8 +1,8 @@
-// The sum of the 32 parts of each moment of each pair, through workgroup memory, part by part.
+// Sum of the 32 partial moments of each pair, serially, through workgroup memory.
 
-const STRIDE: u32 = 33u; // not 32: threads that add up different moments read different memory banks
+const STRIDE: u32 = 33u; // not 32, to avoid bank conflicts between threads that sum different moments
 
-// All threads must come here: thread 32 k + part with what that part of pair k came to.
+// Thread 32 k + p passes part p of pair k. Needs uniform control flow.
 fn reduce_parts(m: Moments, count: u32, thread: Thread) {
     let local = local_index(thread);
     let k = local / PARTS;

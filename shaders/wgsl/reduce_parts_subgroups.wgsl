@@ -1,11 +1,11 @@
-// The sum of the 32 parts of each moment of each pair: eight lanes by three exchanges, then four partial_sums through workgroup memory.
-// At each exchange a lane gives away half of the moments that it has and keeps the sums of the others. The 32 parts are the leaves
-// of one binary tree whatever the size of the subgroups, so that this has the same bits with any.
+// Sum of the 32 partial moments of each pair: three shuffles reduce eight lanes, workgroup memory the four results. At
+// each shuffle a lane passes half of its moments on and keeps the sums of the others. The 32 parts form one binary tree
+// for every subgroup size, so results do not depend on that size.
 
-// Moment m of eight n, 0 to 3, of pair k at 4 (16 k + m) + n.
+// Moment m of eight lanes n, 0 to 3, of pair k at 4 (16 k + m) + n.
 var<workgroup> partial_sums: array<f32, 512>;
 
-// All threads must come here: thread 32 k + part with what that part of pair k came to.
+// Thread 32 k + p passes part p of pair k. Needs uniform control flow.
 fn reduce_parts(m: Moments, count: u32, thread: Thread) {
     let local = local_index(thread);
     let upper = vec3<bool>((local & 1u) != 0u, (local & 2u) != 0u, (local & 4u) != 0u);

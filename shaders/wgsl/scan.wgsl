@@ -1,5 +1,5 @@
-// Stage `scan`: exclusive_scan sums in place, in three dispatches: of each block, over the blocks, within each block. Sums
-// that would not fit stay at the largest number, so that whoever compares them with a limit cannot be fooled.
+// Stage `scan`: exclusive prefix sum in place, in three dispatches: within blocks, over block sums, and their
+// combination. Sums saturate at 2^32 - 1, so that a comparison with a limit never sees a wrapped value.
 
 struct PassConstants {
     len_word: u32,

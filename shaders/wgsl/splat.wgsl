@@ -1,5 +1,5 @@
-// Splats in four banks of columns, and what `project` and `project_backward` both compute of them.
-// EWA splatting (Zwicker et al. 2001): covariance' = A A^T + 0.3 I with A = J W R S.
+// Splat columns in four banks, and the parts of the projection that `project` and `project_backward` share. EWA
+// splatting (Zwicker et al. 2001): covariance' = A A^T + 0.3 I with A = J W R S.
 
 @group(0) @binding(0) var<storage, read> bank_a: array<f32>;
 @group(0) @binding(1) var<storage, read> bank_b: array<f32>;
@@ -8,10 +8,10 @@
 @group(0) @binding(4) var<uniform> views: Views;
 @group(0) @binding(5) var<uniform> splats: SplatSet;
 
-// The view that this thread is at.
+// The view of this thread.
 var<private> view: View;
 
-// Column k of the first bank.
+// Column k of bank 0.
 fn column(k: u32, i: u32) -> f32 {
     return bank_a[k * splats.stride + i];
 }
@@ -20,7 +20,7 @@ fn column3(k: u32, i: u32) -> vec3<f32> {
     return vec3<f32>(column(k, i), column(k + 1u, i), column(k + 2u, i));
 }
 
-// SH coefficient b of the three channels; only those of the degree in use may be asked for.
+// SH coefficient b of the three channels; b must be within the degree in use.
 fn coefficient(b: u32, i: u32) -> vec3<f32> {
     let n = splats.stride;
     if b == 0u {
@@ -40,7 +40,7 @@ fn dot3(a: vec3<f32>, b: vec3<f32>) -> f32 {
     return fma(a.x, b.x, fma(a.y, b.y, a.z * b.z));
 }
 
-// The centre in camera axes.
+// The centre in the camera frame.
 fn camera_point(mean: vec3<f32>) -> vec3<f32> {
     var p: vec3<f32>;
     for (var r = 0u; r < 3u; r++) {
@@ -52,7 +52,7 @@ fn camera_point(mean: vec3<f32>) -> vec3<f32> {
 
 struct Ewa {
     inv_z: f32,
-    // x/z and y/z, clamped to the view's cone and 15 % beyond, and whether they were not clamped.
+    // x/z and y/z, clamped to the view and 15 % beyond, and whether they are unclamped.
     u: vec2<f32>,
     free: vec2<bool>,
     quat: vec4<f32>, // normalised, wxyz
@@ -63,8 +63,8 @@ struct Ewa {
     t1: vec3<f32>,
     a0: vec3<f32>, // rows of A
     a1: vec3<f32>,
-    cov: vec3<f32>, // xx, xy, yy before the blur
-    det0: f32, // determinant before the blur
+    cov: vec3<f32>, // xx, xy, yy before the low-pass filter
+    det0: f32, // determinant before the low-pass filter
     det1: f32, // and after
 }
 
@@ -97,7 +97,7 @@ fn ewa(i: u32, p: vec3<f32>) -> Ewa {
     e.a0 = vec3<f32>(dot3(e.t0, e.axes[0]), dot3(e.t0, e.axes[1]), dot3(e.t0, e.axes[2]));
     e.a1 = vec3<f32>(dot3(e.t1, e.axes[0]), dot3(e.t1, e.axes[1]), dot3(e.t1, e.axes[2]));
     e.cov = vec3<f32>(dot3(e.a0, e.a0), dot3(e.a0, e.a1), dot3(e.a1, e.a1));
-    // A sum of squares (Cauchy and Binet), as xx yy - xy^2 would cancel in needles.
+    // A sum of squares (Cauchy-Binet), as xx yy - xy^2 cancels for needles.
     let minors = vec3<f32>(
         e.a0.x * e.a1.y - e.a1.x * e.a0.y,
         e.a0.y * e.a1.z - e.a1.y * e.a0.z,
@@ -159,7 +159,7 @@ fn basis3(d: vec3<f32>) -> array<f32, 7> {
     );
 }
 
-// The colour before it is clamped, sRGB.
+// The colour before the clamp at 0, sRGB.
 fn colour(i: u32, d: vec3<f32>) -> vec3<f32> {
     var c = fma(coefficient(0u, i), vec3<f32>(SH_C0), vec3<f32>(0.5));
     if splats.sh_degree >= 1u {

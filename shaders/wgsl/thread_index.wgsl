@@ -1,10 +1,10 @@
-// Which thread of its workgroup a thread is. This one every adapter knows.
+// Index of a thread in its workgroup, portable version.
 
 struct Thread {
     @builtin(local_invocation_index) local: u32,
 }
 
-// 0 to 255, each once.
+// A permutation of 0 to 255.
 fn local_index(thread: Thread) -> u32 {
     return thread.local;
 }

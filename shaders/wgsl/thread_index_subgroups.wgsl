@@ -1,5 +1,5 @@
-// Which thread of its workgroup a thread is, and of its subgroup. All subgroups have the same size, a power of two from 8 to 128
-// (`render` sees to that). Nothing says that neighbours by local index share a subgroup, so threads are numbered by their lanes.
+// Index of a thread in its workgroup by subgroup and lane. All subgroups have the same size, a power of two from 8 to
+// 128 (checked by `render`). Threads adjacent in local index need not share a subgroup, hence this numbering.
 
 struct Thread {
     @builtin(subgroup_id) subgroup: u32,
@@ -7,7 +7,7 @@ struct Thread {
     @builtin(subgroup_invocation_id) lane: u32,
 }
 
-// 0 to 255, each once.
+// A permutation of 0 to 255.
 fn local_index(thread: Thread) -> u32 {
     return thread.subgroup * thread.size + thread.lane;
 }

@@ -1,12 +1,12 @@
-// Which tiles the ellipse of a record at alpha = 1/255 overlaps. `project` counts them and `emit` lists them: both must
-// find the same ones, so nothing here leaves a compiler a choice of how to round (fma where a product is added).
+// The tiles that the ellipse of a record at alpha = 1/255 overlaps. `project` counts them and `emit` lists them. Both
+// must agree, so sums of products are explicit fma, which leaves the compiler no choice of rounding.
 
 struct TileBox {
     first: vec2<u32>,
     end: vec2<u32>,
 }
 
-// The tiles of the ellipse's box; extents are below 1e7.
+// The tiles of the ellipse's bounding box; extents are below 1e7.
 fn tile_box(r: Record, tiles: vec2<u32>) -> TileBox {
     let low = max((r.mean_ab.xy - r.c_opacity_extent.zw - 0.5) * 0.0625, vec2<f32>(0.0));
     let high = max((r.mean_ab.xy + r.c_opacity_extent.zw - 0.5) * 0.0625, vec2<f32>(0.0));
@@ -18,10 +18,10 @@ struct Ellipse {
     a: f32,
     b: f32,
     c: f32,
-    // Where the exponent is largest on a vertical (times x) and on a horizontal line (times y).
+    // Position of the largest exponent on a vertical line (times x) and on a horizontal line (times y).
     on_column: f32,
     on_row: f32,
-    // What the squares may come to.
+    // Upper bound of the sum of squares.
     reach: f32,
 }
 
@@ -29,12 +29,12 @@ fn ellipse(r: Record) -> Ellipse {
     let a = r.mean_ab.z;
     let b = r.mean_ab.w;
     let c = r.c_opacity_extent.x;
-    // log2(1/255) is -7.9943534; a little slack, as the rasterizer tests each pixel anyway.
+    // log2(1/255) is -7.9943534. The slack covers rounding; the rasterizer tests each pixel itself.
     return Ellipse(r.mean_ab.xy, a, b, c, -(a * b) / fma(b, b, c * c), -b / a, r.c_opacity_extent.y + 7.9953534);
 }
 
 fn overlaps(e: Ellipse, tile: vec2<u32>) -> bool {
-    // Pixel centres of the tile's corners, from the mean.
+    // Pixel centres of the tile's corners, relative to the mean.
     let low = vec2<f32>(tile * TILE) + 0.5 - e.mean;
     let high = low + 15.0;
     let near = max(low, min(vec2<f32>(0.0), high));

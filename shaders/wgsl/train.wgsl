@@ -1,24 +1,25 @@
-// What training keeps on the device from step to step, and what a step's loss is made of.
+// Structs and constants of the training stages; see `train.rs` for the fields.
 
 struct OptimiserState {
-    // Steps that are over, those left out included.
+    // Finished steps, skipped ones included.
     steps_done: u32,
-    // Steps of Adam.
+    // Updates of Adam.
     adam_steps: u32,
-    // Steps left out, as their loss was not finite.
+    // Steps skipped for a non-finite loss.
     steps_skipped: u32,
-    // Of the epoch under way: views, and the sum of their mean absolute errors.
+    // Views of the current epoch, and the sum of their mean absolute errors.
     epoch_views: u32,
     epoch_l1: f32,
-    // Of the last step: the mean loss of its views, and whether it counts.
+    // Mean loss over the views of the last finished step.
     loss: f32,
+    // 0: the current step is skipped, or its pairs overflowed.
     is_step_valid: u32,
     padding: u32,
-    // Of each of its views: what gradients of L1 and of SSIM are scaled by.
+    // Scale factors of the gradients of L1 and of SSIM, for each view of the step.
     gradient_scales: array<vec2<f32>, MAX_VIEWS>,
 }
 
-// A photo beside a frame.
+// The target photo of one view.
 struct Photo {
     width: u32,
     height: u32,
@@ -33,19 +34,19 @@ struct Photo {
     masked: u32,
 }
 
-// The photos of a step.
+// The target photos of a step.
 struct Photos {
     count: u32,
-    // Of all.
+    // Tiles of all photos.
     tiles: u32,
     // Weight of 1 - SSIM.
     lambda: f32,
-    // 1: a pixel counts by the share of it that the trainable splats explain.
+    // 1: pixels are weighted by the share of their alpha that trainable splats contribute.
     share_weighted: u32,
     photo: array<Photo, MAX_VIEWS>,
 }
 
-// Step sizes of one step and the pull of the regularisers, for one bank of columns.
+// Learning rates and regulariser weights of one step, for one bank of columns.
 struct AdamConstants {
     mean: f32,
     log_scale: f32,
@@ -60,20 +61,20 @@ struct AdamConstants {
     log_scale_max: f32,
     // Columns of the bank that the SH degree uses.
     columns: u32,
-    // Entries from a column to the next.
+    // Elements from one column to the next.
     stride: u32,
     // Views of the step.
     views: u32,
     padding: vec2<u32>,
 }
 
-// SSIM's window: exp(-d^2 / (2 1.5^2)) for d = 0, 1, .. 5, normalised so that the eleven taps sum to one.
+// SSIM's 11-tap window: exp(-d^2 / (2 1.5^2)) for d = 0, 1, .. 5, normalised to a sum of one over the eleven taps.
 const TAPS = array<f32, 6>(0.26601172, 0.21300554, 0.10936069, 0.036000773, 0.007598758, 0.00102838);
 const RADIUS: u32 = 5u;
-// Side of a tile with all that the photos of its pixels reach.
+// Side of a tile with a halo of RADIUS pixels.
 const HALO_SIDE: u32 = 26u;
 
-// A byte of packed ones.
+// Byte i of an array of packed bytes, given its word.
 fn byte_of(word: u32, i: u32) -> u32 {
     return (word >> (8u * (i % 4u))) & 0xffu;
 }

@@ -1,9 +1,10 @@
-// What all stages share: constants (those of `render`, which a test there compares), the views and their status.
+// Shared by all stages: constants (equal to those of `render`, which a test compares), the views and the status. See
+// `lib.rs` for the fields.
 
 const WORKGROUP_SIZE: u32 = 256u;
 const TILE: u32 = 16u;
 const MOMENTS: u32 = 13u;
-// Views drawn side by side, at most.
+// Largest number of views in one dispatch.
 const MAX_VIEWS: u32 = 16u;
 
 const NEAR_METRES: f32 = 0.01;
@@ -15,7 +16,7 @@ const SH_C0: f32 = 0.28209479;
 const LOG2_E: f32 = 1.4426950;
 const LN_2: f32 = 0.6931472;
 
-// A camera and its window.
+// A camera and the offsets of its view in the shared buffers.
 struct View {
     rows: array<vec4<f32>, 3>,
     centre: vec4<f32>,
@@ -31,15 +32,15 @@ struct View {
     padding: vec2<u32>,
 }
 
-// Views drawn side by side. What a splat is in a view is an entry: entry i of `count` views is splat i / count in view i % count,
-// so that those of a splat are neighbours.
+// The views of a dispatch. Entry i of `count` views is splat i / count in view i % count, so the entries of a splat are
+// adjacent.
 struct Views {
     background: vec4<f32>,
     count: u32,
-    // Tiles and pixels of all.
+    // Tiles and pixels of all views.
     tiles: u32,
     pixels: u32,
-    // Entries of the trainable splats; of these and the context.
+    // Entries of the trainable splats; entries of these and of the context.
     trainable_entries: u32,
     entries: u32,
     pair_capacity: u32,
@@ -74,28 +75,28 @@ struct Status {
     pair_histogram_len: u32,
 }
 
-// A splat in the view. The ellipse is the conic's Cholesky factor for exponents of two:
-// alpha = 2^(log2_opacity - (a dx + b dy)^2 - (c dy)^2); the conic itself would cancel along needles.
+// A projected splat. a, b, c are the Cholesky factor of the conic, scaled for base 2:
+// alpha = 2^(log2_opacity - (a dx + b dy)^2 - (c dy)^2). Evaluating the conic itself cancels along needles.
 struct Record {
-    // Mean in pixels, a, b.
+    // Mean in pixels; a, b.
     mean_ab: vec4<f32>,
-    // c, log2 of the opacity, half extents in pixels of the ellipse at alpha = 1/255.
+    // c, log2 of the opacity, half extents of the ellipse at alpha = 1/255 in pixels.
     c_opacity_extent: vec4<f32>,
-    // Colour, clamped from below at 0; depth in metres.
+    // Colour, clamped below at 0; depth in metres.
     colour_depth: vec4<f32>,
 }
 
-// The number of a thread in a dispatch of one or two dimensions of workgroups.
+// Number of a thread in a one- or two-dimensional dispatch.
 fn thread_number(group: vec3<u32>, groups: vec3<u32>, local: u32) -> u32 {
     return (group.y * groups.x + group.x) * WORKGROUP_SIZE + local;
 }
 
-// UpstreamPlanes of a frame.
+// Number of planes of a frame.
 fn frame_planes(extras: u32) -> u32 {
     return select(4u, 6u, extras != 0u);
 }
 
-// By bits: compilers may take comparisons for granted that only NaN fails.
+// On bits, as compilers may assume that there is no NaN.
 fn is_finite(x: f32) -> bool {
     return (bitcast<u32>(x) & 0x7f800000u) != 0x7f800000u;
 }

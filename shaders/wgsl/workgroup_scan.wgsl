@@ -1,8 +1,8 @@
-// Sums over a workgroup through its memory.
+// Exclusive prefix sum over a workgroup through its memory (Hillis and Steele).
 
 var<workgroup> partial: array<u32, 256>;
 
-// The sum of `value` over the threads before this one; all threads must come here.
+// Sum of `value` over the threads before this one. Needs uniform control flow.
 fn exclusive_scan(value: u32, thread: Thread) -> u32 {
     let local = local_index(thread);
     partial[local] = value;
@@ -22,7 +22,7 @@ fn exclusive_scan(value: u32, thread: Thread) -> u32 {
     return partial[local - 1u];
 }
 
-// The sum over all threads, after `exclusive_scan`.
+// Sum over all threads; valid after `exclusive_scan`.
 fn scan_total(thread: Thread) -> u32 {
     return partial[255];
 }

@@ -1,8 +1,9 @@
-// Sums over a workgroup within its subgroups and then over these: one barrier. Not `subgroupExclusiveAdd`, which wraps around.
+// Exclusive prefix sum over a workgroup: within subgroups, then over subgroups, with one barrier.
+// `subgroupExclusiveAdd` wraps around, so shuffles with a saturating addition replace it.
 
 var<workgroup> subgroup_sums: array<u32, 32>;
 
-// The sum of `value` over the threads before this one; all threads must come here.
+// Sum of `value` over the threads before this one. Needs uniform control flow.
 fn exclusive_scan(value: u32, thread: Thread) -> u32 {
     var sum = value;
     for (var distance = 1u; distance < thread.size; distance *= 2u) {
@@ -21,7 +22,7 @@ fn exclusive_scan(value: u32, thread: Thread) -> u32 {
     return before;
 }
 
-// The sum over all threads, after `exclusive_scan`.
+// Sum over all threads; valid after `exclusive_scan`.
 fn scan_total(thread: Thread) -> u32 {
     var sum = 0u;
     for (var s = 0u; s < 256u / thread.size; s++) {

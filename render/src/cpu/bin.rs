@@ -1,9 +1,9 @@
 //! Stages `sort` and `bin`: the depth order of the splats, and for every tile the list of splats that overlap it.
 //!
-//! A tile is 16×16 pixels, that is sixteen blocks of 4×4 pixels. A pair of splat and tile has a bit for each block that the ellipse at
-//! α = 1/255 overlaps; one SIMD test, a lane per block, computes all sixteen bits. So the rasterizer skips the empty corners of the
-//! bounding box.
-//! Splats are sorted by depth once; pairs are emitted in that order and sorted by tile with a stable counting sort.
+//! A tile is 16×16 pixels, that is sixteen blocks of 4×4 pixels. A pair of splat and tile has a bit for each block that
+//! the ellipse at α = 1/255 overlaps; one SIMD test, a lane per block, computes all sixteen bits. So the rasterizer
+//! skips the empty corners of the bounding box. Splats are sorted by depth once; pairs are emitted in that order and
+//! sorted by tile with a stable counting sort.
 
 use rayon::prelude::*;
 
@@ -40,7 +40,8 @@ pub(crate) struct Bins {
     pub(crate) position: Vec<u32>,
 }
 
-/// Sorts the indices of the visible splats by depth, nearest first; ties keep index order. Positive floats sort as their bits.
+/// Sorts the indices of the visible splats by depth, nearest first; ties keep index order. Positive floats sort as
+/// their bits.
 pub(crate) fn sort_by_depth(projected: &[Projected], seen: &[u16], order: &mut Vec<u32>, scratch: &mut SortScratch) {
     const BITS: u32 = 11;
     const BUCKETS: usize = 1 << BITS;

@@ -3,19 +3,19 @@
 use super::simd::{Isa, LANES, Lanes};
 use crate::{kernel, unroll};
 
-/// Floating-point operations per lane of the forward rasterizer, for one (splat, 4×4 block) combination: the additions and
-/// multiplications of its loops, an FMA counted as two; 10 for the exponent, 12 for `exp2`, 8 for blending. Comparisons, selections,
-/// rounding and signs do not count.
+/// Floating-point operations per lane of the forward rasterizer, for one (splat, 4×4 block) combination: the additions
+/// and multiplications of its loops, an FMA counted as two; 10 for the exponent, 12 for `exp2`, 8 for blending.
+/// Comparisons, selections, rounding and signs do not count.
 pub const RASTERIZE_FLOPS: u64 = 30;
-/// The same for the backward rasterizer without depth: 22 for α, 18 for blending with its reciprocal counted as four, 26 for the moments.
-/// Pixel offsets are computed twice but counted once.
+/// The same for the backward rasterizer without depth: 22 for α, 18 for blending with its reciprocal counted as four,
+/// 26 for the moments. Pixel offsets are computed twice but counted once.
 pub const RASTERIZE_BACKWARD_FLOPS: u64 = 66;
 
-/// Runs `rounds` of independent FMA chains on this instruction set, as many chains as fit into registers without spilling. Returns the
-/// number of floating-point operations, and a value that depends on all of them.
+/// Runs `rounds` of independent FMA chains on this instruction set, as many chains as fit into registers without
+/// spilling. Returns the number of floating-point operations, and a value that depends on all of them.
 pub fn multiply_adds(isa: Isa, rounds: u64) -> (u64, f32) {
-    // Sixteen lanes take one of 32 registers with AVX-512, two of 16 with AVX2, four of 16 with SSE2. Latency times ports is 8
-    // registers (Zen, Skylake) to 10 (Haswell).
+    // Sixteen lanes take one of 32 registers with AVX-512, two of 16 with AVX2, four of 16 with SSE2. Latency times
+    // ports is 8 registers (Zen, Skylake) to 10 (Haswell).
     let (chains, value) = match isa.name() {
         "avx512" => (12, twelve(isa, rounds)),
         "avx2" => (5, five(isa, rounds)),

@@ -1,8 +1,8 @@
 //! Contribution of each splat to a view, as a pruning score.
 //!
-//! A pixel's colour is affine in the α of each of its splats. So one front-to-back pass gives the exact change of the pixel if a splat is
-//! removed: `δ = -α·dI/dα`, with `dI/dα = T·c - (colour behind) / (1 - α)`. The scores are sums of squares over pixels; a loss gradient
-//! cannot provide them, as it sums signed terms.
+//! A pixel's colour is affine in the α of each of its splats. So one front-to-back pass gives the exact change of the
+//! pixel if a splat is removed: `δ = -α·dI/dα`, with `dI/dα = T·c - (colour behind) / (1 - α)`. The scores are sums of
+//! squares over pixels; a loss gradient cannot provide them, as it sums signed terms.
 
 use std::hint::cold_path;
 
@@ -23,8 +23,8 @@ mod sum {
 }
 
 impl Renderer {
-    /// Contributions of the trainable splats to the view of the last [`forward`](Self::forward). `weights` is one plane of pixel weights;
-    /// empty: all weights are 1.
+    /// Contributions of the trainable splats to the view of the last [`forward`](Self::forward). `weights` is one plane
+    /// of pixel weights; empty: all weights are 1.
     ///
     /// # Panics
     /// Without a forward pass before, or if the plane has another size than the frame.

@@ -1,7 +1,8 @@
 //! A parallel stable counting sort.
 //!
-//! The input is split into parts, one per thread. Each part counts its items per bucket, [`offsets`] turns the counts into output
-//! positions, and each part scatters its items to positions that no other part writes. The result does not depend on the number of parts.
+//! The input is split into parts, one per thread. Each part counts its items per bucket, [`offsets`] turns the counts
+//! into output positions, and each part scatters its items to positions that no other part writes. The result does not
+//! depend on the number of parts.
 
 use std::marker::PhantomData;
 
@@ -13,8 +14,8 @@ pub(crate) fn parts(items: usize) -> usize {
     (items / MIN_PART).clamp(1, rayon::current_num_threads())
 }
 
-/// Replaces the count of each part and bucket by the position of its first item: ordered by bucket, then by part. Calls `bucket_start`
-/// with the start of each bucket and with the end of the last.
+/// Replaces the count of each part and bucket by the position of its first item: ordered by bucket, then by part. Calls
+/// `bucket_start` with the start of each bucket and with the end of the last.
 pub(crate) fn offsets(counts: &mut [Vec<u32>], buckets: usize, mut bucket_start: impl FnMut(u32)) {
     let mut sum = 0;
     bucket_start(sum);
@@ -47,7 +48,8 @@ impl<'a, T: Copy> ScatterWriter<'a, T> {
     /// No other thread writes to this position of the slice.
     pub(crate) unsafe fn write(&self, position: usize, value: T) {
         assert!(position < self.len, "a position within the slice");
-        // Safety: the position is within the slice, which is borrowed mutably, and the caller rules out a second writer.
+        // Safety: the position is within the slice, which is borrowed mutably, and the caller rules out a second
+        // writer.
         unsafe { self.first.add(position).write(value) }
     }
 }

@@ -5,8 +5,9 @@
 //! splats ─project→ records ─sort→ order ─bin→ pairs per tile ─rasterize→ frame
 //! upstream ─rasterize_backward→ moments per pair ─reduce→ moments per splat ─project_backward→ gradients
 //! ```
-//! Every reduction runs in the order of the data, so results do not depend on the number of threads. `with_max_len(1)` makes threads take
-//! one chunk or tile row at a time: rayon's default split into a few large ranges balances the load badly.
+//! Every reduction runs in the order of the data, so results do not depend on the number of threads. `with_max_len(1)`
+//! makes threads take one chunk or tile row at a time: rayon's default split into a few large ranges balances the load
+//! badly.
 
 mod bin;
 pub mod ceiling;
@@ -169,8 +170,8 @@ impl Renderer {
         &self.frame
     }
 
-    /// Gradients of the trainable splats of the last [`forward`](Self::forward). `splats` must be those of the forward pass,
-    /// unchanged.
+    /// Gradients of the trainable splats of the last [`forward`](Self::forward). `splats` must be those of the forward
+    /// pass, unchanged.
     ///
     /// # Panics
     /// Without a forward pass before, or with another number of splats.
@@ -209,8 +210,8 @@ impl Renderer {
         self.bins.pairs.len()
     }
 
-    /// Number of (splat, 4×4 pixel block) combinations that the rasterizer evaluated in the last view, for counting its operations. The
-    /// backward pass evaluates the same ones.
+    /// Number of (splat, 4×4 pixel block) combinations that the rasterizer evaluated in the last view, for counting its
+    /// operations. The backward pass evaluates the same ones.
     pub fn visits(&self) -> u64 {
         self.visited.iter().map(|tile| u64::from(tile.blocks)).sum()
     }
@@ -222,22 +223,22 @@ impl Renderer {
         self.records.resize(total, Projected::default());
         self.seen.clear();
         self.seen.resize(total.div_ceil(simd::LANES), 0);
-        let (own_records, context_records) = self.records.split_at_mut(first_context.min(total));
-        let (own_seen, context_seen) = self.seen.split_at_mut(first_context / simd::LANES);
+        let (trainable_records, context_records) = self.records.split_at_mut(first_context.min(total));
+        let (trainable_seen, context_seen) = self.seen.split_at_mut(first_context / simd::LANES);
         let isa = self.isa;
-        let draw = |splats: &Splats, options: &Options, own: f32, records: &mut [Projected], seen: &mut [u16]| {
+        let draw = |splats: &Splats, options: &Options, trainable: f32, records: &mut [Projected], seen: &mut [u16]| {
             records
                 .par_chunks_mut(CHUNK)
                 .zip(seen.par_chunks_mut(CHUNK / simd::LANES))
                 .enumerate()
                 .with_max_len(1)
                 .for_each(|(chunk, (records, seen))| {
-                    project::project(isa, splats, chunk * CHUNK, view, options, own, records, seen);
+                    project::project(isa, splats, chunk * CHUNK, view, options, trainable, records, seen);
                 });
         };
-        draw(splats, options, 1.0, &mut own_records[..splats.len()], own_seen);
+        draw(splats, options, 1.0, &mut trainable_records[..splats.len()], trainable_seen);
         if let Some(context) = context {
-            // The context is finished: it is drawn in full, whatever degree the trainable splats have reached.
+            // The context is frozen: it is drawn at its full SH degree, whatever degree training has reached.
             let options = Options { sh_degree: context.sh_degree(), ..*options };
             draw(context, &options, 0.0, context_records, context_seen);
         }
@@ -295,8 +296,9 @@ impl Renderer {
         );
     }
 
-    /// Sums the moments of each splat's pairs, in the order of its tiles. Splats are processed in depth order, which is the order of the
-    /// emission numbers: then only the moments are gathered from scattered positions, and these are known ahead for prefetching.
+    /// Sums the moments of each splat's pairs, in the order of its tiles. Splats are processed in depth order, which is
+    /// the order of the emission numbers: then only the moments are gathered from scattered positions, and these are
+    /// known ahead for prefetching.
     fn reduce(&mut self, count: usize) {
         self.rank_splats();
         self.sums.resize(self.order.len(), Moments::default());
@@ -379,8 +381,8 @@ impl Renderer {
 }
 
 impl Bins {
-    /// Calls `work(tile row, tile, moments)` for every tile, in parallel over tile rows. `moments` are those of the pairs that the
-    /// forward pass visited; the moments of the tile's other pairs are set to zero.
+    /// Calls `work(tile row, tile, moments)` for every tile, in parallel over tile rows. `moments` are those of the
+    /// pairs that the forward pass visited; the moments of the tile's other pairs are set to zero.
     fn for_each_tile(
         &self,
         ranked: &[Projected],

@@ -1,7 +1,7 @@
 //! Stage `project`: EWA projection of splats to ellipses in the view, sixteen at a time.
 //!
-//! EWA splatting (Zwicker et al. 2001) with gsplat's conventions: `Σ' = A Aᵀ + 0.3·I` with `A = J W R S`. The Jacobian J is taken at the
-//! centre, clamped to the view plus 15 %. SH colour is evaluated here, once per splat and view.
+//! EWA splatting (Zwicker et al. 2001) with gsplat's conventions: `Σ' = A Aᵀ + 0.3·I` with `A = J W R S`. The Jacobian
+//! J is taken at the centre, clamped to the view plus 15 %. SH colour is evaluated here, once per splat and view.
 
 use scene::{Camera, Splats, column};
 
@@ -14,8 +14,8 @@ pub(crate) mod at {
     /// Mean in pixels.
     pub(crate) const X: usize = 0;
     pub(crate) const Y: usize = 1;
-    /// Cholesky factor of the conic, scaled for base 2: α = 2^(LOG2_OPACITY - (A dx + B dy)² - (C dy)²). Evaluating the conic itself
-    /// cancels along needles: its error grows with the square of their length.
+    /// Cholesky factor of the conic, scaled for base 2: α = 2^(LOG2_OPACITY - (A dx + B dy)² - (C dy)²). Evaluating the
+    /// conic itself cancels along needles: its error grows with the square of their length.
     pub(crate) const A: usize = 2;
     pub(crate) const B: usize = 3;
     pub(crate) const C: usize = 4;
@@ -179,8 +179,8 @@ pub(crate) fn opacity<L: Lanes>(splats: &Splats, i: usize) -> L {
 }
 
 kernel!(
-    /// Projects splats `first .. first + out.len()` into `out`; the length is a multiple of 16 except in the last chunk. Sets bit
-    /// `i % 16` of `seen[i / 16]` for visible splats.
+    /// Projects splats `first .. first + out.len()` into `out`; the length is a multiple of 16 except in the last
+    /// chunk. Sets bit `i % 16` of `seen[i / 16]` for visible splats.
     pub(crate) fn project(
         splats: &Splats, first: usize, view: &View, options: &Options, trainable: f32, out: &mut [Projected], seen: &mut [u16],
     ) = project_lanes
@@ -201,8 +201,8 @@ fn project_lanes<L: Lanes>(
     }
 }
 
-/// Conservative visibility of sixteen splats: each is treated as an opaque sphere of its largest scale. Splats are in Morton order, so
-/// this cheap test rejects most groups outside the view as a whole.
+/// Conservative visibility of sixteen splats: each is treated as an opaque sphere of its largest scale. Splats are in
+/// Morton order, so this cheap test rejects most groups outside the view as a whole.
 #[inline(always)]
 fn near_image<L: Lanes>(splats: &Splats, i: usize, view: &View, p: [L; 3]) -> u16 {
     /// √(2 ln(1 / ALPHA_MIN)), with a margin for rounding.

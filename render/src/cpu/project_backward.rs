@@ -1,7 +1,7 @@
 //! Stage `project_backward`: from the moments of a splat to the gradients of its parameters and of the pose.
 //!
-//! The chain rule through [`project`](super::project) in reverse, sixteen splats at a time. Intermediate values are recomputed from the
-//! parameters; only the moments are stored between the passes.
+//! The chain rule through [`project`](super::project) in reverse, sixteen splats at a time. Intermediate values are
+//! recomputed from the parameters; only the moments are stored between the passes.
 
 use scene::{Splats, column};
 
@@ -21,8 +21,8 @@ pub(crate) struct GradientChunk<'a> {
 }
 
 kernel!(
-    /// Gradients of splats `first ..` from their moments `sums`, which are in depth order (`rank`). Returns the chunk's part of the pose
-    /// gradient, (ρ, ω).
+    /// Gradients of splats `first ..` from their moments `sums`, which are in depth order (`rank`). Returns the chunk's
+    /// part of the pose gradient, (ρ, ω).
     pub(crate) fn project_backward(
         splats: &Splats, first: usize, view: &View, options: &Options, seen: &[u16], rank: &[u32], sums: &[Moments],
         out: &mut GradientChunk,
@@ -208,7 +208,8 @@ fn backward_group<L: Lanes>(
         d_world[c].keep(seen).store_to(out.columns[column::MEAN + c], at);
     }
 
-    // Pose: a translation moves the splat's centre and the camera's centre, a rotation the splat's centre and the axes W.
+    // Pose: a translation moves the splat's centre and the camera's centre, a rotation the splat's centre and the axes
+    // W.
     let turn = cross(p, d_p);
     for r in 0..3 {
         pose[r] = pose[r] + L::select(seen, d_p[r] + dot(rows[r], d_direction), L::zero());

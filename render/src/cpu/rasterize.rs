@@ -1,4 +1,5 @@
-//! Stage `rasterize`: blends the pairs of a tile front to back, sixteen pixels (a 4×4 block) at a time, until every pixel is finished.
+//! Stage `rasterize`: blends the pairs of a tile front to back, sixteen pixels (a 4×4 block) at a time, until every
+//! pixel is finished.
 
 use std::hint::cold_path;
 

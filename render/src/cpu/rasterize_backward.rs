@@ -1,8 +1,9 @@
 //! Stage `rasterize_backward`: the gradient moments of each pair of a tile.
 //!
-//! It walks the pairs front to back like the forward pass and keeps, per pixel, the colour behind the current splat as "final colour minus
-//! colour blended so far". So it needs neither a list per pixel nor a back-to-front pass (as in Taming-3DGS and Brush). The gradient of a
-//! pair is a few moments, sums over its pixels; the gradients of the conic and of the mean are linear in them.
+//! It walks the pairs front to back like the forward pass and keeps, per pixel, the colour behind the current splat as
+//! "final colour minus colour blended so far". So it needs neither a list per pixel nor a back-to-front pass (as in
+//! Taming-3DGS and Brush). The gradient of a pair is a few moments, sums over its pixels; the gradients of the conic
+//! and of the mean are linear in them.
 
 use std::hint::cold_path;
 
@@ -12,8 +13,9 @@ use super::simd::Lanes;
 use super::tile::{BLOCKS, Moments, PREFETCH_DISTANCE, Plane, SplatLanes, TileInput, lane_offsets, moment};
 use crate::{ALPHA_MAX, Frame, TRANSMITTANCE_MIN, Upstream, kernel};
 
-/// The last trainable pair of each block: pairs behind it do not affect any gradient of that block. Returns (pair, mask of blocks that end
-/// there), ascending and terminated by an unreachable pair, and the mask of all blocks with a trainable pair.
+/// The last trainable pair of each block: pairs behind it do not affect any gradient of that block. Returns (pair, mask
+/// of blocks that end there), ascending and terminated by an unreachable pair, and the mask of all blocks with a
+/// trainable pair.
 pub(crate) fn last_trainable_pairs(pairs: &[Pair]) -> ([(u32, u32); BLOCKS + 1], u32) {
     let (mut ends, mut first, mut found) = ([(u32::MAX, 0); BLOCKS + 1], BLOCKS, 0);
     for (n, pair) in pairs.iter().enumerate().rev().filter(|(_, pair)| pair.trainable) {
@@ -59,8 +61,8 @@ impl<'a> BackwardBand<'a> {
 }
 
 kernel!(
-    /// Moments of each pair of a tile, into `out` (one element per pair). Pairs that no pixel blends get zeros; pairs of context splats
-    /// are not written.
+    /// Moments of each pair of a tile, into `out` (one element per pair). Pairs that no pixel blends get zeros; pairs
+    /// of context splats are not written.
     pub(crate) fn rasterize_backward(tile: &TileInput, band: &BackwardBand, out: &mut [Moments]) = rasterize_backward_lanes
 );
 
@@ -91,7 +93,8 @@ fn rasterize_backward_tile<L: Lanes, const DEPTH: bool>(tile: &TileInput, band: 
     for c in 0..3 {
         tile.gather(band.d_colour[c], 1.0, &mut d_colour[c]);
     }
-    // Dot product of the upstream gradient with the colour behind the splats blended so far; initially with the final colour.
+    // Dot product of the upstream gradient with the colour behind the splats blended so far; initially with the final
+    // colour.
     let mut behind = Plane::filled(0.0);
     let mut product = |value: &[f32], gradient: &[f32]| {
         if !gradient.is_empty() {

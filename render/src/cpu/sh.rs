@@ -1,5 +1,5 @@
-//! Real spherical harmonics up to degree 3 and their derivatives, in Cartesian form on unit directions, with the constants of the original
-//! 3DGS rasterizer (Kerbl et al. 2023, `forward.cu`).
+//! Real spherical harmonics up to degree 3 and their derivatives, in Cartesian form on unit directions, with the
+//! constants of the original 3DGS rasterizer (Kerbl et al. 2023, `forward.cu`).
 
 use super::simd::Lanes;
 
@@ -7,8 +7,8 @@ const C1: f32 = 0.488_602_52;
 const C2: [f32; 5] = [1.092_548_4, -1.092_548_4, 0.315_391_57, -1.092_548_4, 0.546_274_24];
 const C3: [f32; 7] = [-0.590_043_6, 2.890_611_4, -0.457_045_8, 0.373_176_34, -0.457_045_8, 1.445_305_7, -0.590_043_6];
 
-/// The basis functions of degrees 1 ..= `degree` at unit direction (x, y, z), without the constant one. Elements above the degree are
-/// zero.
+/// The basis functions of degrees 1 ..= `degree` at unit direction (x, y, z), without the constant one. Elements above
+/// the degree are zero.
 #[inline(always)]
 pub(crate) fn basis<L: Lanes>(degree: u8, x: L, y: L, z: L) -> [L; 15] {
     let mut b = [L::zero(); 15];

@@ -1,7 +1,8 @@
 //! Sixteen `f32` lanes on any machine: one AVX-512 register, two AVX2 registers, or an array.
 //!
-//! Kernels are generic over [`Lanes`]; [`kernel!`](crate::kernel) compiles them for every instruction set, and [`Isa::detect`] selects
-//! one at run time. Sixteen lanes are one 4×4 pixel block of the rasterizer, or sixteen splats of the projection.
+//! Kernels are generic over [`Lanes`]; [`kernel!`](crate::kernel) compiles them for every instruction set, and
+//! [`Isa::detect`] selects one at run time. Sixteen lanes are one 4×4 pixel block of the rasterizer, or sixteen splats
+//! of the projection.
 //!
 //! Safety: the methods of the vector types call intrinsics that need their instruction set. The types are hidden: only
 //! [`kernel!`](crate::kernel) names them, guarded by an [`Isa`], which exists only after detection.
@@ -24,8 +25,8 @@ pub use portable::Portable;
 pub use x86::{Avx2, Avx512};
 
 /// Compiles a generic kernel for every instruction set and dispatches on the first argument, an [`Isa`]:
-/// `kernel!(pub(crate) fn forward(tile: &mut Tile) = forward_lanes);` with `fn forward_lanes<L: Lanes>(tile: &mut Tile)`,
-/// which must be `#[inline(always)]`. The crate `train` uses it too.
+/// `kernel!(pub(crate) fn forward(tile: &mut Tile) = forward_lanes);` with `fn forward_lanes<L: Lanes>(tile: &mut
+/// Tile)`, which must be `#[inline(always)]`. The crate `train` uses it too.
 #[macro_export]
 #[doc(hidden)]
 macro_rules! kernel {
@@ -57,8 +58,8 @@ macro_rules! kernel {
 
 /// An array of an expression evaluated at each index, unrolled: `unroll!(c in [0, 1, 2] => a[c] * b[c])`.
 ///
-/// Kernels use it instead of closures: a closure is compiled as a function without the kernel's target features, and intrinsics cannot
-/// be inlined into it.
+/// Kernels use it instead of closures: a closure is compiled as a function without the kernel's target features, and
+/// intrinsics cannot be inlined into it.
 #[macro_export]
 #[doc(hidden)]
 macro_rules! unroll {

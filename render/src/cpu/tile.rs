@@ -16,7 +16,8 @@ pub(crate) const BLOCKS: usize = 16;
 const BLOCK_X: [f32; BLOCKS] = [0.0, 4.0, 8.0, 12.0, 0.0, 4.0, 8.0, 12.0, 0.0, 4.0, 8.0, 12.0, 0.0, 4.0, 8.0, 12.0];
 const BLOCK_Y: [f32; BLOCKS] = [0.0, 0.0, 0.0, 0.0, 4.0, 4.0, 4.0, 4.0, 8.0, 8.0, 8.0, 8.0, 12.0, 12.0, 12.0, 12.0];
 
-/// One value per pixel of a tile: sixteen blocks of sixteen lanes. Each block is one cache line, as a load across two lines is slow.
+/// One value per pixel of a tile: sixteen blocks of sixteen lanes. Each block is one cache line, as a load across two
+/// lines is slow.
 #[derive(Clone, Copy)]
 #[repr(align(64))]
 pub(crate) struct Plane([[f32; 16]; BLOCKS]);
@@ -42,7 +43,8 @@ impl IndexMut<usize> for Plane {
     }
 }
 
-/// Indices of the moments of a pair: sums over pixels of `v = α dL/dα` and `w = αT`, times offsets from the mean or upstream gradients.
+/// Indices of the moments of a pair: sums over pixels of `v = α dL/dα` and `w = αT`, times offsets from the mean or
+/// upstream gradients.
 pub(crate) mod moment {
     pub(crate) const V: usize = 0;
     pub(crate) const VX: usize = 1;
@@ -79,8 +81,8 @@ pub(crate) struct TileInput<'a> {
 }
 
 impl TileInput<'_> {
-    /// Calls `f(block, lane, count, offset in the tile row's planes)` for each row of a block, that is up to four pixels, inside the
-    /// image.
+    /// Calls `f(block, lane, count, offset in the tile row's planes)` for each row of a block, that is up to four
+    /// pixels, inside the image.
     #[inline(always)]
     pub(crate) fn for_each_run(&self, mut f: impl FnMut(usize, usize, usize, usize)) {
         let columns = (self.width - self.x).min(TILE);
@@ -126,8 +128,8 @@ impl TileInput<'_> {
         });
     }
 
-    /// Initial transmittance, and a mask of the blocks with pixels: 1 inside the image, 0 outside, so that outside pixels count as
-    /// finished.
+    /// Initial transmittance, and a mask of the blocks with pixels: 1 inside the image, 0 outside, so that outside
+    /// pixels count as finished.
     #[inline(always)]
     pub(crate) fn start(&self) -> (Plane, u32) {
         let mut live = Plane::filled(0.0);
@@ -167,8 +169,9 @@ impl<L: Lanes> SplatLanes<L> {
         (lane_x + L::splat(self.x + BLOCK_X[block]), lane_y + L::splat(self.y + BLOCK_Y[block]))
     }
 
-    /// α of the pixels of some blocks, zero where the splat is skipped. This loop is separate from blending: its iterations are
-    /// independent, so a core overlaps several blocks; the dependency chain of α and blending together is too long for that.
+    /// α of the pixels of some blocks, zero where the splat is skipped. This loop is separate from blending: its
+    /// iterations are independent, so a core overlaps several blocks; the dependency chain of α and blending together
+    /// is too long for that.
     #[inline(always)]
     pub(crate) fn alphas(&self, mut blocks: u32, lane_x: L, lane_y: L, out: &mut Plane) {
         while blocks != 0 {

@@ -16,8 +16,9 @@ pub enum Reduction {
 }
 
 impl GpuRenderer {
-    /// Encodes a backward pass of the last [`forward`](Self::forward): gradients of the trainable splats, summed over its views, from
-    /// the content of [`upstream`](Self::upstream). `splats` must be those of the forward pass, unchanged. There is no pose gradient.
+    /// Encodes a backward pass of the last [`forward`](Self::forward): gradients of the trainable splats, summed over
+    /// its views, from the content of [`upstream`](Self::upstream). `splats` must be those of the forward pass,
+    /// unchanged. There is no pose gradient.
     ///
     /// # Errors
     /// Without a forward pass before, or with another number of splats; and as `forward`.
@@ -57,7 +58,8 @@ impl GpuRenderer {
         Ok(())
     }
 
-    /// Encodes the stages of [`backward`](Self::backward) before `project_backward`: the moments of each trainable splat in each view.
+    /// Encodes the stages of [`backward`](Self::backward) before `project_backward`: the moments of each trainable
+    /// splat in each view.
     ///
     /// # Errors
     /// Without a forward pass before; and as `forward`.
@@ -117,8 +119,8 @@ impl GpuRenderer {
         Ok(())
     }
 
-    /// Reads the result of [`reduce_moments`](Self::reduce_moments): the moments of each entry of a trainable splat, in the order of
-    /// `rasterize_backward.wgsl`; zero where it is not visible.
+    /// Reads the result of [`reduce_moments`](Self::reduce_moments): the moments of each entry of a trainable splat, in
+    /// the order of `rasterize_backward.wgsl`; zero where it is not visible.
     ///
     /// # Errors
     /// Any error of the submitted work.

@@ -64,8 +64,8 @@ impl Gpu {
         }
     }
 
-    /// Writes values at a byte offset, ahead of the next submission. At most 16 MiB wait in host staging memory at once, whatever the
-    /// size of `values`.
+    /// Writes values at a byte offset, ahead of the next submission. At most 16 MiB wait in host staging memory at
+    /// once, whatever the size of `values`.
     ///
     /// # Errors
     /// A pending error of the device.
@@ -85,7 +85,8 @@ impl Gpu {
         self.check()
     }
 
-    /// Writes values at a byte offset, in the order of the encoder's commands; [`upload`](Self::upload) precedes all of them.
+    /// Writes values at a byte offset, in the order of the encoder's commands; [`upload`](Self::upload) precedes all of
+    /// them.
     pub fn write<T: NoUninit>(&self, encoder: &mut wgpu::CommandEncoder, to: &wgpu::Buffer, offset: u64, values: &[T]) {
         let bytes = bytemuck::cast_slice(values);
         if !bytes.is_empty() {

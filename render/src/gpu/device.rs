@@ -1,7 +1,7 @@
 //! The wgpu device: adapter choice, limits, submission and error reporting.
 //!
-//! wgpu reports most errors to a handler instead of the call that caused them. [`Gpu`] collects them, and every operation that submits or
-//! waits returns them.
+//! wgpu reports most errors to a handler instead of the call that caused them. [`Gpu`] collects them, and every
+//! operation that submits or waits returns them.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
@@ -120,8 +120,8 @@ impl Gpu {
         })
     }
 
-    /// The backend's name, such as "gpu-vulkan-llvmpipe-subgroups": API, adapter without versions, and the path unless it is the
-    /// portable one. Results are bit-identical only under the same name.
+    /// The backend's name, such as "gpu-vulkan-llvmpipe-subgroups": API, adapter without versions, and the path unless
+    /// it is the portable one. Results are bit-identical only under the same name.
     pub fn name(&self) -> &str {
         &self.name
     }
@@ -172,8 +172,8 @@ impl Gpu {
         &self.timestamps
     }
 
-    /// Returns and clears the first error that this thread caused since its last call. The loss of the device is returned at every
-    /// call.
+    /// Returns and clears the first error that this thread caused since its last call. The loss of the device is
+    /// returned at every call.
     ///
     /// # Errors
     /// That error.
@@ -229,8 +229,8 @@ impl Gpu {
     }
 }
 
-/// Whether the adapter has subgroups as the stages need them: one fixed size (WebGPU does not tell which of several sizes a pipeline
-/// gets), a power of two from 8 to 128.
+/// Whether the adapter has subgroups as the stages need them: one fixed size (WebGPU does not tell which of several
+/// sizes a pipeline gets), a power of two from 8 to 128.
 fn has_subgroups(features: wgpu::Features, info: &wgpu::AdapterInfo) -> bool {
     let size = info.subgroup_min_size;
     features.contains(wgpu::Features::SUBGROUP)

@@ -90,8 +90,8 @@ impl GpuError {
 /// Errors that wgpu's handlers recorded and that no call has returned yet.
 #[derive(Debug, Default)]
 pub(super) struct DeviceErrors {
-    /// The first unreturned error of each thread. wgpu calls the handler on the thread that causes the error, and a thread works on one
-    /// task at a time, so no task receives another's error.
+    /// The first unreturned error of each thread. wgpu calls the handler on the thread that causes the error, and a
+    /// thread works on one task at a time, so no task receives another's error.
     first: Mutex<HashMap<ThreadId, GpuError>>,
     /// The loss of the device. Permanent: later operations fail, and wgpu does not report the loss again.
     lost: OnceLock<GpuError>,

@@ -11,11 +11,11 @@ use super::views::views_of;
 use crate::Options;
 
 impl GpuRenderer {
-    /// Encodes a forward pass of the trainable splats and a frozen context into [`frame`](Self::frame), with one view per camera.
+    /// Encodes a forward pass of the trainable splats and a frozen context into [`frame`](Self::frame), with one view
+    /// per camera.
     ///
-    /// # Errors
-    /// Unless there are 1 to [`MAX_VIEWS`](shaders::MAX_VIEWS) cameras, or if a buffer does not fit. Errors of the execution are returned
-    /// by the call that submits or waits.
+    /// # Errors Unless there are 1 to [`MAX_VIEWS`](shaders::MAX_VIEWS) cameras, or if a buffer does not fit. Errors of
+    /// the execution are returned by the call that submits or waits.
     pub fn forward(
         &mut self,
         encoder: &mut wgpu::CommandEncoder,
@@ -85,8 +85,8 @@ impl GpuRenderer {
         kernels.compact.run(gpu, pass, &bindings, views.entries.div_ceil(WORKGROUP_SIZE));
     }
 
-    /// Sorts the visible entries by depth, emits their pairs and sorts these by tile. Returns the index of the ping-pong buffer that
-    /// holds the sorted pairs.
+    /// Sorts the visible entries by depth, emits their pairs and sorts these by tile. Returns the index of the
+    /// ping-pong buffer that holds the sorted pairs.
     fn encode_sort_and_bin(&self, pass: &mut wgpu::ComputePass, tiles: u32) -> usize {
         let (gpu, kernels, entries, pairs) = (&*self.gpu, &self.kernels, &self.entries, &self.pairs);
         let (status, args) = (&*self.status, &*self.args);

@@ -5,7 +5,8 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 use super::error::GpuError;
 
-/// Bytes of a device's buffers, and their cap. Excludes small uniforms, and dropped buffers that commands in flight still use.
+/// Bytes of a device's buffers, and their cap. Excludes small uniforms, and dropped buffers that commands in flight
+/// still use.
 #[derive(Debug)]
 pub(super) struct MemoryCap {
     limit: u64,

@@ -5,13 +5,14 @@
 //! splats ─project→ records ─compact→ visible ─sort by depth→ order ─emit→ pairs ─sort by tile→ ranges ─rasterize→ frame
 //! upstream ─rasterize_backward→ moments per pair ─reduce→ moments per splat ─project_backward→ gradients
 //! ```
-//! Several views share each dispatch. An *entry* is one splat in one view; the entries of a splat are adjacent, and the tiles of the
-//! views are numbered consecutively. All entries are sorted together, which keeps the order within each tile, so every view is
-//! bit-identical to a pass over that view alone.
+//! Several views share each dispatch. An *entry* is one splat in one view; the entries of a splat are adjacent, and the
+//! tiles of the views are numbered consecutively. All entries are sorted together, which keeps the order within each
+//! tile, so every view is bit-identical to a pass over that view alone.
 //!
-//! Only the device knows how many splats are visible and how many (splat, tile) pairs they produce: stage `plan` writes the arguments of
-//! the indirect dispatches. Pair buffers have a fixed capacity. A pass with more pairs sets a sticky overflow flag, and nothing is drawn
-//! or trained until the host grows the buffers ([`GpuRenderer::grow_after_overflow`]).
+//! Only the device knows how many splats are visible and how many (splat, tile) pairs they produce: stage `plan` writes
+//! the arguments of the indirect dispatches. Pair buffers have a fixed capacity. A pass with more pairs sets a sticky
+//! overflow flag, and nothing is drawn or trained until the host grows the buffers
+//! ([`GpuRenderer::grow_after_overflow`]).
 //!
 //! Floats are never added atomically in the default path: the same adapter gives the same bits.
 

@@ -21,8 +21,8 @@ pub enum Path {
     /// The subgroup stages if the adapter has subgroups of one fixed size, else the portable ones.
     #[default]
     Fast,
-    /// The subgroup stages with per-pixel gradient terms in half precision: less workgroup memory traffic, gradients correct to three
-    /// digits. Opening fails on an adapter without subgroups of one size or without halves.
+    /// The subgroup stages with per-pixel gradient terms in half precision: less workgroup memory traffic, gradients
+    /// correct to three digits. Opening fails on an adapter without subgroups of one size or without halves.
     Half,
 }
 

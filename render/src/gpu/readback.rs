@@ -55,7 +55,8 @@ impl GpuRenderer {
         })
     }
 
-    /// The view of the last forward pass and the index of its sorted pair buffer. Intermediate results are compared for one view only.
+    /// The view of the last forward pass and the index of its sorted pair buffer. Intermediate results are compared for
+    /// one view only.
     fn single_view(&self, what: &str) -> Result<(Views, usize), GpuError> {
         match self.last_forward {
             Some(LastForward { views, sorted, .. }) if views.count == 1 => Ok((views, sorted)),
@@ -122,8 +123,8 @@ impl GpuRenderer {
         })
     }
 
-    /// Waits for all submitted work and reads the gradients in the CPU backend's form, summed over the views; zero where no view sees a
-    /// splat. The pose gradient is always zero.
+    /// Waits for all submitted work and reads the gradients in the CPU backend's form, summed over the views; zero
+    /// where no view sees a splat. The pose gradient is always zero.
     ///
     /// # Errors
     /// Any error of the submitted work, or no forward pass before.

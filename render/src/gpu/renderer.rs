@@ -161,14 +161,15 @@ impl GpuRenderer {
         self.gpu.name().to_string()
     }
 
-    /// Pixels of the frame, for each view consecutive planes of `width · height` floats: red, green, blue, transmittance and, with
-    /// [`Options::extras`](crate::Options::extras), depth and trainable alpha; as in [`Frame`](crate::Frame).
+    /// Pixels of the frame, for each view consecutive planes of `width · height` floats: red, green, blue,
+    /// transmittance and, with [`Options::extras`](crate::Options::extras), depth and trainable alpha; as in
+    /// [`Frame`](crate::Frame).
     pub fn frame(&self) -> &wgpu::Buffer {
         &self.frame
     }
 
-    /// Input of [`backward`](Self::backward): for each view the planes of [`Upstream`](crate::Upstream), that is three of colour,
-    /// transmittance, depth; all five have space. Allocated by `forward`.
+    /// Input of [`backward`](Self::backward): for each view the planes of [`Upstream`](crate::Upstream), that is three
+    /// of colour, transmittance, depth; all five have space. Allocated by `forward`.
     pub fn upstream(&self) -> &wgpu::Buffer {
         &self.upstream
     }
@@ -178,14 +179,14 @@ impl GpuRenderer {
         &self.gradients
     }
 
-    /// For each visible entry of a trainable splat four floats: `screen_gradient`, `screen_gradient_abs` and `weight` of
-    /// [`Gradients`](crate::Gradients) in that view, and the view's number of pixels.
+    /// For each visible entry of a trainable splat four floats: `screen_gradient`, `screen_gradient_abs` and `weight`
+    /// of [`Gradients`](crate::Gradients) in that view, and the view's number of pixels.
     pub fn statistics(&self) -> &wgpu::Buffer {
         &self.statistics
     }
 
-    /// Indices of the visible entries, ascending; the first [`Status::visible_trainable`] belong to trainable splats. Entry `i` of `n`
-    /// views is splat `i / n` in view `i % n`.
+    /// Indices of the visible entries, ascending; the first [`Status::visible_trainable`] belong to trainable splats.
+    /// Entry `i` of `n` views is splat `i / n` in view `i % n`.
     pub fn visible(&self) -> &wgpu::Buffer {
         &self.entries.visible
     }
@@ -217,8 +218,8 @@ impl GpuRenderer {
         Ok(status)
     }
 
-    /// Waits for all submitted work; after an overflow, grows the pair buffers and clears the flag. Returns whether there was an
-    /// overflow: then that pass and all later ones had no effect and must be repeated.
+    /// Waits for all submitted work; after an overflow, grows the pair buffers and clears the flag. Returns whether
+    /// there was an overflow: then that pass and all later ones had no effect and must be repeated.
     ///
     /// # Errors
     /// Any error of the submitted work.

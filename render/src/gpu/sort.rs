@@ -1,6 +1,7 @@
 //! Prefix sum and LSD radix sort: the sequences of dispatches of `scan` and `radix`.
 //!
-//! Only the device knows the number of entries: threads read it from a word of the status, dispatches take it from `args`.
+//! Only the device knows the number of entries: threads read it from a word of the status, dispatches take it from
+//! `args`.
 
 use shaders::{PassConstants, args, status_word};
 
@@ -87,8 +88,8 @@ impl Sorter {
         groups.run(gpu, pass, &self.scan_apply, &bindings);
     }
 
-    /// Sorts stably by the lowest `bits` of the keys; returns the index of the ping-pong buffer that holds the result. Input keys are in
-    /// buffer 0; input values are `first_values`, or else in buffer 0.
+    /// Sorts stably by the lowest `bits` of the keys; returns the index of the ping-pong buffer that holds the result.
+    /// Input keys are in buffer 0; input values are `first_values`, or else in buffer 0.
     pub(super) fn sort(
         &self,
         gpu: &Gpu,

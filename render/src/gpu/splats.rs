@@ -9,11 +9,12 @@ use super::buffer::Buffer;
 use super::device::Gpu;
 use super::error::GpuError;
 
-/// First column of each bank, and the end: bank 0 holds the parameters and the constant SH coefficient, the others five SH
-/// coefficients each.
+/// First column of each bank, and the end: bank 0 holds the parameters and the constant SH coefficient, the others five
+/// SH coefficients each.
 const BANKS: [usize; 5] = [0, column::SH + 3, column::SH + 18, column::SH + 33, column::SH + 48];
 
-/// Columns of floats on the device, in the order of [`scene::column`]. Column `k` of a bank begins at element `k · stride`.
+/// Columns of floats on the device, in the order of [`scene::column`]. Column `k` of a bank begins at element `k ·
+/// stride`.
 #[derive(Debug)]
 pub struct Columns {
     banks: [Buffer; 4],
@@ -36,7 +37,8 @@ impl Columns {
         Ok(Self { banks: [bank(0)?, bank(1)?, bank(2)?, bank(3)?], stride, sh_degree })
     }
 
-    /// The four banks: columns 0..14, 14..29, 29..44, 44..59. Banks above the SH degree are unused buffers of minimum size.
+    /// The four banks: columns 0..14, 14..29, 29..44, 44..59. Banks above the SH degree are unused buffers of minimum
+    /// size.
     pub fn banks(&self) -> [&wgpu::Buffer; 4] {
         self.banks.each_ref().map(|bank| &**bank)
     }

@@ -5,8 +5,8 @@ use std::sync::Arc;
 use super::device::Gpu;
 use super::options::{GpuOptions, Path};
 
-/// Opens a device, with the portable stages if `portable`. Without an adapter it prints "skipped" and returns `None`, or panics if
-/// `PLAT_GPU=required`.
+/// Opens a device, with the portable stages if `portable`. Without an adapter it prints "skipped" and returns `None`,
+/// or panics if `PLAT_GPU=required`.
 pub(super) fn gpu(portable: bool) -> Option<Arc<Gpu>> {
     let required = std::env::var("PLAT_GPU").is_ok_and(|value| value == "required");
     let options = GpuOptions {

@@ -1,7 +1,7 @@
 //! Time of each pipeline stage, by GPU timestamp queries.
 //!
-//! Without timestamp queries a recording can be cut off after n dispatches, so that a host clock measures how much later each stage
-//! ends. Recording is off by default and does not change results.
+//! Without timestamp queries a recording can be cut off after n dispatches, so that a host clock measures how much
+//! later each stage ends. Recording is off by default and does not change results.
 
 use super::device::Gpu;
 use super::error::GpuError;
@@ -23,8 +23,8 @@ impl Gpu {
         self.device().features().contains(TIMESTAMP_FEATURES)
     }
 
-    /// Starts a recording: until [`finish_timing`](Self::finish_timing) only the next `max_dispatches` dispatches are encoded, and the
-    /// end of each is timed.
+    /// Starts a recording: until [`finish_timing`](Self::finish_timing) only the next `max_dispatches` dispatches are
+    /// encoded, and the end of each is timed.
     pub fn start_timing(&self, max_dispatches: usize) {
         self.timestamps().start(self.device(), max_dispatches);
     }

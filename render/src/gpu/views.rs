@@ -7,8 +7,8 @@ use shaders::{MAX_VIEWS, TILE, View, Views};
 use super::error::GpuError;
 use crate::Options;
 
-/// Views of these cameras over so many trainable and context splats. Fails if the number of cameras is not in 1..=[`MAX_VIEWS`], or if a
-/// buffer would exceed `max_binding_bytes`.
+/// Views of these cameras over so many trainable and context splats. Fails if the number of cameras is not in
+/// 1..=[`MAX_VIEWS`], or if a buffer would exceed `max_binding_bytes`.
 pub(super) fn views_of(
     cameras: &[Camera],
     options: &Options,
@@ -27,7 +27,8 @@ pub(super) fn views_of(
         fits.ok_or(GpuError::TooLarge { what: "visible".into(), bytes, limit })
     };
     let area = |camera: &Camera| u64::from(camera.pinhole.width) * u64::from(camera.pinhole.height);
-    // Five planes of upstream gradients are the largest image buffer. The bound also keeps pixel and tile counts within 32 bits.
+    // Five planes of upstream gradients are the largest image buffer. The bound also keeps pixel and tile counts within
+    // 32 bits.
     let bytes = 20 * cameras.iter().map(area).sum::<u64>();
     if bytes > limit {
         return Err(GpuError::TooLarge { what: "upstream".into(), bytes, limit });

@@ -1,22 +1,22 @@
-//! Scenes that are not nice: what every backend is drawn against.
+//! Difficult random scenes, and the comparison of a frame with the f64 reference.
 
 use render::Frame;
 use scene::{Camera, Splats};
 
 use super::{Random, Scene, camera};
 
-/// What every pixel may be off by, where no decision is near.
+/// Tolerance of every unambiguous pixel.
 pub(crate) const TOLERANCE: f64 = 2e-3;
 
-/// Sizes of images, most of them no multiple of a tile.
+/// Image sizes, most of them not a multiple of the tile size.
 pub(crate) const SIZES: [(u32, u32); 6] = [(1, 1), (3, 5), (16, 16), (17, 33), (64, 4), (250, 187)];
 
-/// A camera whose field of view is the same at every size.
+/// A camera with the same field of view at every size.
 pub(crate) fn camera_of(width: u32, height: u32) -> Camera {
     camera(width, height, 0.9 * f64::from(width.max(height)))
 }
 
-/// What sort of splats a scene has besides common ones.
+/// The special kind of splats in a scene.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum Kind {
     Common,
@@ -44,7 +44,7 @@ pub(crate) const KINDS: [Kind; 10] = [
     Kind::Far,
 ];
 
-/// Every third splat is of this kind.
+/// A random scene in which every third splat is of this kind, the others common.
 pub(crate) fn mixture(random: &mut Random, camera: &Camera, kind: Kind, count: usize) -> Splats {
     let (width, height) = (camera.pinhole.width as f32, camera.pinhole.height as f32);
     let mut splats = Splats::new(2);
@@ -75,22 +75,22 @@ pub(crate) fn mixture(random: &mut Random, camera: &Camera, kind: Kind, count: u
     splats
 }
 
-/// How many pixels are not as in the reference.
+/// Counts of pixels that differ from the reference.
 #[derive(Default)]
 pub(crate) struct Tally {
     pub(crate) pixels: usize,
-    /// Pixels near a decision.
-    pub(crate) unsure: usize,
+    /// Pixels within 0.1 % of a threshold (α cut, clamp, early stop, depth order), where f32 may decide differently.
+    pub(crate) ambiguous: usize,
     pub(crate) off: usize,
-    pub(crate) off_though_sure: usize,
-    pub(crate) worst_sure: f64,
+    pub(crate) off_unambiguous: usize,
+    pub(crate) worst_unambiguous: f64,
 }
 
 impl Tally {
     pub(crate) fn add(&mut self, frame: &Frame, scene: &Scene) {
         let image = scene.render();
         let area = image.transmittance.len();
-        // Depth is in units of the farthest splat that can be seen well.
+        // Depth errors are relative to the largest depth.
         let far = image.depth.iter().fold(1.0, |m: f64, &d| m.max(d));
         for i in 0..area {
             let difference = |a: &[f32], b: &[f64], i: usize| (f64::from(a[i]) - b[i]).abs();
@@ -99,13 +99,13 @@ impl Tally {
             error = error.max(difference(&frame.trainable_alpha, &image.trainable_alpha, i));
             error = error.max(difference(&frame.depth, &image.depth, i) / far);
             self.pixels += 1;
-            let unsure = image.margin[i] < 1e-3;
-            self.unsure += usize::from(unsure);
+            let ambiguous = image.margin[i] < 1e-3;
+            self.ambiguous += usize::from(ambiguous);
             let off = error.is_nan() || error > TOLERANCE;
             self.off += usize::from(off);
-            if !unsure {
-                self.off_though_sure += usize::from(off);
-                self.worst_sure = self.worst_sure.max(error);
+            if !ambiguous {
+                self.off_unambiguous += usize::from(off);
+                self.worst_unambiguous = self.worst_unambiguous.max(error);
             }
         }
     }

@@ -1,11 +1,11 @@
-//! The renderer once more, as plainly as its definition and in f64: project, sort, blend pixel by pixel.
+//! A reference renderer in f64: project, sort, blend pixel by pixel.
 //!
-//! Written from DESIGN section 4 and the papers, not from the backends: covariances are matrix products, spherical harmonics
-//! come from Legendre polynomials, every pixel visits every splat. Beside the image it says how near each pixel came to a
-//! decision (α cut, clamp, early stop, depth order), because there f32 may rightly decide otherwise and central
-//! differences mean nothing.
+//! It is written from the definition and the papers, independently of the backends: covariances are matrix products,
+//! spherical harmonics come from Legendre polynomials, every pixel visits every splat. It also reports how close each
+//! pixel is to a threshold (α cut, clamp, early stop, depth order): near a threshold f32 may decide differently, and
+//! central differences are invalid.
 
-#![allow(dead_code)] // each test program uses a part
+#![allow(dead_code)] // each test binary uses a part
 
 pub(crate) mod mixture;
 pub(crate) mod tensors;
@@ -14,7 +14,7 @@ use glam::{DMat3, DQuat, DVec2, DVec3};
 use render::{ALPHA_MAX, ALPHA_MIN, LOW_PASS, NEAR_METRES, Options, TRANSMITTANCE_MIN};
 use scene::{Camera, Pinhole, Rigid, Splat, Splats, column};
 
-/// What is drawn, every number f64 so that it can be moved by a millionth.
+/// A scene in f64, which allows central differences with steps of 1e-6.
 #[derive(Debug, Clone)]
 pub(crate) struct Scene {
     /// As in [`scene::Splats`], trainable splats first, then the context.
@@ -27,7 +27,7 @@ pub(crate) struct Scene {
     pub(crate) options: Options,
 }
 
-/// A [`render::Frame`] in f64, and more.
+/// A [`render::Frame`] in f64 with statistics.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Image {
     pub(crate) colour: Vec<f64>,
@@ -36,18 +36,18 @@ pub(crate) struct Image {
     pub(crate) trainable_alpha: Vec<f64>,
     /// Σ αT of each splat.
     pub(crate) weight: Vec<f64>,
-    /// For each pixel the relative distance to the nearest decision.
+    /// Relative distance of each pixel to the nearest threshold.
     pub(crate) margin: Vec<f64>,
-    /// The same for decisions taken once per splat: near plane, clamped Jacobian, colour clamped at 0.
+    /// The same for thresholds evaluated once per splat: near plane, clamped Jacobian, colour clamped at 0.
     pub(crate) splat_margin: f64,
 }
 
-/// A splat in the view.
+/// A projected splat.
 struct Ellipse {
     index: usize,
     z: f64,
     mean: DVec2,
-    /// Inverse of the blurred covariance: xx, xy, yy.
+    /// Inverse of the covariance after the low-pass filter: xx, xy, yy.
     conic: [f64; 3],
     opacity: f64,
     colour: DVec3,
@@ -60,7 +60,13 @@ impl Scene {
             all.append(context);
         }
         let columns = all.columns().iter().map(|c| c.iter().map(|&v| f64::from(v)).collect()).collect();
-        Self { columns, trainable: splats.len(), shift: vec![DVec2::ZERO; all.len()], camera: *camera, options: *options }
+        Self {
+            columns,
+            trainable: splats.len(),
+            shift: vec![DVec2::ZERO; all.len()],
+            camera: *camera,
+            options: *options,
+        }
     }
 
     pub(crate) fn render(&self) -> Image {
@@ -96,7 +102,7 @@ impl Scene {
         if p.z <= near {
             return None;
         }
-        // Jacobian of the projection at the centre, clamped to the view's cone and 15 % of the image beyond.
+        // Jacobian of the projection at the centre, clamped to the view and 15 % of the image beyond.
         let mut clamped = |ratio: f64, centre: f64, length: u32, focal: f64| {
             let length = f64::from(length);
             let (low, high) = ((-centre - 0.15 * length) / focal, (length - centre + 0.15 * length) / focal);
@@ -122,14 +128,14 @@ impl Scene {
         let a = jacobian * w * m;
         let cov = a * a.transpose();
         let (xx, xy, yy) = (cov.x_axis.x, cov.x_axis.y, cov.y_axis.y);
-        // The determinant of A·Aᵀ as a sum of squares (Cauchy and Binet): no cancellation, even in needles.
+        // The determinant of A·Aᵀ as a sum of squares (Cauchy-Binet), which does not cancel for needles.
         let minor = |c: usize, d: usize| (a.col(c).x * a.col(d).y - a.col(c).y * a.col(d).x).powi(2);
-        let sharp = minor(0, 1) + minor(0, 2) + minor(1, 2);
-        let blur = f64::from(LOW_PASS);
-        let blurred = sharp + blur * (xx + yy) + blur * blur;
+        let det0 = minor(0, 1) + minor(0, 2) + minor(1, 2);
+        let low_pass = f64::from(LOW_PASS);
+        let det1 = det0 + low_pass * (xx + yy) + low_pass * low_pass;
         let mut opacity = 1.0 / (1.0 + (-value(column::OPACITY)).exp());
         if self.options.antialiased {
-            opacity *= (sharp / blurred).sqrt();
+            opacity *= (det0 / det1).sqrt();
         }
 
         let direction = (vector(column::MEAN) - self.camera.centre()).normalize();
@@ -146,7 +152,7 @@ impl Scene {
             index: i,
             z: p.z,
             mean: DVec2::new(k.fx * p.x / p.z + k.cx, k.fy * p.y / p.z + k.cy) + self.shift[i],
-            conic: [(yy + blur) / blurred, -xy / blurred, (xx + blur) / blurred],
+            conic: [(yy + low_pass) / det1, -xy / det1, (xx + low_pass) / det1],
             opacity,
             colour: colour.max(DVec3::ZERO),
         })
@@ -161,7 +167,7 @@ impl Scene {
             let d = centre - e.mean;
             let power = 0.5 * (e.conic[0] * d.x * d.x + e.conic[2] * d.y * d.y) + e.conic[1] * d.x * d.y;
             if power > 7.0 {
-                continue; // exp(-7) is a quarter of the cut
+                continue; // exp(-7) is a quarter of ALPHA_MIN
             }
             let raw = e.opacity * (-power).exp();
             nearest = nearest.min((raw / alpha_min - 1.0).abs()).min((raw / alpha_max - 1.0).abs());
@@ -170,7 +176,7 @@ impl Scene {
             }
             let alpha = raw.min(alpha_max);
             let next = transmittance * (1.0 - alpha);
-            nearest = nearest.min((next / stop - 1.0).abs()).min(10.0 * (e.z / last_z - 1.0)); // f32 depths are exact enough
+            nearest = nearest.min((next / stop - 1.0).abs()).min(10.0 * (e.z / last_z - 1.0)); // f32 depths are accurate to far less than this
             if next <= stop {
                 break;
             }
@@ -194,7 +200,7 @@ impl Scene {
 }
 
 impl Image {
-    /// How near the whole image came to a decision.
+    /// Distance of the whole image to the nearest threshold.
     pub(crate) fn nearest(&self) -> f64 {
         self.margin.iter().fold(self.splat_margin, |a, &b| a.min(b))
     }
@@ -226,7 +232,7 @@ fn harmonic(l: i64, m: i64, d: DVec3) -> f64 {
     phase * norm.sqrt() * along_z * if m < 0 { im } else { re }
 }
 
-/// Random numbers by SplitMix64: the same on every machine.
+/// Random numbers by SplitMix64, the same on every machine.
 #[derive(Debug, Clone)]
 pub(crate) struct Random(pub(crate) u64);
 
@@ -246,7 +252,7 @@ impl Random {
         (0..len).map(|_| self.range(-1.0, 1.0)).collect()
     }
 
-    /// A splat at a pixel and a depth with about this size in pixels; turned, stretched and coloured at random.
+    /// A splat at a pixel and depth with about this size in pixels, with random rotation, stretch and colour.
     pub(crate) fn splat(&mut self, camera: &Camera, pixel: [f32; 2], z: f32, sigma_pixels: f32) -> Splat {
         let k = &camera.pinhole;
         let z = f64::from(z);
@@ -267,7 +273,7 @@ impl Random {
     }
 }
 
-/// A camera askew in the world, its principal point off the centre, its pixels not square.
+/// A rotated camera with an off-centre principal point and non-square pixels.
 pub(crate) fn camera(width: u32, height: u32, focal: f64) -> Camera {
     Camera {
         pinhole: Pinhole {

@@ -1,4 +1,4 @@
-//! The float64 reference tensors of `../shared/oracle`, and what a backend must agree with them to.
+//! The float64 oracle tensors of `../shared/oracle`, and the comparison of a backend with them.
 
 use std::collections::BTreeMap;
 use std::io::Read;
@@ -101,7 +101,7 @@ pub(crate) fn cosine(a: &[f32], b: &[f64]) -> (f64, f64) {
 }
 
 impl Case {
-    /// The gradient that the tensors' gradients follow from.
+    /// The upstream gradient of the tensors.
     pub(crate) fn upstream(&self) -> Upstream {
         Upstream {
             colour: planes(&self.arrays["dL_dimage"].1, 3),

@@ -56,7 +56,8 @@ pub trait Lanes:
     fn exp2(self) -> Self {
         self.max(Self::splat(-126.0)).min(Self::splat(126.0)).exp2_in_range()
     }
-    /// `exp2` for exponents up to 126. Below -126 the result is at most 2^-126, and may be NaN where `self` is not finite.
+    /// `exp2` for exponents up to 126. Below -126 the result is at most 2^-126, and may be NaN where `self` is not
+    /// finite.
     #[inline(always)]
     fn exp2_at_most(self) -> Self {
         self.max(Self::splat(-126.0)).exp2_in_range()

@@ -1,4 +1,5 @@
-//! The lanes in x86-64 registers: one of AVX-512 or two of AVX2. The module [`simd`](super) explains why calling the intrinsics is safe.
+//! The lanes in x86-64 registers: one of AVX-512 or two of AVX2. The module [`simd`](super) explains why calling the
+//! intrinsics is safe.
 
 use std::arch::x86_64::*;
 use std::ops::{Add, Div, Mul, Neg, Sub};
@@ -220,8 +221,8 @@ impl Lanes for Avx2 {
     fn select(mask: u16, a: Self, b: Self) -> Self {
         unsafe { Self(_mm256_blendv_ps(b.0, a.0, Self::mask(mask)), _mm256_blendv_ps(b.1, a.1, Self::mask(mask >> 8))) }
     }
-    // AVX2 comparisons give vector masks. These overrides keep them, as the conversion to a 16-bit mask and back dominates a
-    // rasterizer's loop.
+    // AVX2 comparisons give vector masks. These overrides keep them, as the conversion to a 16-bit mask and back
+    // dominates a rasterizer's loop.
     #[inline(always)]
     fn where_le(self, a: Self, b: Self) -> Self {
         unsafe {
