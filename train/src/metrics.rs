@@ -316,6 +316,41 @@ mod tests {
         assert!(colour_corrected_psnr(&broken, &photo, Some(&mask)).unwrap() > 80.0);
     }
 
+    /// The same fit by normal equations with an explicit inverse, which is accurate for well-conditioned colours only.
+    fn psnr_by_normal_equations(render: &[f32], photo: &[f32]) -> f64 {
+        let area = render.len() / 3;
+        let at = |image: &[f32], i: usize| DVec3::from_array([0, 1, 2].map(|c| f64::from(image[c * area + i])));
+        let mean = |image: &[f32]| (0..area).map(|i| at(image, i)).sum::<DVec3>() / area as f64;
+        let (mean_render, mean_photo) = (mean(render), mean(photo));
+        let (mut rr, mut rp) = (DMat3::ZERO, DMat3::ZERO);
+        for i in 0..area {
+            let (r, p) = (at(render, i) - mean_render, at(photo, i) - mean_photo);
+            rr += DMat3::from_cols(r * r.x, r * r.y, r * r.z);
+            rp += DMat3::from_cols(r * p.x, r * p.y, r * p.z);
+        }
+        let ridge = 1e-9 * (rr.col(0)[0] + rr.col(1)[1] + rr.col(2)[2]) + 1e-9;
+        let transform = ((rr + DMat3::from_diagonal(DVec3::splat(ridge))).inverse() * rp).transpose();
+        let mut corrected = render.to_vec();
+        for i in 0..area {
+            let colour = mean_photo + transform * (at(render, i) - mean_render);
+            (0..3).for_each(|c| corrected[c * area + i] = colour[c].clamp(0.0, 1.0) as f32);
+        }
+        psnr(&corrected, photo, None).unwrap()
+    }
+
+    #[test]
+    fn colour_correction_agrees_with_normal_equations_on_well_conditioned_colours() {
+        let photo = picture(40, 30, 0.0);
+        for (phase, amplitude, gain) in [(0.0, 0.02, 1.0), (0.0, 0.1, 0.7), (0.3, 0.05, 1.2), (0.9, 0.0, 1.0)] {
+            let shifted = picture(40, 30, phase);
+            let render: Vec<f32> =
+                shifted.iter().enumerate().map(|(i, v)| gain * v + 0.05 + noise(i, amplitude)).collect();
+            let (found, expected) =
+                (colour_corrected_psnr(&render, &photo, None).unwrap(), psnr_by_normal_equations(&render, &photo));
+            assert!((found - expected).abs() < 1e-6, "{phase} {amplitude} {gain}: {found} against {expected}");
+        }
+    }
+
     #[test]
     fn the_pseudo_inverse_inverts_the_range() {
         let rank_three = DMat3::from_cols_array(&[4.0, 1.0, 0.5, 1.0, 3.0, -0.2, 0.5, -0.2, 2.0]);

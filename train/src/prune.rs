@@ -1,6 +1,5 @@
 //! Prunes splats within a PSNR tolerance: the fewest splats whose PSNR on the training views stays above a floor.
 //!
-//!
 //! ```text
 //! recovery without a cut → floor
 //! repeat: importance → cut to `drop_db` below the floor (bisection) → recovery: train without densification
