@@ -1,19 +1,20 @@
-//! The speed-accuracy chart: for each scene a row of panels (held-out PSNR over CPU seconds, PSNR over splats, perceptual measures
-//! over CPU seconds), as SVG that is legible on light and dark pages. Plain text in, plain text out; the same lines give the
-//! same bytes.
+//! Draws the chart of quality over cost as SVG for light and dark pages.
+//!
+//! Each scene has a row of panels: held-out PSNR over CPU seconds, PSNR over splats, perceptual measures over CPU seconds. The same lines
+//! give the same bytes.
 
 mod panel;
 
 use std::fmt::Write;
 
 use crate::{Averaged, ResultLine, averaged, scenes};
-use panel::{GAP, Measure, Point, ROW, Series, panel};
+use panel::{GAP, Measure, Point, ROW, Series, escape, panel};
 
 const LEFT: f64 = 8.0;
 const HEADER: f64 = 50.0;
-/// Height of a scene's name.
+/// Height of the line with a scene's name.
 const NAME: f64 = 26.0;
-/// Colours of runs, told apart by most kinds of sight (Okabe and Ito 2008), as light and dark themes show them.
+/// Colours of runs for light and dark themes, distinguishable with colour vision deficiencies (Okabe and Ito 2008).
 const COLOURS: [(&str, &str); 6] = [
     ("#0072b2", "#56b4e9"),
     ("#d55e00", "#ff9040"),
@@ -26,9 +27,9 @@ const COLOURS: [(&str, &str); 6] = [
 /// A scene and its panels.
 type Row<'a> = (&'a str, Vec<(Measure, Vec<Series>)>);
 
-/// Draws the latest run of each scene and label (of several seeds the mean), and the references dashed. A run with one
-/// configuration is its curve over time; of several, as a sweep leaves, each is a point and a line joins them. Measures that nobody has of a scene
-/// have no panel there, scenes with neither run nor reference no row.
+/// Draws the latest run of each scene and label (of several seeds the mean), and the references dashed. A label with one configuration
+/// is drawn as its curve over time; with several, as one point each, joined by a line. Measures without values have no panel, scenes
+/// without runs and references no row.
 pub fn chart(lines: &[ResultLine], reference: &[ResultLine]) -> String {
     let [runs, references] = [lines, reference].map(averaged);
     let scenes = scenes(runs.iter().chain(&references).map(|run| &run.line));
@@ -62,7 +63,7 @@ pub fn chart(lines: &[ResultLine], reference: &[ResultLine]) -> String {
             Some(run) if run.line.downscale > 1 => format!(", 1/{} of its size", run.line.downscale),
             _ => String::new(),
         };
-        // writing to a String cannot fail
+        // Writing to a String cannot fail.
         let _ = writeln!(svg, "<text class=\"scene\" x=\"20\" y=\"{}\">{}{size}</text>", y + 18.0, escape(scene));
         let mut x = LEFT;
         for (measure, series) in panels {
@@ -73,7 +74,7 @@ pub fn chart(lines: &[ResultLine], reference: &[ResultLine]) -> String {
     svg + "</svg>\n"
 }
 
-/// What runs are called, each once, in the order of their first appearance.
+/// The labels of runs in order of first appearance.
 fn labels(runs: &[Averaged]) -> Vec<&str> {
     let mut labels: Vec<&str> = Vec::new();
     for run in runs {
@@ -84,7 +85,7 @@ fn labels(runs: &[Averaged]) -> Vec<&str> {
     labels
 }
 
-/// Each label's line in a panel; references where no `labels` give them colours.
+/// The series of each label in a panel. Without `coloured` labels they are drawn as references.
 fn series_of(runs: &[Averaged], scene: &str, measure: Measure, coloured: Option<&[&str]>) -> Vec<Series> {
     let of_scene: Vec<&Averaged> = runs.iter().filter(|run| run.line.scene == scene).collect();
     let mut series: Vec<Series> = Vec::new();
@@ -98,7 +99,7 @@ fn series_of(runs: &[Averaged], scene: &str, measure: Measure, coloured: Option<
             [one] => measure.curve(&one.line),
             _ => all.iter().flat_map(|run| measure.end(&run.line, &run.variant)).collect(),
         };
-        // As time went, for a curve; as a sweep goes, for its points.
+        // By cost: time of a curve, cost of a sweep's points.
         points.sort_by(|a, b| a.x.total_cmp(&b.x));
         let colour = coloured.and_then(|labels| labels.iter().position(|of| of == label));
         let class = colour.map_or("reference".to_owned(), |n| format!("c{}", n % COLOURS.len()));
@@ -109,8 +110,7 @@ fn series_of(runs: &[Averaged], scene: &str, measure: Measure, coloured: Option<
     series
 }
 
-/// Every run's name once, with a sample of its line, in rows under the title; the references come last. And where the panels
-/// begin.
+/// The legend in rows below the title, references last; and the y coordinate at which the panels begin.
 fn legend(runs: &[&str], references: &[&str], right: f64) -> (String, f64) {
     const LETTER: f64 = 6.6;
     const LINE: f64 = 18.0;
@@ -160,10 +160,6 @@ fn style() -> String {
     css
 }
 
-fn escape(text: &str) -> String {
-    text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -184,9 +180,9 @@ mod tests {
         let reference = [line("OpenSplat", "fox", &[(0.6, 12.1), (71.0, 19.4), (1338.0, 28.48)])];
         let svg = chart(&runs, &reference);
         assert_eq!(svg.matches("class=\"scene\"").count(), 2);
-        // PSNR over time and over splats; nobody measured anything else.
+        // PSNR over time and over splats; nothing else was measured.
         assert_eq!(svg.matches("class=\"panel\"").count(), 4);
-        // each curve, and one sample per label in the legend
+        // One line per curve, and one per label in the legend.
         assert_eq!(svg.matches("line reference\"").count(), 1 + 1);
         assert_eq!(svg.matches("line c0\"").count(), 2 + 1);
         assert_eq!(svg.matches("line c1\"").count(), 1 + 1);
@@ -195,7 +191,7 @@ mod tests {
     }
 
     #[test]
-    fn perceptual_measures_have_panels_where_they_were_measured() {
+    fn perceptual_measures_have_panels_if_they_were_measured() {
         let mut runs = [line("plat", "fox", &[(1.0, 15.0)]), line("plat", "street", &[(2.0, 16.0)])];
         runs[0].perceptual = Some(-16.2);
         runs[1].perceptual = Some(33.3);
@@ -207,7 +203,7 @@ mod tests {
     }
 
     #[test]
-    fn a_sweep_is_a_line_of_its_ends() {
+    fn a_sweep_is_drawn_as_a_line_of_final_points() {
         let end = |steps: u32, seconds: f64, psnr: f64| ResultLine {
             steps: Some(steps),
             seed: Some(0),
@@ -221,7 +217,7 @@ mod tests {
     }
 
     #[test]
-    fn one_point_and_no_point_draw() {
+    fn one_point_or_none_can_be_drawn() {
         let svg = chart(&[line("plat", "fox", &[(10.0, 20.0)])], &[]);
         assert!(svg.contains("<circle") && !svg.contains("NaN"));
         assert!(!chart(&[], &[]).contains("NaN"));

@@ -1,8 +1,7 @@
-//! What a run leaves for people: result lines, the chart and table drawn from them, contact sheets, bird's-eye cameras.
+//! Result lines of measured runs, and the chart and tables that are drawn from them.
 //!
-//! `bench/results/*.jsonl` holds one [`ResultLine`] per run and is never edited by hand; the README's chart and table
-//! are functions of it and of what other trainers reached ([`reference`]). Lines with a `kind` are measurements of a part
-//! ([`PartLine`]).
+//! `bench/results/*.jsonl` holds one [`ResultLine`] per run and is never edited by hand. Chart and tables are functions of these lines and of
+//! other trainers' figures ([`reference`]). Lines with a `kind` are measurements of a component ([`PartLine`]).
 
 pub mod chart;
 pub mod parts;
@@ -22,10 +21,10 @@ pub use parts::{PartLine, append_part};
 pub use seeds::{Averaged, averaged};
 pub use table::{replace_table, short_table, table};
 
-/// One run, as one line of JSON. What was not measured is null.
+/// One run as one line of JSON. Figures that were not measured are null.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct ResultLine {
-    /// What the chart calls the run: `plat tree`, `OpenSplat`.
+    /// Label of the run in the chart: `plat tree`, `OpenSplat`.
     pub label: String,
     /// The program's git commit.
     pub commit: String,
@@ -33,18 +32,18 @@ pub struct ResultLine {
     pub machine: String,
     /// The capture's name: `fox`, `street_lund`.
     pub scene: String,
-    /// Photos were used at one over this of their size.
+    /// Divisor of the photos' size.
     #[serde(default = "one")]
     pub downscale: u32,
     /// Hash of the resolved configuration.
     pub config_hash: Option<String>,
-    /// Steps that were planned; null where nobody noted them.
+    /// Planned optimiser steps; null in old lines.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub steps: Option<u32>,
-    /// Splats that were planned, likewise.
+    /// Planned number of splats; null in old lines.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub budget: Option<u32>,
-    /// Loss of PSNR that pruning was allowed, dB, likewise; 0 = nothing was pruned.
+    /// Tolerance of pruning, dB; 0 = no pruning; null in old lines.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub tolerance_db: Option<f64>,
     /// Backend and its instruction set or adapter.
@@ -53,24 +52,24 @@ pub struct ResultLine {
     pub workers: u32,
     /// Wall time of training, seconds.
     pub wall_seconds: Option<f64>,
-    /// User and system time of training, image loading included, evaluation not, seconds.
+    /// User and system time of training, seconds; with image loading, without evaluation.
     pub cpu_seconds: f64,
-    /// Held-out views, dB.
+    /// PSNR over held-out views, dB.
     pub psnr: f64,
-    /// Held-out views, dB, each after the affine transform of colours that comes nearest to its photo.
+    /// PSNR over held-out views after an affine colour correction of each view, dB.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub cc_psnr: Option<f64>,
-    /// Held-out views, 0..1.
+    /// SSIM over held-out views, 0..1.
     pub ssim: Option<f64>,
-    /// Held-out views.
+    /// LPIPS over held-out views.
     pub lpips: Option<f64>,
     /// SSIMULACRA2 over held-out views, up to 100.
     pub perceptual: Option<f64>,
     /// PSNR inside object zones, dB.
     pub zone_psnr: Option<f64>,
-    /// Share of the photos' detections that the renders keep.
+    /// Share of the detections on photos that are also detected on renders.
     pub detections_kept: Option<f64>,
-    /// Splats at the end.
+    /// Final number of splats.
     pub splats: Option<u64>,
     /// Size of the model, bytes.
     pub bytes: Option<u64>,
@@ -82,21 +81,21 @@ pub struct ResultLine {
     pub fps: Option<f64>,
     /// The run's seed.
     pub seed: Option<u64>,
-    /// The command that made the line.
+    /// The command that wrote the line.
     pub command: String,
-    /// Held-out PSNR along the way, in order of time.
+    /// Held-out PSNR during training, in order of time.
     #[serde(default)]
     pub curve: Vec<CurvePoint>,
-    /// Where a reference's figures come from; null for our own runs.
+    /// Source of a reference's figures; null for runs of plat.
     pub source: Option<String>,
 }
 
-/// A report during a run.
+/// A measurement during training.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct CurvePoint {
-    /// Since the start, as [`ResultLine::cpu_seconds`].
+    /// CPU seconds since the start, as [`ResultLine::cpu_seconds`].
     pub cpu_seconds: f64,
-    /// Held-out views, dB.
+    /// PSNR over held-out views, dB.
     pub psnr: f64,
     /// Splats at that time.
     pub splats: Option<u64>,
@@ -106,7 +105,7 @@ fn one() -> u32 {
     1
 }
 
-/// CPU seconds until a curve first reaches this PSNR, interpolated between its points; `None` if it never does.
+/// CPU seconds until a curve first reaches this PSNR, interpolated linearly between its points; `None` if it never does.
 pub fn cpu_seconds_to(curve: &[CurvePoint], psnr: f64) -> Option<f64> {
     let reached = curve.iter().position(|p| p.psnr >= psnr)?;
     let at = curve[reached];
@@ -116,12 +115,12 @@ pub fn cpu_seconds_to(curve: &[CurvePoint], psnr: f64) -> Option<f64> {
 }
 
 impl ResultLine {
-    /// As the function, of this run's curve.
+    /// [`cpu_seconds_to`] of this run's curve.
     pub fn cpu_seconds_to(&self, psnr: f64) -> Option<f64> {
         cpu_seconds_to(&self.curve, psnr)
     }
 
-    /// The best PSNR of the curve and the end, dB.
+    /// The highest PSNR of the curve and the end, dB.
     pub fn best_psnr(&self) -> f64 {
         self.curve.iter().map(|p| p.psnr).fold(self.psnr, f64::max)
     }
@@ -134,10 +133,10 @@ impl ResultLine {
     }
 }
 
-/// Appends a line to a results file, which it makes if need be.
+/// Appends a line to a results file; creates the file if it does not exist.
 ///
 /// # Errors
-/// A number that is not finite (JSON has none), or a file that cannot be written.
+/// A number that is not finite, which JSON cannot hold, or a file that cannot be written.
 pub fn append(path: &Path, line: &ResultLine) -> Result<(), SaveError> {
     append_line(path, line, line.is_finite())
 }
@@ -153,7 +152,7 @@ fn append_line(path: &Path, line: &impl Serialize, is_finite: bool) -> Result<()
     store::file::append(&mut file, text.as_bytes()).map_err(refuse)
 }
 
-/// Whether a line is of a [`PartLine`].
+/// Whether a line is a [`PartLine`].
 fn is_part(line: &str) -> bool {
     #[derive(Deserialize)]
     struct Kind {
@@ -162,7 +161,7 @@ fn is_part(line: &str) -> bool {
     serde_json::from_str(line).is_ok_and(|Kind { kind }| kind.is_some())
 }
 
-/// The runs of a results file, in order; empty lines and those of parts are skipped.
+/// The runs of a results file, in order. Empty lines and component measurements are skipped.
 ///
 /// # Errors
 /// A file that cannot be read, or a line that is not a result.
@@ -174,7 +173,7 @@ pub fn read(path: &Path) -> Result<Vec<ResultLine>, BadInput> {
     let parse = |(i, line): (usize, &str)| -> Result<ResultLine, BadInput> {
         let bad =
             |what: String| BadInput::new(format!("{name}:{}", i + 1), what, "restore the line from version control");
-        let line: ResultLine = serde_json::from_str(line).map_err(|e| bad(format!("is no result line: {e}")))?;
+        let line: ResultLine = serde_json::from_str(line).map_err(|e| bad(format!("is not a result line: {e}")))?;
         if line.is_finite() { Ok(line) } else { Err(bad("has a number that is not finite".into())) }
     };
     lines.map(parse).collect()
@@ -204,7 +203,7 @@ fn files(folder: &Path, extension: &str) -> Result<Vec<PathBuf>, BadInput> {
     Ok(paths)
 }
 
-/// CPU model and number of cores of this machine: `Intel(R) Xeon(R) CPU @ 2.50GHz, 2 cores`. No host name.
+/// CPU model and number of cores of this machine, without its host name: `Intel(R) Xeon(R) CPU @ 2.50GHz, 2 cores`.
 pub fn machine() -> String {
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
     let info = fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
@@ -213,7 +212,7 @@ pub fn machine() -> String {
     format!("{model}, {cores} core{}", if cores == 1 { "" } else { "s" })
 }
 
-/// Scenes in the order in which chart and table show them: those of the bench first, then others as they come.
+/// Scenes in the order of chart and table: the benchmark scenes first, then others in order of appearance.
 fn scenes<'a>(lines: impl Iterator<Item = &'a ResultLine>) -> Vec<&'a str> {
     const KNOWN: [&str; 4] = ["fox", "aerial_caliterra", "street_lund", "building_sceaux"];
     let mut scenes: Vec<&str> = Vec::new();
@@ -271,7 +270,7 @@ pub(crate) mod tests {
         };
         append_part(&path, &PartLine::Ingest(part.clone())).unwrap();
         assert!(append_part(&path, &PartLine::Ingest(parts::Ingest { cpu_seconds: f64::NAN, ..part })).is_err());
-        assert_eq!(read_folder(folder.path()).unwrap(), lines, "parts are no runs");
+        assert_eq!(read_folder(folder.path()).unwrap(), lines, "component lines are not runs");
         let not_finite = ResultLine { psnr: f64::NAN, ..lines[0].clone() };
         assert!(append(&path, &not_finite).is_err());
         assert_eq!(read(&path).unwrap().len(), 2);

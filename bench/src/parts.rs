@@ -1,5 +1,4 @@
-//! What was measured of one part of plat: lines beside those of the runs, told from them by their `kind`, that chart
-//! and table leave out.
+//! Result lines of component measurements. They have a `kind`; chart and tables skip them.
 
 use std::path::Path;
 
@@ -8,25 +7,25 @@ use store::file::SaveError;
 
 use crate::CurvePoint;
 
-/// A measurement of a part, as one line of JSON.
+/// A measurement of one component, as one line of JSON.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "lowercase")]
 pub enum PartLine {
-    /// The renderer's passes.
+    /// Times of the renderer's passes.
     Kernels(Kernels),
-    /// Photos to artefacts.
+    /// Ingest of a capture.
     Ingest(Ingest),
-    /// A model with fewer splats.
+    /// Pruning of a model.
     Prune(Prune),
-    /// A tree's levels, and its faces between blocks.
+    /// Levels and seams of a tree.
     Tree(Tree),
-    /// Training in another way.
+    /// Training with a variant of the recipe.
     Ablation(Ablation),
     /// A job on a cluster.
     Scale(Scale),
 }
 
-/// How long the renderer's passes take: medians.
+/// Median times of the renderer's passes.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Kernels {
     /// The program's git commit.
@@ -35,66 +34,66 @@ pub struct Kernels {
     pub machine: String,
     /// Backend and its instruction set or adapter.
     pub backend: String,
-    /// What sort of adapter it is: `discrete`, `integrated`, `virtual`, `software` or `other`; null on the CPU.
+    /// Class of the adapter: `discrete`, `integrated`, `virtual`, `software` or `other`; null on the CPU.
     #[serde(default)]
     pub adapter_class: Option<String>,
     /// Threads of the host.
     pub threads: u32,
-    /// Splats drawn.
+    /// Number of splats.
     pub splats: u64,
-    /// Pixels.
+    /// Width of the picture, pixels.
     pub width: u32,
-    /// Pixels.
+    /// Height of the picture, pixels.
     pub height: u32,
-    /// Views that a GPU drew side by side; pairs and times are a share of theirs, of one view. Null where one was drawn alone.
+    /// Views that a GPU rendered in one pass; pairs and times are per view. Null for single views.
     #[serde(default)]
     pub views: Option<u32>,
     /// Pairs of splat and tile.
     pub pairs: u64,
-    /// Blocks of 4×4 pixels that the CPU's rasterizer visited, each for one splat.
+    /// Blocks of 4×4 pixels visited by the CPU's rasterizer, summed over splats.
     #[serde(default)]
     pub visits: Option<u64>,
-    /// What one core can do, measured beside: fused multiply-adds, 10⁹ operations a second, a fused one counted as two.
+    /// Arithmetic ceiling of one core, measured in the same run: 10⁹ operations per second of fused multiply-adds, each counted as two.
     #[serde(default)]
     pub ceiling_gflops: Option<f64>,
-    /// What one core can move between memory and registers: 10⁹ bytes a second of a sum of two long arrays into a third.
+    /// Memory ceiling of one core: 10⁹ bytes per second when adding two long arrays into a third.
     #[serde(default)]
     pub ceiling_gbytes: Option<f64>,
     /// The stages.
     #[serde(default)]
     pub stages: Vec<StageTime>,
-    /// What timed the stages of a GPU: `device` (its own clock) or `wall` (a pass up to a stage's end less one up to its
-    /// beginning, each submitted and waited for); null on the CPU.
+    /// How the stages of a GPU were timed: `device` (timestamps) or `wall` (a pass that ends after the stage minus one that
+    /// ends before it); null on the CPU.
     #[serde(default)]
     pub clock: Option<String>,
-    /// CPU time of the process, milliseconds.
+    /// CPU time of the forward pass, milliseconds.
     pub forward_cpu_millis: f64,
-    /// CPU time of the process, milliseconds.
+    /// CPU time of the backward pass, milliseconds.
     pub backward_cpu_millis: f64,
-    /// Wall time, milliseconds.
+    /// Wall time of the forward pass, milliseconds.
     pub forward_wall_millis: f64,
-    /// Wall time, milliseconds.
+    /// Wall time of the backward pass, milliseconds.
     pub backward_wall_millis: f64,
-    /// The command that made the line.
+    /// The command that wrote the line.
     pub command: String,
 }
 
-/// How long a stage takes, and how much it does in that time.
+/// Time and throughput of a stage.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct StageTime {
     /// Its name.
     pub stage: String,
-    /// CPU time, milliseconds: median; null on a GPU.
+    /// Median CPU time, milliseconds; null on a GPU.
     pub cpu_millis: Option<f64>,
-    /// Time on the device, milliseconds: median; null on the CPU.
+    /// Median time on the device, milliseconds; null on the CPU.
     #[serde(default)]
     pub device_millis: Option<f64>,
-    /// Arithmetic by the count of the stage's inner loop, 10⁹ operations a second and core; null where it is not what the
-    /// stage is about.
+    /// 10⁹ operations per second and core, by the operation count of the stage's inner loop; null for stages that are not bound by
+    /// arithmetic.
     pub gflops: Option<f64>,
-    /// Bytes that it must read and write at least, 10⁹ a second and core; null likewise.
+    /// 10⁹ bytes per second and core that the stage must at least read and write; null for stages that are not bound by memory.
     pub gbytes: Option<f64>,
-    /// The larger of the two over its ceiling.
+    /// The throughput as a share of its ceiling.
     pub of_ceiling: Option<f64>,
 }
 
@@ -107,37 +106,37 @@ pub struct Ablation {
     pub machine: String,
     /// The capture's name.
     pub scene: String,
-    /// Photos were used at one over this of their size.
+    /// Divisor of the photos' size.
     pub downscale: u32,
     /// Backend and its instruction set or adapter.
     pub backend: String,
     /// Threads.
     pub threads: u32,
-    /// What was changed.
+    /// Name of the variant.
     pub variant: String,
     /// The run's seed.
     pub seed: u64,
     /// Steps.
     pub steps: u32,
-    /// Splats to end with.
+    /// Planned number of splats.
     pub budget: u32,
-    /// How long it took to reach what.
+    /// Time to each target PSNR.
     pub reached: Vec<Reached>,
-    /// Held-out views at the end, dB.
+    /// Final PSNR over held-out views, dB.
     pub psnr: f64,
     /// Splats at the end.
     pub splats: u64,
-    /// User and system time of all threads.
+    /// User and system time of all threads, seconds.
     pub cpu_seconds: f64,
-    /// Seconds.
+    /// Wall time, seconds.
     pub wall_seconds: f64,
-    /// Held-out PSNR along the way; the first point is the model that training starts from.
+    /// Held-out PSNR during training; the first point is the initial model.
     pub curve: Vec<CurvePoint>,
-    /// The command that made the line.
+    /// The command that wrote the line.
     pub command: String,
 }
 
-/// A job on a cluster of processes of one machine, whose store was empty.
+/// A job on a cluster of processes on one machine, with an empty store.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Scale {
     /// The program's git commit.
@@ -148,42 +147,42 @@ pub struct Scale {
     pub scene: String,
     /// Backend and its instruction set.
     pub backend: String,
-    /// The plan's name.
+    /// Id of the plan.
     pub plan: String,
     /// `file` or `s3`.
     pub store: String,
-    /// Workers.
+    /// Number of workers.
     pub workers: u32,
-    /// Threads of each.
+    /// Threads per worker.
     pub threads: u32,
-    /// Tasks.
+    /// Number of tasks.
     pub tasks: u64,
-    /// From when the job was accepted, its photos in the store, until it was done.
+    /// Seconds from the acceptance of the job, with all photos in the store, to its end.
     pub job_seconds: f64,
-    /// User and system time of all workers from their start to their end.
+    /// User and system time of all workers, seconds.
     pub cpu_seconds: f64,
-    /// What all workers read from the store.
+    /// Bytes that all workers read from the store.
     pub bytes_read: u64,
-    /// What all workers wrote to it.
+    /// Bytes that all workers wrote to the store.
     pub bytes_written: u64,
-    /// What of the reading was for windows of photos.
+    /// Bytes read for photo windows.
     pub window_bytes_read: u64,
-    /// The part of it that the windows' own pixels take of their tiles.
+    /// Part of these bytes for pixels inside the windows; the rest of each tile is outside.
     pub window_bytes_used: u64,
-    /// The command that made the line.
+    /// The command that wrote the line.
     pub command: String,
 }
 
-/// When a curve first reached a PSNR.
+/// The time at which a curve first reached a PSNR.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Reached {
-    /// Held-out views, dB.
+    /// Target PSNR over held-out views, dB.
     pub psnr: f64,
-    /// Interpolated between the curve's points; null if it never did.
+    /// Interpolated between the curve's points; null if it was never reached.
     pub cpu_seconds: Option<f64>,
 }
 
-/// What an ingest into an empty store took.
+/// Cost of an ingest into an empty store.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Ingest {
     /// The program's git commit.
@@ -192,27 +191,27 @@ pub struct Ingest {
     pub machine: String,
     /// The capture's name.
     pub scene: String,
-    /// Photos were used at one over this of their size.
+    /// Divisor of the photos' size.
     pub downscale: u32,
     /// Threads.
     pub threads: u32,
-    /// Photos.
+    /// Number of photos.
     pub photos: u64,
-    /// Their pixels at full size.
+    /// Pixels of all photos at full size.
     pub pixels: u64,
-    /// Seconds, the capture's cameras and points included.
+    /// Wall time, seconds; includes reading cameras and points.
     pub wall_seconds: f64,
-    /// User and system time of all threads, likewise.
+    /// User and system time of all threads, seconds.
     pub cpu_seconds: f64,
     /// Largest resident memory of the process, bytes.
     pub peak_memory_bytes: Option<u64>,
     /// Bytes written to the store.
     pub bytes_written: u64,
-    /// The command that made the line.
+    /// The command that wrote the line.
     pub command: String,
 }
 
-/// A model cut to a share of its splats, or pruned and healed within a tolerance.
+/// A model cut to a share of its splats, or pruned within a tolerance with recovery.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Prune {
     /// The program's git commit.
@@ -221,29 +220,29 @@ pub struct Prune {
     pub machine: String,
     /// The capture's name.
     pub scene: String,
-    /// Photos were used at one over this of their size.
+    /// Divisor of the photos' size.
     pub downscale: u32,
-    /// What went first.
+    /// Order of pruning.
     pub order: String,
-    /// Share kept, without healing; null where it follows from a tolerance.
+    /// Share kept, without recovery; null with a tolerance.
     pub keep: Option<f64>,
-    /// Loss allowed on the views that it was pruned by, dB, after healing.
+    /// Allowed loss on the views that it was pruned by after recovery, dB.
     pub tolerance_db: Option<f64>,
-    /// Splats before.
+    /// Number of splats before.
     pub splats_before: u64,
-    /// Splats now.
+    /// Number of splats after.
     pub splats: u64,
-    /// PSNR on the views that it was pruned by: before and now, dB.
+    /// PSNR on the views that it was pruned by: before and after, dB.
     pub held_in_psnr: [f64; 2],
-    /// PSNR on the held-out views: before and now, dB.
+    /// PSNR on the held-out views: before and after, dB.
     pub held_out_psnr: [f64; 2],
-    /// User and system time of all threads.
+    /// User and system time of all threads, seconds.
     pub cpu_seconds: f64,
-    /// The command that made the line.
+    /// The command that wrote the line.
     pub command: String,
 }
 
-/// What the levels of a tree lose, and what shows of the faces between its blocks. Figures are means over the held-out views.
+/// Quality of a tree's levels and at the seams between its blocks. Figures are means over the held-out views.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Tree {
     /// The program's git commit.
@@ -252,49 +251,49 @@ pub struct Tree {
     pub machine: String,
     /// The capture's name.
     pub scene: String,
-    /// Photos were used at one over this of their size.
+    /// Divisor of the photos' size.
     pub downscale: u32,
-    /// Splats of the finest model.
+    /// Splats of the finest cut.
     pub splats: u64,
-    /// The cuts of the tree, coarsest first.
+    /// Levels of the tree, coarsest first.
     pub levels: Vec<TreeLevel>,
-    /// The faces; null where the finest model is one block.
+    /// Figures at the seams; null if the finest cut is one block.
     pub faces: Option<TreeFaces>,
-    /// The command that made the line.
+    /// The command that wrote the line.
     pub command: String,
 }
 
-/// A cut of a tree at one level, and at its viewing distance: where its pixels are as large as the picture's.
+/// The cut of a tree at one level, at full resolution and at its viewing distance: where its pixels are as large as the picture's.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct TreeLevel {
-    /// Its level.
+    /// The level.
     pub level: u8,
-    /// Splats in it.
+    /// Splats of the cut.
     pub splats: f64,
-    /// PSNR at full size, dB.
+    /// PSNR at full resolution, dB.
     pub psnr: Option<f64>,
-    /// The viewing distance, as a mip of the photos.
+    /// Viewing distance as a mip of the photos.
     pub away_mip: f64,
-    /// PSNR there, dB: the cut's, the finest model's, and that of the finest model's most important splats, as many.
+    /// PSNR there, dB: of the cut, of the finest cut, and of as many of the finest cut's most important splats.
     pub away_psnr: [Option<f64>; 3],
 }
 
-/// The faces between the blocks of a finest model.
+/// Figures near the faces between the blocks of a finest cut.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct TreeFaces {
-    /// What counts as near a face, metres.
+    /// Half width of the band at a face, metres.
     pub seam_metres: f64,
-    /// Share of pixels near a face.
+    /// Share of pixels in the band.
     pub seam_share: f64,
-    /// PSNR near faces and elsewhere in the same views, dB.
+    /// PSNR in the band and elsewhere in the same views, dB.
     pub psnr: [Option<f64>; 2],
-    /// SSIM likewise.
+    /// SSIM in the band and elsewhere.
     pub ssim: [Option<f64>; 2],
-    /// ꟻLIP likewise.
+    /// ꟻLIP in the band and elsewhere.
     pub flip: [Option<f64>; 2],
     /// Step of the mean error across a face, mean over faces, levels of 255.
     pub step: Option<f64>,
-    /// PSNR at the same places of a model of the same capture that has no faces there, dB.
+    /// PSNR in the same regions of a model of the same capture without faces, dB.
     pub without_psnr: Option<[Option<f64>; 2]>,
 }
 
@@ -336,7 +335,7 @@ impl PartLine {
     }
 }
 
-/// Appends a measurement to a results file, which it makes if need be.
+/// Appends a measurement to a results file; creates the file if it does not exist.
 ///
 /// # Errors
 /// As [`crate::append`].

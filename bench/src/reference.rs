@@ -1,5 +1,4 @@
-//! What other trainers reached: `bench/reference/*.json`, a file for each trainer, with where its figures come from. Their
-//! code and builds stay out of the repository.
+//! Reads the figures of other trainers: `bench/reference/*.json`, one file per trainer, with its source.
 
 use std::fs;
 use std::path::Path;
@@ -9,31 +8,31 @@ use serde::Deserialize;
 
 use crate::{CurvePoint, ResultLine, files};
 
-/// A file: figures of one trainer, of one version on one machine.
+/// A file: figures of one version of one trainer on one machine.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Reference {
-    /// Its name, as chart and table show it.
+    /// Name of the trainer in chart and table.
     pub trainer: String,
     /// Release or commit.
     pub version: String,
-    /// What it ran on, see [`crate::machine`]; of a published figure, as its authors say.
+    /// The machine, see [`crate::machine`]; for published figures as the authors describe it.
     pub machine: String,
-    /// What computed.
+    /// Backend.
     pub backend: String,
-    /// Who measured it, how and where that is written.
+    /// Who measured the figures and where they are published.
     pub source: String,
     /// The runs.
     pub runs: Vec<Run>,
 }
 
-/// A run of another trainer. What was not measured is left out.
+/// A run of another trainer. Figures that were not measured are absent.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Run {
     /// As [`ResultLine::scene`].
     pub scene: String,
-    /// Photos were used at one over this of their size.
+    /// Divisor of the photos' size.
     pub downscale: u32,
     /// The command.
     pub command: String,
@@ -43,25 +42,25 @@ pub struct Run {
     pub cpu_seconds: f64,
     /// Wall time of training, seconds.
     pub wall_seconds: Option<f64>,
-    /// Held-out views, dB.
+    /// PSNR over held-out views, dB.
     pub psnr: f64,
-    /// Held-out views, 0..1.
+    /// SSIM over held-out views, 0..1.
     pub ssim: Option<f64>,
-    /// Held-out views.
+    /// LPIPS over held-out views.
     pub lpips: Option<f64>,
     /// SSIMULACRA2 over held-out views.
     pub perceptual: Option<f64>,
-    /// Splats at the end.
+    /// Final number of splats.
     pub splats: Option<u64>,
     /// Largest resident memory, bytes.
     pub peak_memory_bytes: Option<u64>,
-    /// Held-out PSNR along the way, in order of time.
+    /// Held-out PSNR during training, in order of time.
     #[serde(default)]
     pub curve: Vec<CurvePoint>,
 }
 
 impl Reference {
-    /// As lines beside our own, told from them by their source.
+    /// The runs as result lines; unlike plat's own they have a source.
     pub fn lines(&self) -> Vec<ResultLine> {
         let line = |run: &Run| ResultLine {
             label: self.trainer.clone(),
@@ -92,14 +91,15 @@ impl Reference {
 /// The lines of all of a folder's references, files in name order.
 ///
 /// # Errors
-/// A folder or a file that cannot be read, or is no reference.
+/// A folder or a file that cannot be read, or a file that is not a reference.
 pub fn read_references(folder: &Path) -> Result<Vec<ResultLine>, BadInput> {
     let mut lines = Vec::new();
     for path in files(folder, "json")? {
-        let bad = |what: String| BadInput::new(path.display().to_string(), what, "see the others there for its form");
+        let bad =
+            |what: String| BadInput::new(path.display().to_string(), what, "use the format of the other files there");
         let text = fs::read_to_string(&path).map_err(|e| bad(format!("cannot be read: {e}")))?;
         let reference: Reference =
-            serde_json::from_str(&text).map_err(|e| bad(format!("is no reference of a trainer: {e}")))?;
+            serde_json::from_str(&text).map_err(|e| bad(format!("is not a reference of a trainer: {e}")))?;
         lines.extend(reference.lines());
     }
     Ok(lines)
@@ -122,7 +122,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_reference_is_named() {
+    fn a_file_that_is_not_a_reference_is_named() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("other.json");
         for text in ["", "{}", "[1]", "{\"trainer\": \"a\", \"speed\": 9}"] {

@@ -1,4 +1,4 @@
-//! One run of several seeds: what chart and table show, as a seed alone moves PSNR by tenths of a decibel.
+//! Averages runs over their seeds. The seed alone changes PSNR by tenths of a decibel, so chart and table show means.
 
 use std::collections::BTreeMap;
 
@@ -7,24 +7,24 @@ use crate::{CurvePoint, ResultLine};
 /// The mean over the seeds of a run.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Averaged {
-    /// The last line of the run with its figures averaged; those that a seed lacks are null.
+    /// The last line of the run with averaged figures; a figure that any seed lacks is null.
     pub line: ResultLine,
-    /// In what its configuration differs from the others of its scene and label: `400 steps, 12000 splats`; empty where it is the only
-    /// one.
+    /// The settings in which it differs from the other configurations of its scene and label: `400 steps, 12000 splats`; empty if it is
+    /// the only one.
     pub variant: String,
     /// Number of seeds.
     pub seeds: usize,
-    /// Largest PSNR less the smallest, dB.
+    /// Largest minus smallest PSNR, dB.
     pub spread: f64,
 }
 
-/// For each scene and label, in the order of their first appearance, and for each configuration that the last line's commit ran: the mean
-/// over seeds, each seed's last one. Lines without a seed (references) stand alone.
+/// The mean over seeds for each scene and label, in order of first appearance, and each configuration that the last line's commit ran. Of
+/// several lines with the same seed the last one counts. Lines without a seed (references) are not averaged.
 pub fn averaged(lines: &[ResultLine]) -> Vec<Averaged> {
     let same = |a: &ResultLine, b: &ResultLine| a.scene == b.scene && a.label == b.label;
     let firsts = lines.iter().enumerate().filter(|(i, line)| !lines[..*i].iter().any(|before| same(before, line)));
     let runs = |(_, first): (usize, &ResultLine)| -> Vec<Averaged> {
-        let last = lines.iter().rfind(|line| same(line, first)).expect("the first is one");
+        let last = lines.iter().rfind(|line| same(line, first)).expect("the first line matches");
         if last.seed.is_none() {
             return vec![mean(last, &[last], String::new())];
         }
@@ -36,7 +36,7 @@ pub fn averaged(lines: &[ResultLine]) -> Vec<Averaged> {
         let of_settings = |of: &&ResultLine| {
             let mut alike = all.iter().copied().filter(|line| settings(line) == settings(of));
             let by_seed: BTreeMap<Option<u64>, &ResultLine> = alike.clone().map(|line| (line.seed, line)).collect();
-            let last = alike.next_back().expect("it is one");
+            let last = alike.next_back().expect("at least one line matches");
             mean(last, &by_seed.into_values().collect::<Vec<_>>(), variant(of, &distinct))
         };
         distinct.iter().map(of_settings).collect()
@@ -44,12 +44,12 @@ pub fn averaged(lines: &[ResultLine]) -> Vec<Averaged> {
     firsts.flat_map(runs).collect()
 }
 
-/// What a sweep goes through.
+/// The settings that a sweep varies.
 fn settings(line: &ResultLine) -> [Option<f64>; 3] {
     [line.steps.map(f64::from), line.budget.map(f64::from), line.tolerance_db]
 }
 
-/// In what a run's settings are not those of all.
+/// The settings of a run that differ among all runs.
 fn variant(line: &ResultLine, all: &[&ResultLine]) -> String {
     let names = [" steps", " splats", " dB pruned"];
     let differs = |k: usize| all.iter().any(|other| settings(other)[k] != settings(line)[k]);
@@ -83,7 +83,7 @@ fn mean(last: &ResultLine, runs: &[&ResultLine], variant: String) -> Averaged {
     Averaged { line, variant, seeds: runs.len(), spread }
 }
 
-/// Point by point where all curves have as many; else the last one's.
+/// The mean of curves of equal length, point by point; else the last run's curve.
 fn mean_curve(last: &ResultLine, runs: &[&ResultLine]) -> Vec<CurvePoint> {
     if runs.iter().any(|run| run.curve.len() != last.curve.len()) {
         return last.curve.clone();
@@ -129,7 +129,7 @@ mod tests {
     }
 
     #[test]
-    fn configurations_of_a_commit_stand_side_by_side() {
+    fn configurations_of_a_commit_are_kept_apart() {
         let with = |commit: &str, steps: u32, budget: u32, seed: u64, psnr: f64| ResultLine {
             steps: Some(steps),
             budget: Some(budget),
@@ -150,7 +150,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_seed_lacks_the_mean_lacks() {
+    fn the_mean_lacks_figures_that_a_seed_lacks() {
         let mut lines = [of_seed("new", 0, 20.0), of_seed("new", 1, 24.0)];
         lines[0].ssim = Some(0.5);
         lines[0].curve.pop();

@@ -10,8 +10,7 @@ const END: &str = "<!-- bench:end -->";
 const SHORT_ROWS: usize = 8;
 
 /// The latest runs of each scene and label, references (lines with a source) first; of several seeds the mean, with the
-/// largest PSNR less the smallest. The column of times says how long a run took to the reference's best PSNR, and how
-/// much sooner that is than the reference's own.
+/// range of PSNR. The column of times has the CPU seconds to the reference's best PSNR, and the speed-up over the reference.
 pub fn table(lines: &[ResultLine]) -> String {
     let runs = averaged(lines);
     let mut text = String::from(
@@ -25,7 +24,7 @@ pub fn table(lines: &[ResultLine]) -> String {
         let reference = of_scene(true).next().map(|run| &run.line);
         for run in of_scene(true).chain(of_scene(false)) {
             let line = &run.line;
-            // writing to a String cannot fail
+            // Writing to a String cannot fail.
             let _ = writeln!(
                 text,
                 "| {} | {} | {} | {} | {} | {} | {} | {} | {} | {} |",
@@ -85,14 +84,14 @@ pub fn short_table(lines: &[ResultLine]) -> String {
 }
 
 /// The document with the text between its markers `<!-- bench:begin -->` and `<!-- bench:end -->` replaced; `None`
-/// where a marker is missing.
+/// if a marker is missing.
 pub fn replace_table(document: &str, table: &str) -> Option<String> {
     let from = document.find(BEGIN)? + BEGIN.len();
     let to = from + document[from..].find(END)?;
     Some(format!("{}\n{}\n{}", &document[..from], table.trim_end(), &document[to..]))
 }
 
-/// The scene, with the size of its photos where it is not their own.
+/// The scene, with the divisor of its photos' size if it is not 1.
 fn scene_cell(line: &ResultLine) -> String {
     let size = if line.downscale > 1 { format!(" 1/{}", line.downscale) } else { String::new() };
     cell(&line.scene) + &size
@@ -152,7 +151,7 @@ mod tests {
     use crate::tests::line;
 
     #[test]
-    fn rows_say_how_much_sooner() {
+    fn rows_have_the_speed_up_over_the_reference() {
         let mut reference = line("OpenSplat", "fox", &[(100.0, 20.0), (1000.0, 28.0)]);
         reference.source = Some("measured".into());
         let ours = line("plat tree", "fox", &[(10.0, 26.0), (30.0, 30.0)]);
@@ -182,7 +181,7 @@ mod tests {
     }
 
     #[test]
-    fn only_what_lies_between_the_markers_changes() {
+    fn only_text_between_the_markers_changes() {
         let document = "a\n<!-- bench:begin -->\nold\n<!-- bench:end -->\nb\n";
         let new = replace_table(document, "| new |\n").unwrap();
         assert_eq!(new, "a\n<!-- bench:begin -->\n| new |\n<!-- bench:end -->\nb\n");

@@ -1,29 +1,28 @@
-//! One panel of the chart: a measure of quality over what it costs.
+//! Draws one panel of the chart: a measure of quality over its cost.
 
 use std::fmt::Write;
 
-use super::escape;
 use crate::{CurvePoint, ResultLine};
 
-/// Height of a panel.
+/// Height of a panel, pixels.
 pub(super) const ROW: f64 = 232.0;
-/// Between two panels.
+/// Gap between two panels, pixels.
 pub(super) const GAP: f64 = 6.0;
 const LEFT: f64 = 52.0;
 const RIGHT: f64 = 14.0;
 const TOP: f64 = 26.0;
 const BOTTOM: f64 = 46.0;
 
-/// What a panel shows.
+/// The measure of a panel.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum Measure {
-    /// PSNR over CPU seconds, along the way too.
+    /// PSNR over CPU seconds, during training too.
     PsnrOverTime,
-    /// PSNR over splats, at the end.
+    /// Final PSNR over splats.
     PsnrOverSplats,
-    /// SSIMULACRA2 over CPU seconds, at the end.
+    /// Final SSIMULACRA2 over CPU seconds.
     Ssimulacra2,
-    /// LPIPS likewise.
+    /// Final LPIPS over CPU seconds.
     Lpips,
 }
 
@@ -33,7 +32,7 @@ pub(super) struct Point {
     /// CPU seconds or splats.
     pub(super) x: f64,
     pub(super) y: f64,
-    /// What it is.
+    /// Tooltip.
     pub(super) title: String,
 }
 
@@ -61,7 +60,7 @@ impl Measure {
         }
     }
 
-    /// The least that the axis spans, and digits of a figure.
+    /// Minimum span of the axis, and digits of a figure.
     fn span(self) -> (f64, usize) {
         match self {
             Self::PsnrOverTime | Self::PsnrOverSplats => (4.0, 2),
@@ -70,7 +69,7 @@ impl Measure {
         }
     }
 
-    /// What a run has to show: its curve, where the measure was taken along the way.
+    /// The run's curve if the measure is taken during training, else its final value.
     pub(super) fn curve(self, line: &ResultLine) -> Vec<Point> {
         if self != Self::PsnrOverTime || line.curve.is_empty() {
             return self.end(line, "").into_iter().collect();
@@ -83,7 +82,7 @@ impl Measure {
         line.curve.iter().filter(|p| p.cpu_seconds > 0.0).map(point).collect()
     }
 
-    /// A run's last figure, if it was taken.
+    /// The run's final value, if it was measured.
     pub(super) fn end(self, line: &ResultLine, variant: &str) -> Option<Point> {
         let (x, y) = match self {
             Self::PsnrOverTime => (line.cpu_seconds, line.psnr),
@@ -99,7 +98,7 @@ impl Measure {
     }
 }
 
-/// Maps values to pixels of the panel.
+/// Maps values to the panel's pixels.
 struct Axes {
     width: f64,
     /// log10.
@@ -115,11 +114,11 @@ impl Axes {
             points().map(value).fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), v| (low.min(v), high.max(v)))
         };
         let (x, y) = (range(|p| p.x.log10()), range(|p| p.y));
-        // at least a decade wide
+        // At least a decade wide.
         let wider = ((1.0 - (x.1 - x.0)) / 2.0).max(0.06);
         let x = (x.0 - wider, x.1 + wider);
-        let (least, middle) = (measure.span().0, 0.5 * (y.0 + y.1));
-        let y = (y.0.min(middle - 0.5 * least), y.1.max(middle + 0.5 * least));
+        let (min_span, middle) = (measure.span().0, 0.5 * (y.0 + y.1));
+        let y = (y.0.min(middle - 0.5 * min_span), y.1.max(middle + 0.5 * min_span));
         const STEPS: [f64; 9] = [0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0];
         let step = STEPS.into_iter().find(|step| (y.1 - y.0) / step <= 6.0).unwrap_or(20.0);
         Self { width: measure.width(), x, y: ((y.0 / step).floor() * step, (y.1 / step + 0.25).ceil() * step), step }
@@ -133,29 +132,28 @@ impl Axes {
         ROW - BOTTOM - (y - self.y.0) / (self.y.1 - self.y.0) * (ROW - TOP - BOTTOM)
     }
 
-    /// 1, 2 and 5 times the powers of ten within the range, or 1 and 3 times, or powers of ten alone: as many as keep clear of each
-    /// other.
+    /// Multiples of the powers of ten within the range, by 1, 2 and 5, by 1 and 3, or by 1: as many as do not overlap.
     fn ticks(&self) -> Vec<f64> {
-        let room = (self.width - LEFT - RIGHT) / (self.x.1 - self.x.0);
-        let factors: &[f64] = match room {
+        let pixels_per_decade = (self.width - LEFT - RIGHT) / (self.x.1 - self.x.0);
+        let factors: &[f64] = match pixels_per_decade {
             ..60.0 => &[1.0],
             60.0..120.0 => &[1.0, 3.0],
             _ => &[1.0, 2.0, 5.0],
         };
         let decades = self.x.0.floor() as i32..=self.x.1.ceil() as i32;
-        // Divided, as 3 / 10 is 0.3 and 3 * 0.1 is not.
+        // Divided for negative exponents, as 3 / 10 is 0.3 in floating point and 3 * 0.1 is not.
         let at = |f: f64, d: i32| if d < 0 { f / 10f64.powi(-d) } else { f * 10f64.powi(d) };
         let ticks = decades.flat_map(|d| factors.iter().map(move |&f| at(f, d)));
         ticks.filter(|t| (self.x.0..=self.x.1).contains(&t.log10())).collect()
     }
 }
 
-/// Draws a panel of series of which each has a point.
+/// Draws a panel. Every series has at least one point.
 pub(super) fn panel(measure: Measure, series: &[Series]) -> String {
     let axes = Axes::around(measure, series);
     let (right, bottom) = (axes.width - RIGHT, ROW - BOTTOM);
     let (cost, quality) = measure.names();
-    // writing to a String cannot fail
+    // Writing to a String cannot fail.
     let mut svg = String::new();
     let _ = writeln!(svg, "<text class=\"panel\" x=\"{LEFT}\" y=\"15\">{quality}</text>");
     for tick in axes.ticks() {
@@ -194,7 +192,7 @@ pub(super) fn panel(measure: Measure, series: &[Series]) -> String {
     svg
 }
 
-/// Draws a line through points.
+/// Draws the points of a series and a line through them.
 fn line(svg: &mut String, axes: &Axes, series: &Series) {
     let places: Vec<String> =
         series.points.iter().map(|p| format!("{:.1} {:.1}", axes.px(p.x), axes.py(p.y))).collect();
@@ -212,7 +210,7 @@ fn line(svg: &mut String, axes: &Axes, series: &Series) {
     }
 }
 
-/// Writes the value at a line's end, clear of the `values` written before.
+/// Writes the value at a line's end, without overlap with the `values` written before.
 fn value(svg: &mut String, axes: &Axes, measure: Measure, series: &Series, values: &mut Vec<(f64, f64)>) {
     let class = &series.class;
     if let Some(last) = series.points.last() {
@@ -231,7 +229,12 @@ fn value(svg: &mut String, axes: &Axes, measure: Measure, series: &Series, value
     }
 }
 
-/// A number in few letters: 12000 is 12k.
+/// Text with the special characters of XML escaped.
+pub(super) fn escape(text: &str) -> String {
+    text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
+}
+
+/// A short form of a number: 12000 is 12k.
 fn short(value: f64) -> String {
     match value {
         1e6.. => format!("{}M", value / 1e6),
@@ -251,7 +254,7 @@ mod tests {
     }
 
     #[test]
-    fn faster_is_further_left_and_better_is_higher() {
+    fn cost_grows_to_the_right_and_quality_upwards() {
         let narrow = axes(&[(1.0, 15.0), (100.0, 28.0)]);
         assert!(narrow.px(1.0) < narrow.px(10.0) && narrow.py(28.0) < narrow.py(15.0));
         assert!(narrow.px(1.0) >= LEFT && narrow.py(28.0) >= TOP);
@@ -262,7 +265,7 @@ mod tests {
     }
 
     #[test]
-    fn ticks_of_splats_are_short_and_keep_clear() {
+    fn ticks_of_splats_are_short_and_do_not_overlap() {
         let mut run = line("plat", "fox", &[(1.0, 15.0)]);
         run.splats = Some(2_000);
         let mut other = run.clone();
