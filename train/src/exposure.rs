@@ -30,8 +30,9 @@ pub fn expose(exposure: &Exposure, colour: &[f32], out: &mut Vec<f32>) {
     }
 }
 
-/// ViewOrder the loss's gradient by the exposed picture into that by the drawn `colour`, in place, and returns that by
-/// the exposure. Pixels that do not count have no gradient, and so no say.
+/// Converts `gradient`, the loss gradient with respect to the exposed render, in place to that with respect to the render
+/// `colour`. Returns the gradient with respect to the exposure. Pixels of weight zero have no gradient and contribute
+/// nothing.
 pub fn expose_backward(exposure: &Exposure, colour: &[f32], gradient: &mut [f32]) -> [[f32; 4]; 3] {
     let [red, green, blue] = planes(colour);
     let (by_red, rest) = gradient.split_at_mut(red.len());
