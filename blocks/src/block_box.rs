@@ -12,8 +12,8 @@ pub(crate) struct BlockBox {
 }
 
 impl BlockBox {
-    /// The box over the core and the height range of these points. A core at the scene's rim is extended to its points, because its
-    /// ownership is unbounded there.
+    /// The box over the core and the height range of these points. A core at the scene's rim is extended to its points,
+    /// because its ownership is unbounded there.
     pub(crate) fn new(capture: &Capture, ground: &Ground, block: BlockId, points: impl Iterator<Item = u32>) -> Self {
         let mut indices: Vec<u32> = points.collect();
         indices.sort_unstable();
@@ -38,8 +38,8 @@ impl BlockBox {
 
     /// Lower and upper bounds of the box in the image, pixels of mip 0; `None` when it lies outside.
     ///
-    /// Each face is clipped to the camera's frustum before projection (Sutherland & Hodgman 1974). The bounds are therefore tight
-    /// for a box that crosses the image border, and valid for a camera inside the box.
+    /// Each face is clipped to the camera's frustum before projection (Sutherland & Hodgman 1974). The bounds are
+    /// therefore tight for a box that crosses the image border, and valid for a camera inside the box.
     pub(crate) fn project(&self, camera: &Camera, near_metres: f64) -> Option<(DVec2, DVec2)> {
         let k = &camera.pinhole;
         let (width, height) = (f64::from(k.width), f64::from(k.height));

@@ -1,6 +1,7 @@
 //! Budgets: the splats, steps and memory of every task.
 //!
-//! Splats go where the scene has most detail. Steps are set so that plans of all modes cost the same. Memory is estimated.
+//! Splats go where the scene has most detail. Steps are set so that plans of all modes cost the same. Memory is
+//! estimated.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -17,8 +18,8 @@ use crate::visibility::Observations;
 const INNER_BUDGET_RATIO: f64 = 1.0 / 2.5;
 /// Minimum number of splats of a task, where the whole budget allows it.
 const MIN_BUDGET: u32 = 500;
-/// Splats that one block can hold. The reference cost of a step is capped at a scene of this size: along a street a view of the whole
-/// scene shows ever more splats as the city grows, and a tree does not have that cost.
+/// Splats that one block can hold. The reference cost of a step is capped at a scene of this size: along a street a
+/// view of the whole scene shows ever more splats as the city grows, and a tree does not have that cost.
 pub(crate) const BLOCK_SPLATS: u32 = 100_000;
 /// Weight of a pixel that a coarser level covers already, relative to a new pixel.
 const REPEATED_PIXEL_WEIGHT: f64 = 0.05;
@@ -31,8 +32,9 @@ const MIN_STEPS: u32 = 50;
 /// Depth of the cells of [`DetailShares`] below the leaves: 16 cells a side.
 const CELL_LEVELS: u8 = 4;
 
-/// The detail in each block as a share of the whole scene: half by sparse points, half by the number of distinct finest ground
-/// pixels that the views observe. All levels use the same cells, so the share of a block is the sum of its children's.
+/// The detail in each block as a share of the whole scene: half by sparse points, half by the number of distinct finest
+/// ground pixels that the views observe. All levels use the same cells, so the share of a block is the sum of its
+/// children's.
 pub(crate) struct DetailShares(BTreeMap<BlockId, f64>);
 
 impl DetailShares {
@@ -75,7 +77,8 @@ impl DetailShares {
 
 /// What a task's position in the tree implies for its budgets.
 struct TreePosition {
-    /// Number of tasks below it on the path to the nearest leaf; 0 for blocks that count as leaves ([`LEAF_KEPT_SHARE`]).
+    /// Number of tasks below it on the path to the nearest leaf; 0 for blocks that count as leaves
+    /// ([`LEAF_KEPT_SHARE`]).
     height: u8,
     /// Share of the scene's detail that it keeps: its own less that of the children with a task.
     kept: f64,
@@ -83,8 +86,8 @@ struct TreePosition {
     splats: f64,
 }
 
-/// The tree position of each task. A block gets [`INNER_BUDGET_RATIO`] of the splats of its children for the part they refine, and
-/// as many as a leaf for the part it keeps.
+/// The tree position of each task. A block gets [`INNER_BUDGET_RATIO`] of the splats of its children for the part they
+/// refine, and as many as a leaf for the part it keeps.
 fn tree_positions(tasks: &[Task], shares: &DetailShares) -> Vec<TreePosition> {
     let mut known: BTreeMap<BlockId, TreePosition> = BTreeMap::new();
     // Children come after their parents in the plan, so the reverse order visits children first.
@@ -103,8 +106,8 @@ fn tree_positions(tasks: &[Task], shares: &DetailShares) -> Vec<TreePosition> {
     tasks.iter().filter_map(|task| known.remove(&task.block)).collect()
 }
 
-/// Sets splats, steps and memory of all tasks. `whole` is the reference task of the cost: the whole scene as one task of
-/// `settings.steps` steps.
+/// Sets splats, steps and memory of all tasks. `whole` is the reference task of the cost: the whole scene as one task
+/// of `settings.steps` steps.
 pub(crate) fn set_all(
     tasks: &mut [Task],
     whole: Task,
@@ -127,7 +130,8 @@ pub(crate) fn set_all(
 fn set_budgets(tasks: &mut [Task], positions: &[TreePosition], settings: &PlanSettings) {
     let total = f64::from(settings.budget);
     let parents = parents(tasks);
-    // All leaves form one group, inner blocks one group per level. Detail kept by inner blocks is not part of the leaves' pool.
+    // All leaves form one group, inner blocks one group per level. Detail kept by inner blocks is not part of the
+    // leaves' pool.
     let group = |task: &Task| parents.contains(&task.block).then_some(task.block.level);
     let kept: f64 = tasks.iter().zip(positions).filter(|(task, _)| group(task).is_some()).map(|(_, s)| s.kept).sum();
     let groups: BTreeSet<Option<u8>> = tasks.iter().map(group).collect();
@@ -141,8 +145,9 @@ fn set_budgets(tasks: &mut [Task], positions: &[TreePosition], settings: &PlanSe
     }
 }
 
-/// Splits a pool into integers in proportion to the shares. Each part is at least `minimum`, or a quarter of an equal part if that is
-/// less, and never below 1. The parts add up to the pool, unless the pool is smaller than the number of parts.
+/// Splits a pool into integers in proportion to the shares. Each part is at least `minimum`, or a quarter of an equal
+/// part if that is less, and never below 1. The parts add up to the pool, unless the pool is smaller than the number of
+/// parts.
 fn split(pool: f64, shares: &[f64], minimum: u32) -> Vec<u32> {
     let n = shares.len() as f64;
     let minimum = f64::from(minimum).min((pool / (4.0 * n)).floor()).max(1.0);
@@ -161,8 +166,8 @@ fn split(pool: f64, shares: &[f64], minimum: u32) -> Vec<u32> {
         .collect()
 }
 
-/// Divides the work of `settings.steps` full-image steps on the whole scene: between heights in proportion to their new pixels,
-/// within a height so that every window gets equally many steps.
+/// Divides the work of `settings.steps` full-image steps on the whole scene: between heights in proportion to their new
+/// pixels, within a height so that every window gets equally many steps.
 fn set_steps(tasks: &mut [Task], whole: &Task, positions: &[TreePosition], capture: &Capture, settings: &PlanSettings) {
     if let [task] = tasks
         && task.views.iter().all(|v| v.mip == 0)
@@ -194,8 +199,8 @@ fn parents(tasks: &[Task]) -> BTreeSet<BlockId> {
 /// The weighted number of pixels that the windows of each height add to the heights above it. Repeated pixels count
 /// [`REPEATED_PIXEL_WEIGHT`].
 ///
-/// In an aerial capture every level has four times the pixels of the level above, and leaves get three fifths of the work. In a street
-/// capture most content is observed from so far away that the root resolves it as finely as a leaf.
+/// In an aerial capture every level has four times the pixels of the level above, and leaves get three fifths of the
+/// work. In a street capture most content is observed from so far away that the root resolves it as finely as a leaf.
 fn new_pixels_by_height(tasks: &[Task], positions: &[TreePosition], capture: &Capture) -> BTreeMap<u8, f64> {
     let mut heights: BTreeMap<u8, PixelCoverage> = BTreeMap::new();
     for (task, position) in tasks.iter().zip(positions) {
@@ -257,8 +262,8 @@ fn set_visible_splats(tasks: &mut [Task], capture: &Capture, ground: &Ground) {
     }
 }
 
-/// Estimates the number of visible frozen splats per window: each sparse point outside the task's halo stands for as many splats as
-/// the owning context block has per point of its core.
+/// Estimates the number of visible frozen splats per window: each sparse point outside the task's halo stands for as
+/// many splats as the owning context block has per point of its core.
 fn set_visible_context_splats(tasks: &mut [Task], capture: &Capture, ground: &Ground) {
     let points = sample_points(capture, MAX_CONTEXT_POINTS);
     let mut points_of: BTreeMap<BlockId, f64> = BTreeMap::new();
@@ -311,8 +316,9 @@ const COLUMNS: [u64; 4] = [14, 23, 38, 59];
 const BYTES_PER_TRAINED_COLUMN: u64 = 16;
 /// Bytes per frozen parameter.
 const BYTES_PER_FROZEN_COLUMN: u64 = 4;
-/// Bytes per splat under training beyond its parameters: the projected splat, its gradient, densification statistics, tile entries
-/// and copies made by densification. Fitted to twelve bench runs within 15 %; the processes of tree plans used up to 27 % less.
+/// Bytes per splat under training beyond its parameters: the projected splat, its gradient, densification statistics,
+/// tile entries and copies made by densification. Fitted to twelve bench runs within 15 %; the processes of tree plans
+/// used up to 27 % less.
 const BYTES_PER_PROJECTED: u64 = 1860;
 /// The same for a frozen splat, which has no gradient, statistics or copies.
 const BYTES_PER_FROZEN_PROJECTED: u64 = 112;
@@ -323,7 +329,8 @@ const IMAGE_CACHE_BYTES: u64 = 128 << 20;
 /// Bytes of the process itself and its threads.
 const BASE_BYTES: u64 = 17 << 20;
 
-/// Estimates each task's peak memory, bytes: splats under training, frozen context, the buffers of one window and the image cache.
+/// Estimates each task's peak memory, bytes: splats under training, frozen context, the buffers of one window and the
+/// image cache.
 fn set_memory(tasks: &mut [Task], settings: &PlanSettings) {
     let columns = COLUMNS[usize::from(settings.sh_degree.min(3))];
     let budgets: BTreeMap<BlockId, u64> = tasks.iter().map(|t| (t.block, u64::from(t.budget))).collect();

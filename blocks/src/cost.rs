@@ -1,26 +1,26 @@
 //! The cost model of a training step.
 //!
-//! One model serves three users: `budgets` divides the work of a plan by it, the worker's progress estimate scales with it, and
-//! the coordinator derives the scheduler's estimate of a task's duration from it.
+//! One model serves three users: `budgets` divides the work of a plan by it, the worker's progress estimate scales with
+//! it, and the coordinator derives the scheduler's estimate of a task's duration from it.
 
 use crate::ground::HALO_SCALE;
 use crate::plan::Task;
 
 /// Cost of a splat that the window shows, in pixels: it is projected, sorted, blended over its pixels and updated.
 const PER_VISIBLE: f64 = 1.0;
-/// Cost of a frozen splat that the window shows. It is higher than [`PER_VISIBLE`] because context splats are coarser and cover
-/// more pixels each, and because the estimate from sparse points counts too few of them.
+/// Cost of a frozen splat that the window shows. It is higher than [`PER_VISIBLE`] because context splats are coarser
+/// and cover more pixels each, and because the estimate from sparse points counts too few of them.
 const PER_FROZEN: f64 = 6.0;
 /// Cost of a splat under training, visible or not.
 const PER_TRAINED: f64 = 0.5;
 /// Splats of core and halo per splat of the core: the ratio of their areas.
 pub(crate) const HALO_AREA: f64 = HALO_SCALE * HALO_SCALE;
 
-/// The cost of one training step of a task, by component, in pixels. Resolution and number of splats are the means over the task's
-/// schedule.
+/// The cost of one training step of a task, by component, in pixels. Resolution and number of splats are the means over
+/// the task's schedule.
 ///
-/// Fitted to the 127 tasks of three cities of 0.3, 0.6 and 1.2 km² at ten steps per view on one thread: the measured time of a
-/// level's steps was 0.86 to 1.10 of the model.
+/// Fitted to the 127 tasks of three cities of 0.3, 0.6 and 1.2 km² at ten steps per view on one thread: the measured
+/// time of a level's steps was 0.86 to 1.10 of the model.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct StepCost {
     /// Pixels of the window.

@@ -42,8 +42,8 @@ impl PixelCoverage {
         self.0.values().map(|of_view| of_view.in_windows).sum()
     }
 
-    /// Pixels that this coverage has beyond `coarser`: detail that is new at this level. Each view contributes at least the share
-    /// `min_share` of its pixels.
+    /// Pixels that this coverage has beyond `coarser`: detail that is new at this level. Each view contributes at least
+    /// the share `min_share` of its pixels.
     pub(crate) fn new_pixels(&self, coarser: &Self, min_share: f64) -> f64 {
         let of_views = self.0.iter().map(|(view, now)| {
             let before = coarser.0.get(view).map_or(0, |before| before.pixels());

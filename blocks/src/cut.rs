@@ -1,7 +1,8 @@
 //! Cuts splats into blocks and merges blocks into one model.
 //!
-//! `merge(cut(s)) == s`, up to the order of rows, for all splats with finite means. Both directions use the same ownership rule,
-//! [`Ground::block_at`], so no splat is lost or duplicated. Splats whose mean is not finite have no owner and are dropped.
+//! `merge(cut(s)) == s`, up to the order of rows, for all splats with finite means. Both directions use the same
+//! ownership rule, [`Ground::block_at`], so no splat is lost or duplicated. Splats whose mean is not finite have no
+//! owner and are dropped.
 
 use std::borrow::Borrow;
 use std::collections::BTreeMap;
@@ -28,8 +29,8 @@ pub fn keep_core(splats: &Splats, ground: &Ground, block: BlockId) -> Splats {
     splats.filter(|i| ground.owns(block, splats.mean(i).as_dvec3()))
 }
 
-/// Concatenates all parts in the order of their blocks, independent of the order of arrival. The result has the highest SH degree of
-/// the parts.
+/// Concatenates all parts in the order of their blocks, independent of the order of arrival. The result has the highest
+/// SH degree of the parts.
 pub fn merge(parts: impl IntoIterator<Item = (BlockId, Splats)>) -> Splats {
     let mut parts: Vec<(BlockId, Splats)> = parts.into_iter().collect();
     parts.sort_by_key(|(block, _)| *block);

@@ -26,7 +26,8 @@ const SOFT: &str = "#6b737c";
 /// Colours of block outlines by height above the finest level.
 const LEVEL_COLOURS: [&str; 5] = ["#0b7a53", "#8a3ffc", "#b0206b", "#7a5b00", "#4a5568"];
 
-/// Draws a plan as an SVG: points, cameras, blocks with their views and splats, a table of levels, a scale bar and a legend.
+/// Draws a plan as an SVG: points, cameras, blocks with their views and splats, a table of levels, a scale bar and a
+/// legend.
 pub fn draw(plan: &Plan, capture: &Capture) -> String {
     let map = Map::of(plan, capture);
     let (width, height) = (MAP + PANEL + 3.0 * MARGIN, MAP + 2.0 * MARGIN + TITLE);
@@ -73,8 +74,8 @@ impl Svg {
         ));
     }
 
-    /// Writes centred text with a white outline for legibility. The text is written twice because some viewers do not support
-    /// `paint-order`.
+    /// Writes centred text with a white outline for legibility. The text is written twice because some viewers do not
+    /// support `paint-order`.
     fn outlined_text(&mut self, at: DVec2, size: f64, style: &str, text: &str) {
         let rim = "stroke=\"#ffffff\" stroke-width=\"4\" stroke-linejoin=\"round\" stroke-opacity=\"0.9\"";
         self.text(at, size, &format!("text-anchor=\"middle\" {rim} {style}"), text);

@@ -1,13 +1,15 @@
 //! The ground plane and its quadtree of blocks, which define the owner of every place.
 //!
-//! The root is a square on the ground. Level `L` divides it into `2^L × 2^L` half-open cores. Cores at the rim extend to infinity, so
-//! every finite place has exactly one owner per level, and a block owns exactly what its four children own.
+//! The root is a square on the ground. Level `L` divides it into `2^L × 2^L` half-open cores. Cores at the rim extend
+//! to infinity, so every finite place has exactly one owner per level, and a block owns exactly what its four children
+//! own.
 
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use scene::{BlockId, Camera, Capture};
 use serde::{Deserialize, Serialize};
 
-/// Halo size relative to the core, scaled about its centre. (DOGS on Rubble: 24.25 dB at 1.2, 25.78 at 1.4, 25.97 at 1.5.)
+/// Halo size relative to the core, scaled about its centre. (DOGS on Rubble: 24.25 dB at 1.2, 25.78 at 1.4, 25.97 at
+/// 1.5.)
 pub const HALO_SCALE: f64 = 1.4;
 /// An up direction within 20° of world z snaps to world z (cosine of 20°).
 const SNAP_COSINE: f64 = 0.939_692_6;
@@ -17,8 +19,8 @@ const MIN_UP_AGREEMENT: f64 = 0.5;
 const FAR_METRES: f64 = 1e8;
 /// Padding of the root on each side, relative to the robust extent.
 const ROOT_PAD: f64 = 0.02;
-/// Radius of the foreground in scene extents (see [`Ground::is_background`]). The corners of the root square are at 0.71; background
-/// geometry starts at 1.7.
+/// Radius of the foreground in scene extents (see [`Ground::is_background`]). The corners of the root square are at
+/// 0.71; background geometry starts at 1.7.
 const NEAR_EXTENTS: f64 = 1.5;
 
 /// A half-open square of the ground plane, metres. Sides may be infinite.
@@ -63,9 +65,9 @@ pub struct Ground {
 }
 
 impl Ground {
-    /// Estimates the ground of a capture. The up direction comes from its cameras (see `estimate_up`). The root is the square around the
-    /// 1st to 99th percentiles of sparse points and of camera centres. All values are finite for every input; without points and
-    /// cameras the root is a unit square.
+    /// Estimates the ground of a capture. The up direction comes from its cameras (see `estimate_up`). The root is the
+    /// square around the 1st to 99th percentiles of sparse points and of camera centres. All values are finite for
+    /// every input; without points and cameras the root is a unit square.
     pub fn of(capture: &Capture) -> Self {
         let near = |p: &DVec3| p.abs().max_element() < FAR_METRES;
         let points: Vec<DVec3> = capture.points.positions.iter().copied().filter(near).collect();
@@ -112,7 +114,8 @@ impl Ground {
 
     /// The block of `level` that owns this place. Arbitrary for NaN; see [`Ground::owns`].
     ///
-    /// The cell is computed at the finest level and shifted up, so a block owns exactly what its children own, without rounding errors.
+    /// The cell is computed at the finest level and shifted up, so a block owns exactly what its children own, without
+    /// rounding errors.
     pub fn block_at(&self, level: u8, world: DVec3) -> BlockId {
         let level = level.min(BlockId::MAX_LEVEL);
         let cells = f64::from(1u32 << BlockId::MAX_LEVEL);
@@ -126,11 +129,12 @@ impl Ground {
         world.is_finite() && self.block_at(block.level, world) == block
     }
 
-    /// True for background: places above the ground that are outside the foreground radius, such as the sky and distant tall objects.
+    /// True for background: places above the ground that are outside the foreground radius, such as the sky and distant
+    /// tall objects.
     ///
     /// Ground columns do not partition the background in a useful way, so only the root owns and trains it
-    /// ([`crate::Cut::owner_of`]). Places below the ground are never background: excluding them from the blocks of an aerial capture
-    /// costs 0.2 dB.
+    /// ([`crate::Cut::owner_of`]). Places below the ground are never background: excluding them from the blocks of an
+    /// aerial capture costs 0.2 dB.
     pub fn is_background(&self, world: DVec3) -> bool {
         let middle = (self.min + 0.5 * self.edge_metres).extend(self.height_metres);
         let from_middle = self.from_world(world) - middle;
@@ -208,10 +212,11 @@ impl Ground {
 
 /// Estimates the up direction, a unit vector, from the first rule that applies:
 /// 1. Cameras that agree on an up within 20° of world z, or that look down along it (nadir surveys): world z.
-/// 2. Cameras that face one way and are spread over an area across it (a nadir survey in an arbitrary frame, whose image-up vectors
-///    are horizontal): the direction opposite to the viewing direction.
+/// 2. Cameras that face one way and are spread over an area across it (a nadir survey in an arbitrary frame, whose
+///    image-up vectors are horizontal): the direction opposite to the viewing direction.
 /// 3. Cameras that agree on an up: their mean up vector.
-/// 4. Otherwise the axis of least variance of the sparse points, signed so that cameras lie above, snapped to z within 20°.
+/// 4. Otherwise the axis of least variance of the sparse points, signed so that cameras lie above, snapped to z within
+///    20°.
 fn estimate_up(cameras: &[&Camera], points: &[DVec3]) -> DVec3 {
     let mean =
         |of: &dyn Fn(&Camera) -> DVec3| cameras.iter().map(|c| of(c)).sum::<DVec3>() / cameras.len().max(1) as f64;
@@ -278,7 +283,8 @@ fn principal_axes(places: &[DVec3]) -> ([f64; 3], [DVec3; 3]) {
     (variances.map(|v| v.max(0.0).sqrt()), axes)
 }
 
-/// Eigenvalues (ascending) and eigenvectors of a symmetric matrix by cyclic Jacobi rotations (Golub & Van Loan, section 8.5).
+/// Eigenvalues (ascending) and eigenvectors of a symmetric matrix by cyclic Jacobi rotations (Golub & Van Loan, section
+/// 8.5).
 fn eigen(mut a: DMat3) -> ([f64; 3], [DVec3; 3]) {
     let mut axes = DMat3::IDENTITY;
     for (p, q) in [(0, 1), (0, 2), (1, 2)].into_iter().cycle().take(60) {

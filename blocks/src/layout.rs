@@ -20,8 +20,8 @@ const MIN_MEAN_VIEWS: usize = 24;
 const MIN_MEAN_POINTS: usize = 500;
 /// ... and together at least this share of all sparse points.
 const MIN_COVERED_SHARE: f64 = 0.9;
-/// A further level is added only if at least this share of its pixels is new. Along a road every view observes all blocks ahead, so
-/// a further level costs several times its benefit ...
+/// A further level is added only if at least this share of its pixels is new. Along a road every view observes all
+/// blocks ahead, so a further level costs several times its benefit ...
 const MIN_NEW_PIXELS: f64 = 1.0 / 3.0;
 /// ... or if the parents would exceed the capacity of a block, in splats ([`BLOCK_SPLATS`]) or in pixels.
 const BLOCK_PIXELS: u64 = 500_000_000;
@@ -29,7 +29,8 @@ const BLOCK_PIXELS: u64 = 500_000_000;
 const CROWDED: f64 = 4.0;
 /// ... at most this many times.
 const MAX_SPLITS: u8 = 3;
-/// A block other than the root has no task if fewer views than this observe it at a finer resolution than its parent can use ...
+/// A block other than the root has no task if fewer views than this observe it at a finer resolution than its parent
+/// can use ...
 pub(crate) const MIN_VIEWS: usize = 6;
 /// ... or if its core has fewer sparse points than this.
 const MIN_POINTS: u32 = 10;
@@ -56,8 +57,8 @@ impl Layout<'_> {
         selections
     }
 
-    /// Splits crowded leaves of level `base` into children at the same resolution: leaves with several times the points of the median
-    /// leaf and enough views for all children.
+    /// Splits crowded leaves of level `base` into children at the same resolution: leaves with several times the points
+    /// of the median leaf and enough views for all children.
     pub(crate) fn split_crowded(&self, base: u8, finest_metres: f64, tasks: &mut Vec<Task>) {
         let leaves = tasks.iter().filter(|task| task.block.level == base);
         let mut points: Vec<f64> = leaves.map(|task| f64::from(task.points)).collect();
@@ -79,7 +80,8 @@ impl Layout<'_> {
         }
     }
 
-    /// The deepest level that the resolution allows, whose blocks have enough views and points, and that is worth its cost.
+    /// The deepest level that the resolution allows, whose blocks have enough views and points, and that is worth its
+    /// cost.
     pub(crate) fn choose_levels(&self, finest_metres: f64, budget: u32) -> u8 {
         let points = self.capture.points.len();
         let by_resolution = (self.ground.edge_metres / (LEAF_EDGE_PIXELS * finest_metres)).log2().floor();
@@ -98,7 +100,8 @@ impl Layout<'_> {
             .unwrap_or(0)
     }
 
-    /// True when these leaves add enough new pixels to their parents, or when the parents alone would exceed the capacity of a block.
+    /// True when these leaves add enough new pixels to their parents, or when the parents alone would exceed the
+    /// capacity of a block.
     fn is_worthwhile(
         &self,
         level: u8,
@@ -119,8 +122,8 @@ impl Layout<'_> {
             || pixels > BLOCK_PIXELS * blocks
     }
 
-    /// Lays out the tasks, without budgets and steps. Returns the depth that was reached and the tasks: a tree with more levels than its
-    /// views and points support is laid out again with fewer.
+    /// Lays out the tasks, without budgets and steps. Returns the depth that was reached and the tasks: a tree with
+    /// more levels than its views and points support is laid out again with fewer.
     ///
     /// # Errors
     /// [`PlanError::NoBlocks`] when no block can be trained.

@@ -1,12 +1,12 @@
 //! Divides a city into a quadtree of blocks, plans their training and merges the results.
 //!
-//! The ground plane is a quadtree of blocks ([`Ground`]). One half-open ownership rule assigns every place to a block. [`cut()`] and
-//! [`merge()`] share it, so `merge(cut(s)) == s`. [`plan()`] turns a capture into an immutable, hashed list of tasks. A task states
-//! which block trains on which windows of which views, against which frozen context and within which budgets. [`lint()`] checks a
-//! plan, [`draw()`] draws it as an SVG.
+//! The ground plane is a quadtree of blocks ([`Ground`]). One half-open ownership rule assigns every place to a block.
+//! [`cut()`] and [`merge()`] share it, so `merge(cut(s)) == s`. [`plan()`] turns a capture into an immutable, hashed
+//! list of tasks. A task states which block trains on which windows of which views, against which frozen context and
+//! within which budgets. [`lint()`] checks a plan, [`draw()`] draws it as an SVG.
 //!
-//! Architecture invariant: this crate does no I/O, reads no clock, starts no thread and uses no GPU. All functions are pure, and equal
-//! inputs give equal bytes.
+//! Architecture invariant: this crate does no I/O, reads no clock, starts no thread and uses no GPU. All functions are
+//! pure, and equal inputs give equal bytes.
 
 mod block_box;
 mod budgets;

@@ -1,6 +1,7 @@
 //! Level-of-detail cuts of the block tree, and the context and training order that follow from them.
 //!
-//! Training context and viewer use the same rule: full detail nearby, one level coarser with every doubling of the distance.
+//! Training context and viewer use the same rule: full detail nearby, one level coarser with every doubling of the
+//! distance.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -11,8 +12,8 @@ use crate::ground::Ground;
 
 /// A set of blocks that represents the whole plane. The deepest block that contains a place owns it.
 ///
-/// A block contributes only the splats that it owns in the cut ([`Cut::keep`]). No place is rendered twice, also where a coarse block
-/// fills in for finer blocks that do not exist.
+/// A block contributes only the splats that it owns in the cut ([`Cut::keep`]). No place is rendered twice, also where
+/// a coarse block fills in for finer blocks that do not exist.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Cut {
     /// Region -> its owner. A deeper region inside takes precedence.
@@ -34,8 +35,8 @@ impl Cut {
         Self { regions, deepest }
     }
 
-    /// The cut of disjoint blocks in which gaps belong to the block with the nearest centre (ties: the lowest id). Each gap is the
-    /// largest empty square of the tree and has one owner.
+    /// The cut of disjoint blocks in which gaps belong to the block with the nearest centre (ties: the lowest id). Each
+    /// gap is the largest empty square of the tree and has one owner.
     pub fn nearest(ground: &Ground, blocks: impl IntoIterator<Item = BlockId>) -> Self {
         let blocks: BTreeSet<BlockId> = blocks.into_iter().collect();
         let mut inner: BTreeSet<BlockId> = BTreeSet::new();
@@ -63,8 +64,8 @@ impl Cut {
         self.regions.iter().map(|(&region, &owner)| (region, owner))
     }
 
-    /// The block that owns a place (world metres). `None` if the place is not finite or in a hole of the cut. Background belongs to the
-    /// root if the root is in the cut, because no other block trains it.
+    /// The block that owns a place (world metres). `None` if the place is not finite or in a hole of the cut.
+    /// Background belongs to the root if the root is in the cut, because no other block trains it.
     pub fn owner_of(&self, ground: &Ground, world: DVec3) -> Option<BlockId> {
         if !world.is_finite() {
             return None;
@@ -82,18 +83,20 @@ impl Cut {
     }
 }
 
-/// The level of the context at a distance from the halo of a block of level `level` (distance and core edge in metres): one level
-/// coarser than the block immediately outside, and another level coarser with every doubling of the distance.
+/// The level of the context at a distance from the halo of a block of level `level` (distance and core edge in metres):
+/// one level coarser than the block immediately outside, and another level coarser with every doubling of the distance.
 pub fn target_level(level: u8, distance_metres: f64, core_edge_metres: f64) -> u8 {
     let steps = (1.0 + distance_metres / core_edge_metres).log2().floor();
     // `as` saturates: an infinite distance gives level 0.
     level.saturating_sub(1).saturating_sub(steps as u8)
 }
 
-/// The coarser context of a block: the cut of the existing coarser levels by [`target_level`], without the block's parent.
+/// The coarser context of a block: the cut of the existing coarser levels by [`target_level`], without the block's
+/// parent.
 ///
-/// Together with the parent the context covers the plane. In a complete tree its blocks are disjoint. Where blocks are missing, their
-/// nearest ancestor fills in. The root is always a member, for the background. The context of the root is empty.
+/// Together with the parent the context covers the plane. In a complete tree its blocks are disjoint. Where blocks are
+/// missing, their nearest ancestor fills in. The root is always a member, for the background. The context of the root
+/// is empty.
 pub fn context_of(ground: &Ground, block: BlockId, existing: &BTreeSet<BlockId>) -> Vec<BlockId> {
     let (halo, edge) = (ground.nominal_halo(block), ground.core_edge_metres(block.level));
     let mut found = BTreeSet::new();
@@ -114,8 +117,8 @@ pub fn context_of(ground: &Ground, block: BlockId, existing: &BTreeSet<BlockId>)
     found.into_iter().collect()
 }
 
-/// The sweep, 0 or 1, in which a block is trained: a red-black (checkerboard) colouring of its level. Blocks of one sweep share no
-/// face, so all of them can be trained concurrently.
+/// The sweep, 0 or 1, in which a block is trained: a red-black (checkerboard) colouring of its level. Blocks of one
+/// sweep share no face, so all of them can be trained concurrently.
 pub fn sweep_of(block: BlockId) -> u8 {
     ((block.x ^ block.y) & 1) as u8
 }
@@ -125,8 +128,8 @@ pub fn training_order(block: BlockId) -> (u8, u8, u32, u32) {
     (block.level, sweep_of(block), block.y, block.x)
 }
 
-/// The face neighbours of `block` on its own level that are trained in an earlier sweep. They are final when the block starts, and are
-/// rendered frozen as in the merged model, so that the block fits its neighbours at the seam.
+/// The face neighbours of `block` on its own level that are trained in an earlier sweep. They are final when the block
+/// starts, and are rendered frozen as in the merged model, so that the block fits its neighbours at the seam.
 pub fn finished_neighbours(block: BlockId, of_level: &BTreeSet<BlockId>) -> impl Iterator<Item = BlockId> {
     let is_face_neighbour = move |b: &BlockId| b.x.abs_diff(block.x) + b.y.abs_diff(block.y) == 1;
     of_level

@@ -1,6 +1,7 @@
 //! The plan: an immutable, hashed list of training tasks, with its settings and its codec.
 //!
-//! A plan is stored as positional bincode in a frame, and as JSON. The order of fields and the serde names are part of both formats.
+//! A plan is stored as positional bincode in a frame, and as JSON. The order of fields and the serde names are part of
+//! both formats.
 
 use glam::DVec3;
 use scene::frame::{self, Kind};
@@ -11,7 +12,7 @@ use crate::ground::{Ground, HALO_SCALE};
 use crate::lod::{Cut, training_order};
 
 /// The format version of [`Plan`] that this program reads and writes.
-pub const VERSION: u32 = 5;
+pub const VERSION: u32 = 6;
 /// The frame kind of a plan.
 pub const PLAN: Kind = Kind(*b"plan", VERSION);
 /// The maximum depth of a plan: 65,536 blocks a side.
@@ -46,8 +47,9 @@ pub struct PlanSettings {
     pub levels: Option<u8>,
     /// Seed of all random numbers of the job.
     pub seed: u64,
-    /// Training work, as steps on full images of the whole scene. Plans of all modes cost about the same. For a scene larger than one
-    /// block (100,000 splats) the cost of a step is capped at one block, so that the cost grows linearly with the scene.
+    /// Training work, as steps on full images of the whole scene. Plans of all modes cost about the same. For a scene
+    /// larger than one block (100,000 splats) the cost of a step is capped at one block, so that the cost grows
+    /// linearly with the scene.
     pub steps: u32,
     /// Batch size: windows rendered per optimiser step, 1 to [`MAX_VIEWS_PER_STEP`]. Larger batches fill a large GPU.
     pub views_per_step: u32,
@@ -55,20 +57,24 @@ pub struct PlanSettings {
     pub budget: u32,
     /// PSNR that pruning of a leaf may lose, dB. 0: no pruning.
     pub tolerance_db: f64,
-    /// Refinement threshold, relative: a block is trained only if the RMS error of its parent's splats in the block's windows exceeds
-    /// this many times the root's overall RMS error. 0: every block is trained.
+    /// Refinement threshold, relative: a block is trained only if the RMS error of its parent's splats in the block's
+    /// windows exceeds this many times the root's overall RMS error. 0: every block is trained.
     pub residual: f64,
     /// Every n-th view is held out for testing. 0: none.
     pub test_every: u32,
     /// Degree of the spherical harmonics, 0 to 3.
     pub sh_degree: u8,
-    /// Anti-aliased mode: opacity is compensated for the screen-space filter (Mip-Splatting's 2D filter), so that the model renders at
-    /// any resolution. Otherwise classic 3DGS.
+    /// Anti-aliased mode: opacity is compensated for the screen-space filter (Mip-Splatting's 2D filter), so that the
+    /// model renders at any resolution. Otherwise classic 3DGS.
     pub antialiased: bool,
     /// Whether the root trains an exposure per view, which all other blocks reuse unchanged.
     pub exposure: bool,
     /// Memory limit of one task, bytes.
     pub memory_limit_bytes: u64,
+    /// Each splat carries the block that trained it, as the attribute [`scene::BLOCK_ATTRIBUTE`].
+    pub label_blocks: bool,
+    /// Weight of the depth loss against the capture's sparse points; 0 leaves it out.
+    pub depth_weight: f64,
 }
 
 impl Default for PlanSettings {
@@ -87,6 +93,8 @@ impl Default for PlanSettings {
             antialiased: false,
             exposure: false,
             memory_limit_bytes: 4 << 30,
+            label_blocks: false,
+            depth_weight: 0.0,
         }
     }
 }
@@ -109,8 +117,9 @@ pub struct Task {
     pub block: BlockId,
     /// The block whose result initialises this one. `None`: initialised from sparse points.
     pub parent: Option<BlockId>,
-    /// Context: blocks that are rendered frozen with this one. Coarser blocks outside the halo, and finished neighbours of the same
-    /// level, which also count inside the halo. Together with the parent they cover the plane; see [`Task::context_cut`].
+    /// Context: blocks that are rendered frozen with this one. Coarser blocks outside the halo, and finished neighbours
+    /// of the same level, which also count inside the halo. Together with the parent they cover the plane; see
+    /// [`Task::context_cut`].
     pub context: Vec<BlockId>,
     /// Training windows, sorted by view.
     pub views: Vec<ViewUse>,
@@ -140,12 +149,12 @@ impl Task {
         self.views.iter().map(|v| v.window.area()).sum()
     }
 
-    /// The donor of a place (world metres): the finished neighbour whose splats initialise that part of this block's core. `None`: the
-    /// parent's splats are used.
+    /// The donor of a place (world metres): the finished neighbour whose splats initialise that part of this block's
+    /// core. `None`: the parent's splats are used.
     ///
-    /// The donor is the nearest finished neighbour whose halo contains the place in its inner half. The neighbour trained its splats
-    /// there together with the splats that stay frozen on its side of the face. In the outer half of its halo it has too few
-    /// observations.
+    /// The donor is the nearest finished neighbour whose halo contains the place in its inner half. The neighbour
+    /// trained its splats there together with the splats that stay frozen on its side of the face. In the outer half of
+    /// its halo it has too few observations.
     pub fn donor(&self, ground: &Ground, place: DVec3) -> Option<BlockId> {
         const INNER: f64 = 0.25 * (HALO_SCALE - 1.0);
         if !ground.owns(self.block, place) || ground.is_background(place) {
@@ -255,8 +264,8 @@ impl Plan {
 
     /// The finest cut: the owner of every place in the merged model. Every place has exactly one.
     ///
-    /// In a tree the owner is the deepest task whose core contains the place, so the area of a block without a task stays with its
-    /// nearest ancestor. In a flat plan such an area belongs to the task with the nearest centre.
+    /// In a tree the owner is the deepest task whose core contains the place, so the area of a block without a task
+    /// stays with its nearest ancestor. In a flat plan such an area belongs to the task with the nearest centre.
     pub fn leaves(&self) -> Cut {
         let blocks = self.tasks.iter().map(|t| t.block);
         match self.settings.mode {

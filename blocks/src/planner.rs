@@ -8,11 +8,11 @@ use crate::layout::{Layout, level_rho_metres};
 use crate::plan::{MAX_LEVELS, MAX_VIEWS_PER_STEP, Mode, Plan, PlanError, PlanSettings, VERSION};
 use crate::visibility::{Observations, is_usable};
 
-/// The finest resolution is this quantile of depth / focal length over all observations. With the median, half of the views of a
-/// street would use mip 1.
+/// The finest resolution is this quantile of depth / focal length over all observations. With the median, half of the
+/// views of a street would use mip 1.
 const FINE_QUANTILE: f64 = 0.25;
-/// Plans the training of a capture on a backend. Held-out views ([`Capture::is_test`]) are never trained on. Equal inputs give equal
-/// plans.
+/// Plans the training of a capture on a backend. Held-out views ([`Capture::is_test`]) are never trained on. Equal
+/// inputs give equal plans.
 ///
 /// # Errors
 /// [`PlanError`]: a setting out of range, or a capture that cannot be trained on.

@@ -58,8 +58,8 @@ impl Seams {
                     continue;
                 };
                 *place = next;
-                // The adjacent square of equal or larger size. A divided neighbour reports the face itself; of two equal squares
-                // only the lower one does.
+                // The adjacent square of equal or larger size. A divided neighbour reports the face itself; of two
+                // equal squares only the lower one does.
                 let neighbour = (0..=square.level).rev().find_map(|level| {
                     let found = squares.binary_search_by_key(&beside.ancestor(level), |(square, _)| *square);
                     found.ok().map(|i| squares[i])

@@ -55,8 +55,8 @@ pub(crate) fn capture(cameras: &[Camera], positions: Vec<DVec3>, tracks: bool) -
     Capture { views, points, geo_origin: None }
 }
 
-/// An aerial survey: `n × n` nadir cameras 60 m above a square of `side` metres with `points` points. All cameras head north, so their
-/// mean image-up vector is horizontal.
+/// An aerial survey: `n × n` nadir cameras 60 m above a square of `side` metres with `points` points. All cameras head
+/// north, so their mean image-up vector is horizontal.
 pub(crate) fn aerial(n: usize, side: f64, points: usize) -> Capture {
     let place = |i: usize| (i as f64 + 0.5) / n as f64 * side - 0.5 * side;
     let cameras: Vec<Camera> = (0..n * n)

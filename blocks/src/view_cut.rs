@@ -61,8 +61,8 @@ impl ViewTree {
         Self { ground, rho_metres, nodes, background }
     }
 
-    /// The screen-space error of a block: the size in camera pixels of one pixel of the block's resolution at the block's nearest point.
-    /// 0 if the block is outside the frustum.
+    /// The screen-space error of a block: the size in camera pixels of one pixel of the block's resolution at the
+    /// block's nearest point. 0 if the block is outside the frustum.
     pub fn screen_error(&self, block: BlockId, camera: &Camera) -> f64 {
         let (Some(node), Some(rho)) = (self.nodes.get(&block), self.rho_metres.get(usize::from(block.level))) else {
             return 0.0;
@@ -77,8 +77,9 @@ impl ViewTree {
         rho * camera.pinhole.fx / distance.max(f64::from(f32::MIN_POSITIVE))
     }
 
-    /// Refines greedily from the root: always the block with the largest screen-space error, until all errors are at most one pixel or
-    /// no refinement fits into `budget` splats. The result has at least the root's splats. `None` for an empty tree.
+    /// Refines greedily from the root: always the block with the largest screen-space error, until all errors are at
+    /// most one pixel or no refinement fits into `budget` splats. The result has at least the root's splats. `None` for
+    /// an empty tree.
     pub fn cut(&self, camera: &Camera, budget: usize) -> Option<Cut> {
         let mut splats = self.background + self.nodes.get(&BlockId::ROOT)?.in_children.iter().sum::<usize>();
         let mut members = vec![BlockId::ROOT];

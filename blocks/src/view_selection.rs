@@ -1,8 +1,8 @@
 //! View selection: the views that train a block, their mips and their windows.
 //!
-//! A view is chosen by its observations of the block's sparse points and not by its position. Nothing is rendered (the method of
-//! RE-Urban-GS and BlockGaussian, on tracked points). All blocks of a level are processed in one pass over the observations: each
-//! observation goes to the one to four blocks whose halo contains its point.
+//! A view is chosen by its observations of the block's sparse points and not by its position. Nothing is rendered (the
+//! method of RE-Urban-GS and BlockGaussian, on tracked points). All blocks of a level are processed in one pass over
+//! the observations: each observation goes to the one to four blocks whose halo contains its point.
 
 use std::collections::BTreeMap;
 use std::f64::consts::SQRT_2;
@@ -19,8 +19,8 @@ use crate::visibility::{Observation, Observations, footprint_metres, is_usable, 
 const MIN_OBSERVATIONS: usize = 4;
 /// A view is kept when at least this share of its observations lies in the block (BlockGaussian's first rule) ...
 const MIN_SHARE_OF_VIEW: f64 = 0.3;
-/// ... or when its count is at least this share of the block's 90th percentile view. BlockGaussian's second rule demands 10 % of
-/// the block's points, which no view of a long street reaches.
+/// ... or when its count is at least this share of the block's 90th percentile view. BlockGaussian's second rule
+/// demands 10 % of the block's points, which no view of a long street reaches.
 const MIN_SHARE_OF_BEST: f64 = 0.1;
 /// Views whose finest pixel is more than this many times the block's resolution are dropped ...
 const TOO_COARSE: f64 = 4.0;
@@ -38,8 +38,8 @@ pub(crate) struct ViewSelection {
     pub(crate) views: Vec<ViewUse>,
     /// Held-out views, sorted by index.
     pub(crate) test_views: Vec<ViewUse>,
-    /// Number of training views whose finest pixels reach the block's resolution (with the rounding of mips). The parent, at half
-    /// the resolution, cannot use their detail.
+    /// Number of training views whose finest pixels reach the block's resolution (with the rounding of mips). The
+    /// parent, at half the resolution, cannot use their detail.
     pub(crate) finer_views: usize,
     /// Sparse points in the halo.
     pub(crate) halo_points: u32,
@@ -47,8 +47,8 @@ pub(crate) struct ViewSelection {
     pub(crate) core_points: u32,
 }
 
-/// Selects views for every block of a level that has a sparse point in its core. `rho_metres` is the level's resolution, metres per
-/// pixel. The root gets all views as full images.
+/// Selects views for every block of a level that has a sparse point in its core. `rho_metres` is the level's
+/// resolution, metres per pixel. The root gets all views as full images.
 pub(crate) fn select_level(
     capture: &Capture,
     observations: &Observations,
@@ -162,8 +162,8 @@ impl BlockView {
         Self { view, count: depth.len(), depth_metres, footprint_metres, bounds }
     }
 
-    /// The window at the matching mip that contains the block's box (the observed points when the box cannot be projected). `None`
-    /// for a window narrower than a tile.
+    /// The window at the matching mip that contains the block's box (the observed points when the box cannot be
+    /// projected). `None` for a window narrower than a tile.
     fn window(&self, capture: &Capture, block_box: &BlockBox, rho_metres: f64) -> Option<ViewUse> {
         let camera = &capture.views[self.view as usize].camera;
         let mip = mip_for(camera, self.depth_metres, rho_metres);

@@ -1,7 +1,8 @@
 //! Visibility: which view sees which sparse point, where in its image and how large a pixel is there.
 //!
-//! The observations come from the tracks of structure from motion (point, view), projected into the views. A capture without
-//! tracks is projected into every view instead. Nothing is rendered, so occlusion is known only as far as tracks express it.
+//! The observations come from the tracks of structure from motion (point, view), projected into the views. A capture
+//! without tracks is projected into every view instead. Nothing is rendered, so occlusion is known only as far as
+//! tracks express it.
 
 use glam::DVec2;
 use scene::{Camera, Capture};
@@ -62,8 +63,8 @@ impl Observation {
 impl Observations {
     /// Collects the observations of a capture.
     ///
-    /// A point is observed by the views of its track. A capture without any tracks counts every view that a point projects into.
-    /// Observations behind a camera, outside its image or by an unusable camera are dropped.
+    /// A point is observed by the views of its track. A capture without any tracks counts every view that a point
+    /// projects into. Observations behind a camera, outside its image or by an unusable camera are dropped.
     pub(crate) fn of(capture: &Capture) -> Self {
         let cameras: Vec<Option<&Camera>> =
             capture.views.iter().map(|v| Some(&v.camera).filter(|c| is_usable(c))).collect();

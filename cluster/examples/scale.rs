@@ -3,9 +3,9 @@
 //! ```text
 //! cargo run --release -p cluster --example scale -- --tasks 100000 --workers 10000 [--json]
 //! ```
-//! The job is a quadtree like those of plans: a block depends on its parent and on up to three neighbours of the parent. Tasks take
-//! about 30 seconds. Half of the workers are twice as fast as the others. Every worker sends four heartbeats per lease. All figures
-//! except simulated times are measured on this machine with one thread.
+//! The job is a quadtree like those of plans: a block depends on its parent and on up to three neighbours of the
+//! parent. Tasks take about 30 seconds. Half of the workers are twice as fast as the others. Every worker sends four
+//! heartbeats per lease. All figures except simulated times are measured on this machine with one thread.
 
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
@@ -88,15 +88,28 @@ impl Cost {
     }
 }
 
+/// Costs by kind of event, and the totals of a run.
+#[derive(Default)]
+struct Run {
+    submitting: Cost,
+    requesting: Cost,
+    heartbeats: Cost,
+    completing: Cost,
+    granted: u64,
+    speculative: u64,
+    /// Simulated time of the end of the job, milliseconds.
+    end_millis: u64,
+}
+
+/// Simulates the job and measures the scheduler.
 fn measure(tasks: u32, workers: u32) -> Result<serde_json::Value, String> {
     let mut random = Random::new(1);
     let settings = Settings::default();
     let mut scheduler = Scheduler::new(settings, 1);
     let spec = quadtree(tasks, &mut random);
     let nodes = spec.tasks.clone();
-    let (mut submitting, mut asking, mut beating, mut ending) =
-        (Cost::default(), Cost::default(), Cost::default(), Cost::default());
-    submitting.step(&mut scheduler, 0, Event::Submitted { job: JOB, spec });
+    let mut run = Run::default();
+    run.submitting.step(&mut scheduler, 0, Event::Submitted { job: JOB, spec });
 
     let speed = |worker: u32| if worker.is_multiple_of(2) { 2 } else { 1 };
     let mut due = BinaryHeap::new();
@@ -105,19 +118,20 @@ fn measure(tasks: u32, workers: u32) -> Result<serde_json::Value, String> {
         scheduler.step(0, Event::Joined { worker: WorkerId(worker), offer });
         due.push(Reverse((random.between(0, 1000), worker, Due::Request)));
     }
-    let (mut granted, mut second, mut last) = (0u64, 0u64, 0u64);
     // The current attempt of each worker. Timers of stopped attempts are ignored.
     let mut current: Vec<Option<AttemptId>> = vec![None; workers as usize];
-    while let Some(Reverse((now, worker, what))) = due.pop() {
+    while let Some(Reverse((now, worker, next))) = due.pop() {
         let place = worker as usize;
-        match what {
+        match next {
             Due::Request => {
-                for action in asking.step(&mut scheduler, now, Event::LeaseRequested { worker: WorkerId(worker) }) {
+                for action in
+                    run.requesting.step(&mut scheduler, now, Event::LeaseRequested { worker: WorkerId(worker) })
+                {
                     match action {
                         Action::Grant { attempt, .. } => {
-                            granted += 1;
+                            run.granted += 1;
                             let record = scheduler.record(JOB, attempt.task).ok_or("a grant of an unknown task")?;
-                            second += u64::from(record.state.leases().len() > 1);
+                            run.speculative += u64::from(record.state.leases().len() > 1);
                             let work = nodes[attempt.task.0 as usize].work;
                             let takes = work * random.between(900, 1100) / 1000 / speed(worker) + 1;
                             let (began, ends) = (now, now + takes);
@@ -135,7 +149,7 @@ fn measure(tasks: u32, workers: u32) -> Result<serde_json::Value, String> {
             }
             Due::Heartbeat { attempt, began, ends } if current[place] == Some(attempt) && now < ends => {
                 let done_permille = Some(((now - began) * 1000 / (ends - began)) as u16);
-                let actions = beating.step(&mut scheduler, now, Event::Progressed { attempt, done_permille });
+                let actions = run.heartbeats.step(&mut scheduler, now, Event::Progressed { attempt, done_permille });
                 let [Action::Accepted { .. }] = &actions[..] else { return Err(format!("{actions:?}")) };
                 let beat = now + settings.lease_millis / 4;
                 due.push(Reverse((beat, worker, Due::Heartbeat { attempt, began, ends })));
@@ -143,14 +157,14 @@ fn measure(tasks: u32, workers: u32) -> Result<serde_json::Value, String> {
             Due::Completion { attempt } if current[place] == Some(attempt) => {
                 let artefact = ArtefactId::of(&attempt.task.0.to_le_bytes());
                 let event = Event::Completed { attempt, artefact, follow_ups: Vec::new() };
-                for action in ending.step(&mut scheduler, now, event) {
+                for action in run.completing.step(&mut scheduler, now, event) {
                     match action {
                         Action::Stop { worker, .. } => {
                             current[worker.0 as usize] = None;
                             due.push(Reverse((now, worker.0, Due::Request)));
                         }
                         Action::JobFinished { outcome, .. } => {
-                            last = now;
+                            run.end_millis = now;
                             if outcome != Outcome::Done {
                                 return Err(format!("the job ended {outcome:?}"));
                             }
@@ -165,30 +179,35 @@ fn measure(tasks: u32, workers: u32) -> Result<serde_json::Value, String> {
         }
     }
 
-    let speeds: u64 = (0..workers).map(speed).sum();
-    let ideal = critical_path_work(&nodes) / 2;
+    Ok(figures(&run, &nodes, (0..workers).map(speed).sum(), workers))
+}
+
+/// The figures of a run. `speeds` is the sum of all workers' speeds.
+fn figures(run: &Run, nodes: &[TaskNode], speeds: u64, workers: u32) -> serde_json::Value {
+    let tasks = nodes.len() as u32;
+    let ideal = critical_path_work(nodes) / 2;
     let ideal = ideal.max(nodes.iter().map(|node| node.work).sum::<u64>() / speeds);
-    let steps = [&submitting, &asking, &beating, &ending];
+    let steps = [&run.submitting, &run.requesting, &run.heartbeats, &run.completing];
     let seconds: f64 = steps.iter().map(|cost| cost.spent.as_secs_f64()).sum();
     let share = seconds / f64::from(tasks) / TASK_SECONDS;
-    Ok(json!({
+    json!({
         "tasks": tasks,
         "workers": workers,
         "scheduler_seconds": seconds,
-        "submit_seconds": submitting.spent.as_secs_f64(),
-        "decisions": asking.events,
-        "decisions_per_second": asking.per_second(),
-        "grants": granted,
-        "second_attempts": second,
-        "heartbeats": beating.events,
-        "heartbeats_per_second": beating.per_second(),
-        "results_per_second": ending.per_second(),
-        "drain_seconds": last as f64 / 1e3,
+        "submit_seconds": run.submitting.spent.as_secs_f64(),
+        "decisions": run.requesting.events,
+        "decisions_per_second": run.requesting.per_second(),
+        "grants": run.granted,
+        "second_attempts": run.speculative,
+        "heartbeats": run.heartbeats.events,
+        "heartbeats_per_second": run.heartbeats.per_second(),
+        "results_per_second": run.completing.per_second(),
+        "drain_seconds": run.end_millis as f64 / 1e3,
         "ideal_seconds": ideal as f64 / 1e3,
-        "drain_over_ideal": last as f64 / ideal as f64,
+        "drain_over_ideal": run.end_millis as f64 / ideal as f64,
         "share_of_30_s_tasks": share,
         "peak_memory_bytes": peak_memory(),
-    }))
+    })
 }
 
 /// A quadtree in level order. The work of tasks is between 0.5 and 1.5 of the mean.

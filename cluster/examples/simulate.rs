@@ -5,8 +5,9 @@
 //! cargo run --release -p cluster --example simulate -- --seed 17 --trace
 //! cargo run --release -p cluster --example simulate -- --replay journal.jsonl [--trace]
 //! ```
-//! Seeds are distributed over all cores (`--threads N` for fewer), with a progress bar on a terminal. A trace is written by one thread
-//! in order. Exits with 1 if a seed fails, and prints the lowest failing seed and the command to replay it.
+//! Seeds are distributed over all cores (`--threads N` for fewer), with a progress bar on a terminal. A trace is
+//! written by one thread in order. Exits with 1 if a seed fails, and prints the lowest failing seed and the command to
+//! replay it.
 
 use std::fmt;
 use std::io::{BufWriter, Write};
@@ -31,8 +32,8 @@ struct Args {
 
 fn main() -> ExitCode {
     match parse(std::env::args().skip(1)) {
-        Err(what) => {
-            eprintln!("{what}\nusage: simulate [--seeds A..B | --seed N] [--threads N] [--trace] [--replay FILE]");
+        Err(error) => {
+            eprintln!("{error}\nusage: simulate [--seeds A..B | --seed N] [--threads N] [--trace] [--replay FILE]");
             ExitCode::from(2)
         }
         Ok(args) => match run_all(&args) {
@@ -40,8 +41,8 @@ fn main() -> ExitCode {
                 println!("{summary}");
                 ExitCode::SUCCESS
             }
-            Err(what) => {
-                eprintln!("{what}");
+            Err(error) => {
+                eprintln!("{error}");
                 ExitCode::from(1)
             }
         },
@@ -85,7 +86,8 @@ fn run_all(args: &Args) -> Result<String, String> {
     };
     if let Some(path) = &args.replay {
         let text = std::fs::read_to_string(path).map_err(|error| format!("{path}: {error}"))?;
-        let replayed = cluster::journal::replay(text.lines(), &mut trace).map_err(|what| format!("{path}: {what}"))?;
+        let replayed =
+            cluster::journal::replay(text.lines(), &mut trace).map_err(|error| format!("{path}: {error}"))?;
         return Ok(format!("{} steps and {} restarts replayed", replayed.steps, replayed.restarts));
     }
     let (from, to) = args.seeds.unwrap_or((0, 1000));
@@ -99,14 +101,14 @@ fn run_all(args: &Args) -> Result<String, String> {
         let cores = || thread::available_parallelism().unwrap_or(NonZero::<usize>::MIN);
         run_parallel(from, to, args.threads.unwrap_or_else(cores))?
     };
-    let counts: Vec<String> = all.counts.iter().map(|(what, count)| format!("{what} {count}")).collect();
+    let counts: Vec<String> = all.counts.iter().map(|(name, count)| format!("{name} {count}")).collect();
     let (steps, hours) = (all.steps, all.millis / 3_600_000);
     Ok(format!("{} seeds held: {steps} steps, {hours} simulated hours; {}", to.saturating_sub(from), counts.join(", ")))
 }
 
 fn run_seed(seed: u64, trace: &mut dyn FnMut(fmt::Arguments<'_>)) -> Result<Report, String> {
-    run(seed, Options::default(), trace).map_err(|what| {
-        format!("{what}\nreplay: cargo run --release -p cluster --example simulate -- --seed {seed} --trace")
+    run(seed, Options::default(), trace).map_err(|error| {
+        format!("{error}\nreplay: cargo run --release -p cluster --example simulate -- --seed {seed} --trace")
     })
 }
 
@@ -127,11 +129,11 @@ fn run_parallel(from: u64, to: u64, threads: NonZero<usize>) -> Result<Report, S
             }
             match run_seed(seed, &mut |_| {}) {
                 Ok(report) => all.add(report),
-                Err(what) => {
+                Err(error) => {
                     stop.store(true, Ordering::Relaxed);
                     let mut failure = failure.lock().expect("no thread panics with the lock");
                     if failure.as_ref().is_none_or(|(lowest, _)| seed < *lowest) {
-                        *failure = Some((seed, what));
+                        *failure = Some((seed, error));
                     }
                 }
             }
@@ -145,8 +147,8 @@ fn run_parallel(from: u64, to: u64, threads: NonZero<usize>) -> Result<Report, S
     });
     bar.finish_and_clear();
     let reports = reports.map_err(|_| "a thread panicked; see the message above".to_string())?;
-    if let Some((_, what)) = failure.into_inner().expect("no thread panics with the lock") {
-        return Err(what);
+    if let Some((_, error)) = failure.into_inner().expect("no thread panics with the lock") {
+        return Err(error);
     }
     let mut all = Report::default();
     reports.into_iter().for_each(|report| all.add(report));

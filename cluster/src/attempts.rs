@@ -210,8 +210,8 @@ impl Scheduler {
         };
         let (now, settings) = (self.now_millis, self.settings);
         self.tally.record_end(&class_of_failure);
-        // Concurrent attempts have the same learning rate and identical results, so all of them diverge. The others end here too.
-        // Counted separately, they would quarantine the task before it was retried with a lower rate.
+        // Concurrent attempts have the same learning rate and identical results, so all of them diverge. The others end
+        // here too. Counted separately, they would quarantine the task before it was retried with a lower rate.
         let ends_all_attempts =
             matches!(&class_of_failure, FailureClass::Reported(Failure { kind: FailureKind::Numeric, .. }));
         self.transition(id, task, actions, |record| {
@@ -233,8 +233,8 @@ impl Scheduler {
         actions.retain(|action| !matches!(action, Action::Stop { attempt: stopped, .. } if *stopped == attempt));
     }
 
-    /// Changes the record of a task and announces the change. Attempts that lose their lease are stopped, and their estimated fair-share
-    /// charge is replaced by the actual time.
+    /// Changes the record of a task and announces the change. Attempts that lose their lease are stopped, and their
+    /// estimated fair-share charge is replaced by the actual time.
     pub(crate) fn transition(
         &mut self,
         id: JobId,

@@ -1,5 +1,5 @@
-//! User commands on jobs: submit, cancel, pause, resume, reprioritise, retry, forget. Each is answered by `Agreed` or `Declined` and
-//! is idempotent.
+//! User commands on jobs: submit, cancel, pause, resume, reprioritise, retry, forget. Each is answered by `Agreed` or
+//! `Declined` and is idempotent.
 
 use crate::dag::Addition;
 use crate::events::Action;

@@ -67,8 +67,8 @@ impl Addition {
     }
 }
 
-/// A topological order of the new tasks (Kahn's algorithm). Existing tasks depend on none of them. The error is the first task that is
-/// not reachable.
+/// A topological order of the new tasks (Kahn's algorithm). Existing tasks depend on none of them. The error is the
+/// first task that is not reachable.
 fn order(nodes: &[TaskNode], first: u32) -> Result<Vec<usize>, usize> {
     let inner = |node: &TaskNode| -> Vec<usize> {
         node.dependencies.iter().filter_map(|task| task.0.checked_sub(first)).map(|place| place as usize).collect()

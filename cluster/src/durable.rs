@@ -17,8 +17,8 @@ pub struct Changes {
 }
 
 impl Changes {
-    /// The changes that must be durable before these actions are carried out: the records and headers that they name. `actions` is the
-    /// scheduler's answer to `event`.
+    /// The changes that must be durable before these actions are carried out: the records and headers that they name.
+    /// `actions` is the scheduler's answer to `event`.
     pub fn of(scheduler: &Scheduler, event: &Event, actions: &[Action]) -> Self {
         let mut changes = Self::default();
         for action in actions {

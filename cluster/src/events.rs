@@ -1,4 +1,5 @@
-//! The scheduler's inputs (events) and outputs (actions). Both are serialisable values, so that a journal of events can be replayed.
+//! The scheduler's inputs (events) and outputs (actions). Both are serialisable values, so that a journal of events can
+//! be replayed.
 
 use scene::ArtefactId;
 use serde::{Deserialize, Serialize};
@@ -89,7 +90,8 @@ pub enum Event {
         /// The worker.
         worker: WorkerId,
     },
-    /// An idle worker asks for a task. A lease that it still holds is lost (it restarted, or did not receive the grant).
+    /// An idle worker asks for a task. A lease that it still holds is lost (it restarted, or did not receive the
+    /// grant).
     LeaseRequested {
         /// The worker.
         worker: WorkerId,
@@ -107,8 +109,8 @@ pub enum Event {
         attempt: AttemptId,
         /// The result.
         artefact: ArtefactId,
-        /// Follow-up tasks that the result adds to the job. They may depend on any task of the job, and on each other by
-        /// [`SIBLING_BASE`](crate::SIBLING_BASE) plus their position in this list.
+        /// Follow-up tasks that the result adds to the job. They may depend on any task of the job, and on each other
+        /// by [`SIBLING_BASE`](crate::SIBLING_BASE) plus their position in this list.
         #[serde(rename = "followers")]
         follow_ups: Vec<TaskNode>,
     },
@@ -125,10 +127,11 @@ pub enum Event {
 
 /// An output of the scheduler, to be carried out by the caller.
 ///
-/// Each request gets exactly one answer: a user's command `Agreed` or `Declined`; a worker's request for a task `Grant`, `NothingYet` or
-/// `Unknown`; a report about an attempt `Accepted` or `Refused`.
+/// Each request gets exactly one answer: a user's command `Agreed` or `Declined`; a worker's request for a task
+/// `Grant`, `NothingYet` or `Unknown`; a report about an attempt `Accepted` or `Refused`.
 ///
-/// The records and headers that `Changed` and `Agreed` name must be durable before any action of the same step is carried out.
+/// The records and headers that `Changed` and `Agreed` name must be durable before any action of the same step is
+/// carried out.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Action {
     /// Grants a task to a worker.

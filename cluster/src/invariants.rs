@@ -2,30 +2,35 @@
 //!
 //! Of every state ([`check`]):
 //! - **C1** A task is `Waiting` exactly while some of its dependencies are not done, and stores their number.
-//! - **C2** The ready queues of a job hold exactly its ready tasks, with their keys and memory. The same holds for the index of ready
-//!   tasks by input.
-//! - **C3** A worker holds at most one lease. A leased task has one or two leases, of different workers. The indices of leases,
-//!   speculation candidates and delays agree with the records.
+//! - **C2** The ready queues of a job hold exactly its ready tasks, with their keys and memory. The same holds for the
+//!   index of ready tasks by input.
+//! - **C3** A worker holds at most one lease. A leased task has one or two leases, of different workers. The indices of
+//!   leases, speculation candidates and delays agree with the records.
 //! - **C4** No lease and no delay has expired by now, and no lease ends later than one lease length from now.
-//! - **C5** Running attempts have different numbers, none above the last granted. The same holds for the attempt that ended a task.
+//! - **C5** Running attempts have different numbers, none above the last granted. The same holds for the attempt that
+//!   ended a task.
 //! - **C6** A task that reached a limit is in a final state.
-//! - **C7** A job is over exactly when no task is ready, delayed or leased, or when it was cancelled (then no task is leased). The
-//!   counters of task states and of unfinished jobs are correct.
-//! - **C8** A job is in its pool's fair-share order exactly while tasks can be granted from it, with the key of its priority class and
-//!   service received.
+//! - **C7** A job is over exactly when no task is ready, delayed or leased, or when it was cancelled (then no task is
+//!   leased). The counters of task states and of unfinished jobs are correct.
+//! - **C8** A job is in its pool's fair-share order exactly while tasks can be granted from it, with the key of its
+//!   priority class and service received.
 //! - **C9** The pools hold exactly the known workers, and every worker has a timeout check.
 //! - **C10** The critical path of a task is its work plus the longest critical path of its dependents.
 //!
 //! Of every step ([`check_step`]):
 //! - **C11** Final states change only by a user's retry.
-//! - **C12** The number of attempts grows exactly by the grants, all of this epoch, so that no attempt is granted twice.
-//! - **C13** A granted task fits the worker (backend, memory), its dependencies are done, and its job is neither paused nor cancelled. A
-//!   speculative attempt is granted only for a task with exactly one running attempt on another worker.
-//! - **C14** A grant does not bypass a job of a higher class with a ready task that fits and has never failed on a worker.
+//! - **C12** The number of attempts grows exactly by the grants, all of this epoch, so that no attempt is granted
+//!   twice.
+//! - **C13** A granted task fits the worker (backend, memory), its dependencies are done, and its job is neither paused
+//!   nor cancelled. A speculative attempt is granted only for a task with exactly one running attempt on another
+//!   worker.
+//! - **C14** A grant does not bypass a job of a higher class with a ready task that fits and has never failed on a
+//!   worker.
 //! - **C15** Every change of a record that must be durable is announced.
 //! - **C16** The end of a job is announced exactly once, when it occurs.
 //! - **C17** Time does not go backwards. The dependencies of a task do not change, and tasks do not disappear.
-//! - **C18** A report is accepted only from an attempt that held its lease before the step, or if it repeats the accepted result.
+//! - **C18** A report is accepted only from an attempt that held its lease before the step, or if it repeats the
+//!   accepted result.
 
 use std::collections::{BTreeMap, BTreeSet};
 

@@ -1,7 +1,7 @@
 //! One job: the records of its tasks, and the indices derived from them.
 //!
-//! Every index, here and in [`Indices`], is a function of the records. Records change only in [`Job::update_record`], which removes the
-//! task from all indices and inserts it again, so that no index can become stale.
+//! Every index, here and in [`Indices`], is a function of the records. Records change only in [`Job::update_record`],
+//! which removes the task from all indices and inserts it again, so that no index can become stale.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -197,8 +197,8 @@ impl Job {
         self.index_from(first, &order, indices);
     }
 
-    /// Computes the critical paths of the tasks from `first` on and indexes them. `order` is a topological order of these tasks,
-    /// relative to `first`.
+    /// Computes the critical paths of the tasks from `first` on and indexes them. `order` is a topological order of
+    /// these tasks, relative to `first`.
     pub(crate) fn index_from(&mut self, first: u32, order: &[usize], indices: &mut Indices) {
         for place in order.iter().rev() {
             let task = first as usize + place;

@@ -4,7 +4,8 @@
 //! {"began":{"settings":{…},"snapshot":{…},"epoch":3,"now_millis":0}}
 //! {"step":{"now_millis":17,"event":{…},"said":1234}}
 //! ```
-//! A coordinator can write a journal while it runs. [`replay`] repeats the steps and compares the actions by their digests (`said`).
+//! A coordinator can write a journal while it runs. [`replay`] repeats the steps and compares the actions by their
+//! digests (`said`).
 
 use std::fmt;
 
@@ -73,8 +74,8 @@ pub struct Replayed {
     pub last: Snapshot,
 }
 
-/// Replays a journal: repeats all steps, checks the invariants after each and compares the actions. A truncated last line, as a killed
-/// process leaves it, is ignored.
+/// Replays a journal: repeats all steps, checks the invariants after each and compares the actions. A truncated last
+/// line, as a killed process leaves it, is ignored.
 ///
 /// # Errors
 /// The line number and the problem: an invalid line, a violated invariant, or different actions.
@@ -86,7 +87,7 @@ pub fn replay<'a>(
     let mut scheduler: Option<Scheduler> = None;
     let (mut steps, mut starts) = (0, 0);
     while let Some((number, text)) = lines.next() {
-        let wrong = |what: String| format!("line {number}: {what}");
+        let wrong = |problem: String| format!("line {number}: {problem}");
         if text.len() > LINE_BYTES_LIMIT {
             return Err(wrong(format!("longer than {LINE_BYTES_LIMIT} bytes")));
         }

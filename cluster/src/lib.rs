@@ -1,13 +1,15 @@
 //! The scheduler of all jobs as a sans-I/O state machine: `step(now, event) -> actions`.
 //!
-//! Architecture invariant: no I/O, no clock, no thread, no randomness. Time and events are inputs, actions are outputs, so that a
-//! deterministic simulation can test years of faults in seconds. The scheduler knows tasks and artefact ids, but no splats, files or
-//! sockets.
+//! Architecture invariant: no I/O, no clock, no thread, no randomness. Time and events are inputs, actions are outputs,
+//! so that a deterministic simulation can test years of faults in seconds. The scheduler knows tasks and artefact ids,
+//! but no splats, files or sockets.
 //!
-//! - [`Scheduler`] is the state machine. Its parts are `job`, `dag`, `ready_queue`, `pools`, `placement`, `attempts`, `timers` and
-//!   `retry`.
-//! - [`Snapshot`] is its durable state, [`Changes`] the part that a step changes, [`journal`] the log of its events as lines of JSON.
-//! - [`check`] and [`check_step`] check the numbered invariants. [`sim`] is the deterministic simulation with fault injection.
+//! - [`Scheduler`] is the state machine. Its parts are `job`, `dag`, `ready_queue`, `pools`, `placement`, `attempts`,
+//!   `timers` and `retry`.
+//! - [`Snapshot`] is its durable state, [`Changes`] the part that a step changes, [`journal`] the log of its events as
+//!   lines of JSON.
+//! - [`check`] and [`check_step`] check the numbered invariants. [`sim`] is the deterministic simulation with fault
+//!   injection.
 
 mod attempts;
 mod control;

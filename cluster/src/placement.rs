@@ -1,13 +1,14 @@
 //! Placement: selects the task for a worker that asks for one, in bounded time.
 //!
-//! 1. The first job in fair-share order (priority class, then service received) that has a fitting ready task for the backend.
-//! 2. Of that job, the task with the longest critical path (in half octaves). Ties go to the task with most inputs in the worker's
-//!    cache, then to the plan's order.
-//! 3. Large tasks are reserved for fast workers. A worker `n` octaves slower than the fastest takes only tasks that are at least `n`
-//!    octaves smaller than the largest ready task. If there is none, it takes the smallest larger task: a speculative attempt can
-//!    repair a slow attempt, but nothing repairs idle time.
-//! 4. Without a ready task, a speculative attempt at a running task that this worker would finish earlier (backup tasks, Dean and
-//!    Ghemawat, "MapReduce", 2004, section 3.6). Results are identical, so the first one wins.
+//! 1. The first job in fair-share order (priority class, then service received) that has a fitting ready task for the
+//!    backend.
+//! 2. Of that job, the task with the longest critical path (in half octaves). Ties go to the task with most inputs in
+//!    the worker's cache, then to the plan's order.
+//! 3. Large tasks are reserved for fast workers. A worker `n` octaves slower than the fastest takes only tasks that are
+//!    at least `n` octaves smaller than the largest ready task. If there is none, it takes the smallest larger task: a
+//!    speculative attempt can repair a slow attempt, but nothing repairs idle time.
+//! 4. Without a ready task, a speculative attempt at a running task that this worker would finish earlier (backup
+//!    tasks, Dean and Ghemawat, "MapReduce", 2004, section 3.6). Results are identical, so the first one wins.
 
 use std::ops::Bound;
 
@@ -77,7 +78,8 @@ impl Candidate<'_> {
         None
     }
 
-    /// Whether the task failed on this worker and another suitable worker exists: one with enough memory on which it has not failed.
+    /// Whether the task failed on this worker and another suitable worker exists: one with enough memory on which it
+    /// has not failed.
     fn is_excluded(&self, job: &Job, task: TaskIndex) -> bool {
         let record = job.record(task);
         let TaskState::Ready { since_millis } = record.state else { return false };

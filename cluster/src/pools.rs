@@ -52,8 +52,8 @@ pub(crate) struct Pool {
     pub(crate) fair_order: BTreeSet<FairKey>,
     /// Jobs with tasks that have exactly one running attempt: candidates for speculation.
     pub(crate) speculatable: BTreeSet<JobId>,
-    /// Per priority class, the service of the job that was served last. A new or resumed job starts from this value, so that it cannot
-    /// claim service for its idle time.
+    /// Per priority class, the service of the job that was served last. A new or resumed job starts from this value, so
+    /// that it cannot claim service for its idle time.
     pub(crate) served_floors: BTreeMap<u8, u64>,
 }
 
@@ -96,7 +96,8 @@ impl Pool {
         (u128::from(work) * u128::from(UNIT_SPEED) / u128::from(self.speed_of(worker))).clamp(1, 1 << 40) as u64
     }
 
-    /// Updates the speeds from a completed attempt by exponential smoothing: weight 1/4 for the worker, 1/16 for the pool's mean.
+    /// Updates the speeds from a completed attempt by exponential smoothing: weight 1/4 for the worker, 1/16 for the
+    /// pool's mean.
     pub(crate) fn record_speed(&mut self, id: WorkerId, worker: &mut Worker, work: u64, took_millis: u64) {
         let seen = u128::from(work) * u128::from(UNIT_SPEED) / u128::from(took_millis.max(1));
         let seen = seen.clamp(1, SPEED_LIMIT.into()) as u64;

@@ -1,8 +1,8 @@
 //! The ready queue: ready tasks in grant order, with a search for the first one that fits a worker's memory.
 //!
-//! A treap over the keys in which every node stores the minimum memory of its subtree (Seidel and Aragon, "Randomized search trees",
-//! 1996). The priority of a node is a hash of its key, so that equal keys give equal trees. All operations take expected
-//! `O(log tasks)` time.
+//! A treap over the keys in which every node stores the minimum memory of its subtree (Seidel and Aragon, "Randomized
+//! search trees", 1996). The priority of a node is a hash of its key, so that equal keys give equal trees. All
+//! operations take expected `O(log tasks)` time.
 
 const NIL: u32 = u32::MAX;
 

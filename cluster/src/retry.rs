@@ -60,7 +60,8 @@ pub(crate) fn decide(
         }
         FailureClass::Reported(Failure { kind: FailureKind::OutOfMemory, message }) => {
             record.memory_failures += 1;
-            // Raise the estimate by half, up to the largest worker. If the task ran out of memory there, no worker has enough.
+            // Raise the estimate by half, up to the largest worker. If the task ran out of memory there, no worker has
+            // enough.
             let beyond = site.memory.map_or(0, |memory| memory.saturating_add(1));
             let largest = site.max_memory.unwrap_or(u64::MAX);
             let raised = record.memory_bytes.saturating_add(record.memory_bytes / 2);

@@ -15,16 +15,16 @@
 //!                        └──given back, failed or lost below the limits── (Leased)
 //! ```
 //!
-//! Each grant is a new **attempt**, fenced by the scheduler's epoch and a number that grows per task. Reports about an attempt that
-//! holds no lease are refused, so a zombie worker can waste work but not corrupt results. Dependents of a failed task stay
-//! `Waiting`, all other branches continue. A job is over when no task is ready, delayed or leased.
+//! Each grant is a new **attempt**, fenced by the scheduler's epoch and a number that grows per task. Reports about an
+//! attempt that holds no lease are refused, so a zombie worker can waste work but not corrupt results. Dependents of a
+//! failed task stay `Waiting`, all other branches continue. A job is over when no task is ready, delayed or leased.
 //!
-//! A restarted scheduler ([`Scheduler::restore`]) has a higher epoch. Attempts in the snapshot continue under the epoch that granted
-//! them, with a renewed lease. Attempts that are not in the snapshot were never durable, so their grants were never sent. Reports
-//! about them are refused.
+//! A restarted scheduler ([`Scheduler::restore`]) has a higher epoch. Attempts in the snapshot continue under the epoch
+//! that granted them, with a renewed lease. Attempts that are not in the snapshot were never durable, so their grants
+//! were never sent. Reports about them are refused.
 //!
-//! Cost per event: `O(log)` of tasks and workers, plus the dependents of a task that completes, plus the tasks of a job that is
-//! submitted, cancelled or unschedulable.
+//! Cost per event: `O(log)` of tasks and workers, plus the dependents of a task that completes, plus the tasks of a job
+//! that is submitted, cancelled or unschedulable.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -76,8 +76,8 @@ impl Scheduler {
         }
     }
 
-    /// Processes one event at this time and returns the actions to carry out, in order. A time before the last one counts as the last
-    /// one.
+    /// Processes one event at this time and returns the actions to carry out, in order. A time before the last one
+    /// counts as the last one.
     pub fn step(&mut self, now_millis: u64, event: Event) -> Vec<Action> {
         let mut actions = Vec::new();
         self.now_millis = self.now_millis.max(now_millis);

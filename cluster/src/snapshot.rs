@@ -1,10 +1,11 @@
 //! The durable state of a scheduler, and the restore from it.
 //!
 //! Job headers and task records are durable. They can be stored individually, as [`Action::Changed`](crate::Action) and
-//! [`Action::Agreed`](crate::Action) name them. Workers, speeds and fair-share floors are not durable; workers join again.
+//! [`Action::Agreed`](crate::Action) name them. Workers, speeds and fair-share floors are not durable; workers join
+//! again.
 //!
-//! Times in a snapshot may come from another clock, so a restored scheduler restarts all time spans. Leases get their full length from
-//! now, and a backoff is at most the maximum backoff.
+//! Times in a snapshot may come from another clock, so a restored scheduler restarts all time spans. Leases get their
+//! full length from now, and a backoff is at most the maximum backoff.
 
 use std::collections::BTreeSet;
 

@@ -1,4 +1,5 @@
-//! Timers (leases, backoffs, worker timeouts, unschedulable tasks), and the end of every step: fair-share order and ends of jobs.
+//! Timers (leases, backoffs, worker timeouts, unschedulable tasks), and the end of every step: fair-share order and
+//! ends of jobs.
 
 use std::cmp::Reverse;
 

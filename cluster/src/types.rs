@@ -11,7 +11,8 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 pub struct JobId(pub u64);
 
-/// The index of a task within its job: first the tasks of the plan in order, then follow-up tasks in order of appearance.
+/// The index of a task within its job: first the tasks of the plan in order, then follow-up tasks in order of
+/// appearance.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 pub struct TaskIndex(pub u32);
 
@@ -28,8 +29,8 @@ impl fmt::Display for TaskIndex {
 /// The fencing token of an attempt: unique among all attempts of a task.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 pub struct Fence {
-    /// The epoch of the scheduler that granted the attempt. It grows with every restart, so that a number that was granted but not
-    /// durable cannot be confused with the same number granted again.
+    /// The epoch of the scheduler that granted the attempt. It grows with every restart, so that a number that was
+    /// granted but not durable cannot be confused with the same number granted again.
     pub epoch: u64,
     /// The number of the attempt, from 1 per task.
     pub number: u32,
@@ -57,8 +58,8 @@ impl fmt::Display for AttemptId {
 pub struct TaskNode {
     /// The tasks that must be done before this one starts, in any order. Duplicates are ignored.
     pub dependencies: Vec<TaskIndex>,
-    /// Estimated duration on a worker of unit speed, milliseconds; 0 counts as 1. Only ratios matter, because worker speeds are
-    /// measured in the same unit.
+    /// Estimated duration on a worker of unit speed, milliseconds; 0 counts as 1. Only ratios matter, because worker
+    /// speeds are measured in the same unit.
     pub work: u64,
     /// Estimated peak memory, bytes.
     pub memory_bytes: u64,
@@ -77,8 +78,8 @@ pub struct JobSpec {
     pub tasks: Vec<TaskNode>,
 }
 
-/// Base of sibling indices in [`Event::Completed`](crate::Event::Completed): a follow-up task refers to the n-th follow-up task of the
-/// same result as `SIBLING_BASE + n`, because the final indices are not known in advance.
+/// Base of sibling indices in [`Event::Completed`](crate::Event::Completed): a follow-up task refers to the n-th
+/// follow-up task of the same result as `SIBLING_BASE + n`, because the final indices are not known in advance.
 pub const SIBLING_BASE: u32 = 1 << 31;
 
 /// Maximum number of cached artefacts of a worker that are considered.
@@ -105,7 +106,8 @@ pub struct Settings {
     /// A worker without a lease that sends nothing for this long is removed.
     #[serde(rename = "silence_millis")]
     pub worker_timeout_millis: u64,
-    /// A ready task that fits no worker of its backend is quarantined after this long, once nothing else of its job is running.
+    /// A ready task that fits no worker of its backend is quarantined after this long, once nothing else of its job is
+    /// running.
     #[serde(rename = "strand_millis")]
     pub unschedulable_millis: u64,
     /// For this long a task that failed on a worker is not granted to it again, if another worker can run the task.
@@ -120,13 +122,14 @@ pub struct Settings {
     pub poll_millis: u64,
     /// A task is quarantined after this many attempts whose work failed.
     pub failures_limit: u32,
-    /// A task is quarantined after this many attempts whose worker was lost. Higher than `failures_limit`, because preemption of
-    /// machines is not caused by the task.
+    /// A task is quarantined after this many attempts whose worker was lost. Higher than `failures_limit`, because
+    /// preemption of machines is not caused by the task.
     pub losses_limit: u32,
     /// A task is quarantined after this many attempts with an infrastructure failure.
     #[serde(rename = "troubles_limit")]
     pub infrastructure_failures_limit: u32,
-    /// A task is quarantined after it failed on, or was lost with, this many different workers: it may be what crashes them.
+    /// A task is quarantined after it failed on, or was lost with, this many different workers: it may be what crashes
+    /// them.
     #[serde(rename = "culprits_limit")]
     pub failed_workers_limit: u32,
     /// Maximum number of tasks of a job, including follow-up tasks.
@@ -164,8 +167,8 @@ impl Default for Settings {
 }
 
 impl Settings {
-    /// Settings for workers that share one machine. A speculative attempt would slow down the first one, all workers are equally fast,
-    /// and another worker is no better after a failure.
+    /// Settings for workers that share one machine. A speculative attempt would slow down the first one, all workers
+    /// are equally fast, and another worker is no better after a failure.
     pub fn one_machine(self) -> Self {
         Self { speculation: false, plan_order: true, exclusion_millis: 0, ..self }
     }
@@ -195,7 +198,8 @@ pub struct Lease {
     /// Whether the worker sent any heartbeat since the grant.
     #[serde(rename = "heard")]
     pub has_heartbeat: bool,
-    /// Whether `began_millis` comes from this scheduler's clock. After a restart it does not, and the attempt gives no speed measurement.
+    /// Whether `began_millis` comes from this scheduler's clock. After a restart it does not, and the attempt gives no
+    /// speed measurement.
     #[serde(rename = "timed")]
     pub is_timed: bool,
     /// Fair-share charge to the job for this attempt.

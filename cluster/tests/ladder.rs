@@ -1,5 +1,5 @@
-//! The state transitions of tasks, and random histories with lost, duplicated and late messages. The invariants are checked after
-//! every step.
+//! The state transitions of tasks, and random histories with lost, duplicated and late messages. The invariants are
+//! checked after every step.
 
 use cluster::{
     Action, AttemptId, Event, Failure, FailureKind, Fence, JobId, JobSpec, Offer, Outcome, Scheduler, Settings,
@@ -218,7 +218,7 @@ enum HistoryEvent {
     /// Delivers a message about the n-th grant so far, so that messages are late, duplicated, reordered or lost.
     Report {
         grant: usize,
-        what: u8,
+        kind: u8,
     },
     Wait {
         millis: u64,
@@ -228,7 +228,7 @@ enum HistoryEvent {
 fn histories() -> impl Strategy<Value = Vec<HistoryEvent>> {
     let one = prop_oneof![
         4 => (0..4u32).prop_map(|worker| HistoryEvent::Request { worker }),
-        6 => (any::<usize>(), 0..12u8).prop_map(|(grant, what)| HistoryEvent::Report { grant, what }),
+        6 => (any::<usize>(), 0..12u8).prop_map(|(grant, kind)| HistoryEvent::Report { grant, kind }),
         1 => (0..1500u64).prop_map(|millis| HistoryEvent::Wait { millis }),
     ];
     prop::collection::vec(one, 0..200)
@@ -257,9 +257,9 @@ proptest! {
                     now += millis;
                     job.step(now, Event::Ticked);
                 }
-                HistoryEvent::Report { grant, what } if !grants.is_empty() => {
+                HistoryEvent::Report { grant, kind } if !grants.is_empty() => {
                     let (task, attempt) = grants[grant % grants.len()];
-                    let event = match what {
+                    let event = match kind {
                         0..=4 => completed(task, attempt),
                         5..=8 => progressed(task, attempt),
                         9 => failed(task, attempt, FailureKind::Work),

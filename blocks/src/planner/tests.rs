@@ -64,7 +64,7 @@ fn automatic_levels_are_worth_their_work_or_needed() {
     assert_eq!([50_000, 2_000_000].map(levels), [0, 1]);
 }
 
-/// From the air, photos are looked at about as often at every height as one block would look at them.
+/// In an aerial capture every level trains on the photos about as often as a single block would.
 #[test]
 fn heights_get_work_for_what_they_are_the_first_to_see() {
     let capture = aerial(12, 300.0, 20_000);
@@ -240,7 +240,7 @@ fn degenerate_captures_give_a_plan_or_an_error() {
         ("no tracks", capture(&line, grid(900).collect(), false)),
         ("no points", capture(&line, Vec::new(), false)),
         ("nothing finite", capture(&line, vec![DVec3::NAN; 9], false)),
-        ("nothing seen", capture(&line, vec![DVec3::Z * 500.0; 9], false)),
+        ("no observations", capture(&line, vec![DVec3::Z * 500.0; 9], false)),
         ("huge", capture(&line, grid(900).map(|p| p * 1e300).collect(), false)),
         ("nothing", Capture::default()),
     ];
@@ -260,7 +260,8 @@ fn degenerate_captures_give_a_plan_or_an_error() {
                         assert!(!svg.contains("NaN") && !svg.contains("inf"), "{name}: {svg}");
                     }
                     Err(error) => assert!(
-                        ["one view", "no points", "nothing finite", "nothing seen", "huge", "nothing"].contains(name)
+                        ["one view", "no points", "nothing finite", "no observations", "huge", "nothing"]
+                            .contains(name)
                             || mode == Mode::Flat,
                         "{name} {mode:?} {levels:?}: {error}"
                     ),

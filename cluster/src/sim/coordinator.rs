@@ -99,7 +99,8 @@ impl Node {
     }
 }
 
-/// Checks that the store agrees with the scheduler, so that a coordinator that starts from the store now has the same state.
+/// Checks that the store agrees with the scheduler, so that a coordinator that starts from the store now has the same
+/// state.
 fn check_durable(scheduler: &Scheduler, store: &Store) -> Result<(), String> {
     for job in scheduler.jobs() {
         for (task, live) in scheduler.records(job) {

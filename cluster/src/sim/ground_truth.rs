@@ -80,7 +80,8 @@ impl JobGroundTruth {
     }
 }
 
-/// The result of an attempt. Real results are identical for every attempt. Here they differ, to detect which one was accepted.
+/// The result of an attempt. Real results are identical for every attempt. Here they differ, to detect which one was
+/// accepted.
 pub(crate) fn result_of(attempt: AttemptId) -> ArtefactId {
     ArtefactId::of(attempt.to_string().as_bytes())
 }

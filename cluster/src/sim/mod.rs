@@ -1,16 +1,17 @@
 //! Deterministic simulation testing of the scheduler.
 //!
-//! A small world of coordinators, workers, a network and a store runs under injected faults. Time and randomness derive from one seed,
-//! so that a failing seed can be replayed with one command.
+//! A small world of coordinators, workers, a network and a store runs under injected faults. Time and randomness derive
+//! from one seed, so that a failing seed can be replayed with one command.
 //!
 //! ```text
 //!   workers ◀──network: drops, copies, delays, partitions──▶ coordinators ──fails before, after, fenced──▶ store
 //!   slow, hung, crashing, leaving, out of memory            crash, two leaders, skewed clocks
 //! ```
 //!
-//! The invariants are checked after every step. After a while the faults stop (as in TigerBeetle's simulator: first safety under all
-//! faults, then liveness of the healthy cluster). From then on every job must end, every result that was acknowledged to a worker must
-//! still be committed, and the only unfinished tasks must be those that cannot complete according to the ground truth.
+//! The invariants are checked after every step. After a while the faults stop (as in TigerBeetle's simulator: first
+//! safety under all faults, then liveness of the healthy cluster). From then on every job must end, every result that
+//! was acknowledged to a worker must still be committed, and the only unfinished tasks must be those that cannot
+//! complete according to the ground truth.
 
 mod coordinator;
 mod ground_truth;
@@ -32,7 +33,7 @@ pub use report::{Options, Report};
 pub fn run(seed: u64, options: Options, trace: &mut dyn FnMut(fmt::Arguments<'_>)) -> Result<Report, String> {
     let mut world = world::World::new(seed, options);
     let result = world.run(trace);
-    result.map(|()| world.report()).map_err(|what| format!("seed {seed}: {what}"))
+    result.map(|()| world.report()).map_err(|error| format!("seed {seed}: {error}"))
 }
 
 #[cfg(test)]
@@ -77,13 +78,13 @@ mod tests {
     fn every_job_ends_and_no_result_is_lost_under_faults() {
         let mut all = Report::default();
         for seed in 0..120 {
-            let report = run(seed, Options::default(), &mut |_| {}).unwrap_or_else(|what| {
-                panic!("{what}\nreplay: cargo run --release -p cluster --example simulate -- --seed {seed} --trace")
+            let report = run(seed, Options::default(), &mut |_| {}).unwrap_or_else(|error| {
+                panic!("{error}\nreplay: cargo run --release -p cluster --example simulate -- --seed {seed} --trace")
             });
             all.add(report);
         }
-        for what in COVERED {
-            assert!(all.counts.contains_key(what), "'{what}' did not occur: {:?}", all.counts);
+        for name in COVERED {
+            assert!(all.counts.contains_key(name), "'{name}' did not occur: {:?}", all.counts);
         }
     }
 

@@ -25,7 +25,7 @@ pub struct Report {
 impl Report {
     /// Adds the counts of another simulation.
     pub fn add(&mut self, other: Self) {
-        other.counts.into_iter().for_each(|(what, count)| *self.counts.entry(what).or_default() += count);
+        other.counts.into_iter().for_each(|(name, count)| *self.counts.entry(name).or_default() += count);
         self.steps += other.steps;
         self.millis += other.millis;
         self.journals.extend(other.journals);

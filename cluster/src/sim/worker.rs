@@ -1,5 +1,5 @@
-//! A simulated worker: requests tasks, sends heartbeats, and reports the end of its attempt until it is acknowledged. It can be slow,
-//! hang, crash or leave.
+//! A simulated worker: requests tasks, sends heartbeats, and reports the end of its attempt until it is acknowledged.
+//! It can be slow, hang, crash or leave.
 
 use crate::events::{Event, Failure, FailureKind};
 use crate::sim::ground_truth::{Behaviour, JobGroundTruth, result_of};
@@ -121,7 +121,8 @@ impl SimWorker {
         self.running = Some(RunningAttempt { attempt, began: now, ends: now + takes, end, reports_sent: 0 });
     }
 
-    /// The next request when its timer fires: for a task, a heartbeat, or the report of the end. `None`: the worker crashes.
+    /// The next request when its timer fires: for a task, a heartbeat, or the report of the end. `None`: the worker
+    /// crashes.
     pub(crate) fn next_request(&mut self, now: u64) -> Option<Event> {
         let Some(running) = &mut self.running else { return Some(Event::LeaseRequested { worker: self.id }) };
         if now < running.ends {

@@ -39,7 +39,8 @@ const SETTINGS: Settings = Settings {
 };
 /// Number of coordinator nodes.
 const NODES: usize = 2;
-/// Liveness limit: all jobs must end within this time after the faults stop. A single full-size worker needs some minutes for all work.
+/// Liveness limit: all jobs must end within this time after the faults stop. A single full-size worker needs some
+/// minutes for all work.
 const LIVENESS_LIMIT_MILLIS: u64 = 3_600_000;
 
 /// An event of the simulation, as printed in the trace.
@@ -226,7 +227,7 @@ impl World {
         self.queue.insert((self.now + millis, self.order), event);
     }
 
-    fn count(&mut self, what: &'static str) {
-        *self.report.counts.entry(what).or_default() += 1;
+    fn count(&mut self, name: &'static str) {
+        *self.report.counts.entry(name).or_default() += 1;
     }
 }

@@ -86,7 +86,8 @@ impl World {
         if self.nodes[node].incarnation != incarnation || self.nodes[node].scheduler.is_none() {
             return Ok(());
         }
-        // A fenced coordinator that writes nothing would not notice it and would keep its workers waiting, so it checks periodically.
+        // A fenced coordinator that writes nothing would not notice it and would keep its workers waiting, so it checks
+        // periodically.
         let epoch = self.nodes[node].scheduler.as_ref().map_or(0, |scheduler| scheduler.epoch());
         if epoch < self.store.epoch && (self.faults_ended || self.random.chance(200)) {
             self.count("stepped down");

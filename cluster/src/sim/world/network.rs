@@ -80,10 +80,10 @@ impl World {
                 let job = &self.jobs[&attempt.job];
                 let record = self.store.record(attempt.job, attempt.task);
                 let work = record.map_or(1, |record| record.work());
-                let (faults, mut notes) = (self.work_faults, Vec::new());
-                let mut count = |what| notes.push(what);
+                let (faults, mut counted) = (self.work_faults, Vec::new());
+                let mut count = |name| counted.push(name);
                 worker.begin(now, attempt, rate_permille, job, work, faults, &mut self.random, &mut count);
-                notes.into_iter().for_each(|what| self.count(what));
+                counted.into_iter().for_each(|name| self.count(name));
                 self.set_heartbeat_timer(place);
             }
             Action::NothingYet { wait_millis, .. } => self.set_timer(place, wait_millis),
@@ -130,8 +130,8 @@ impl World {
         let worker = &self.workers[place];
         let Some(running) = &worker.running else { return };
         let left = running.ends.saturating_sub(self.now);
-        let set_heartbeat_timer = self.random.between(SETTINGS.lease_millis / 6, SETTINGS.lease_millis / 2);
-        let pause = if left == 0 { self.random.between(500, 2000) } else { left.min(set_heartbeat_timer) };
+        let heartbeat = self.random.between(SETTINGS.lease_millis / 6, SETTINGS.lease_millis / 2);
+        let pause = if left == 0 { self.random.between(500, 2000) } else { left.min(heartbeat) };
         self.set_timer(place, pause);
     }
 
