@@ -1,6 +1,6 @@
-//! Figures of cities: seconds to generate, triangles, actors, bytes.
+//! Prints statistics of a generated city: seconds to generate, triangles, actors, bytes.
 //!
-//! `cargo run --release -p city --example count -- --area-km2 A [--layout L] [--traffic T]`
+//! `cargo run --release -p city --example city_stats -- --area-km2 A [--layout L] [--traffic T]`
 
 use std::time::Instant;
 
@@ -44,7 +44,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     Ok(())
 }
 
-/// What the city's vectors hold.
+/// Size of the city's data, bytes.
 fn bytes(city: &City) -> usize {
     let meshes: usize = city
         .assets
@@ -62,7 +62,7 @@ fn bytes(city: &City) -> usize {
     meshes + moves + size_of_val(&city.actors[..])
 }
 
-/// The process's high-water mark, where the system tells.
+/// Peak resident memory of the process, where available (Linux).
 fn peak_megabytes() -> f64 {
     let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
     let line = status.lines().find_map(|l| l.strip_prefix("VmHWM:"));

@@ -1,4 +1,4 @@
-//! Draws a city from above and from a street with flat shading, to be looked at: no ray tracer is needed.
+//! Rasterises a city from above and from streets with flat shading, for visual inspection without the ray tracer.
 //!
 //! `cargo run --release -p city --example ortho -- LAYOUT AREA_KM2 FOLDER [SEED] [PLAIN]`
 //! writes `LAYOUT-above.png`, `LAYOUT-oblique.png` and `LAYOUT-street-K.png`.
@@ -27,7 +27,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let oblique =
         View::new(Vec3::new(-0.35 * half, -0.9 * half, 75.0), Vec3::new(0.0, -0.2 * half, 5.0), Some(0.9), 1.0);
     draw(&city, &oblique, [1280, 800], &file("oblique".to_owned()))?;
-    // along the last lane, which is the deck's where there is one, from it and from above
+    // along the last lane (the deck's, if there is one) and from above it
     if let Some(lane) = city.streets.last() {
         let [here, ahead] = [lane.len() / 3, 2 * lane.len() / 3].map(|k| lane[k].as_vec3());
         let over = View::new(here + Vec3::new(0.0, -12.0, 16.0), ahead, Some(0.9), 1.0);
@@ -39,7 +39,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
             &file("last".to_owned()),
         )?;
     }
-    let shelves: [(&str, f32, &[&str]); 4] = [
+    let catalogues: [(&str, f32, &[&str]); 4] = [
         (
             "vehicles",
             7.0,
@@ -56,16 +56,16 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         ),
         ("trees", 8.0, &["tree"]),
     ];
-    for (name, apart, starts) in shelves {
-        let shelf = shelf(&city, f64::from(apart), starts);
-        let side = apart * (shelf.actors.len() as f32).sqrt();
+    for (name, apart, starts) in catalogues {
+        let catalogue = catalogue(&city, f64::from(apart), starts);
+        let side = apart * (catalogue.actors.len() as f32).sqrt();
         let view = View::new(
             Vec3::new(0.5 * side, -0.6 * side, 0.5 * side),
             Vec3::new(-0.5 * apart, -0.5 * apart, 0.0),
             Some(0.62),
             1.0,
         );
-        draw(&shelf, &view, [1500, 1000], &file(format!("shelf-{name}")))?;
+        draw(&catalogue, &view, [1500, 1000], &file(format!("catalogue-{name}")))?;
     }
     let count = city.streets.len();
     for k in 0..count.min(4) {
@@ -77,8 +77,8 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     Ok(())
 }
 
-/// Assets whose names start so, side by side.
-fn shelf(city: &City, apart: f64, starts: &[&str]) -> City {
+/// The assets with these name prefixes, side by side.
+fn catalogue(city: &City, apart: f64, starts: &[&str]) -> City {
     let shown = |name: &str| starts.iter().any(|start| name.starts_with(start));
     let assets: Vec<_> = city.assets.iter().filter(|a| shown(&a.name)).cloned().collect();
     let columns = (assets.len() as f64).sqrt().ceil() as usize;
@@ -96,7 +96,8 @@ fn shelf(city: &City, apart: f64, starts: &[&str]) -> City {
     }
 }
 
-/// An eye: perspective with half a picture's width at unit distance, or from above with half its height in metres.
+/// A camera: perspective with half the image width at unit distance, or orthographic with half the image height in
+/// metres.
 struct View {
     eye: Vec3,
     axes: [Vec3; 3],
@@ -111,7 +112,7 @@ impl View {
         Self { eye, axes: [right, right.cross(ahead), ahead], lens, reach }
     }
 
-    /// A triangle in the eye's axes, cut off in front of it: as a fan.
+    /// A triangle in camera axes, clipped at the near plane, as a fan.
     fn seen(&self, corners: [Vec3; 3]) -> Vec<Vec3> {
         const NEAR: f32 = 0.2;
         let inner = corners.map(|p| Vec3::from(self.axes.map(|axis| axis.dot(p - self.eye))));
@@ -128,7 +129,7 @@ impl View {
         fan
     }
 
-    /// Pixel and depth (growing away from the eye and linear on the screen) of a place in the eye's axes.
+    /// Pixel and depth (increasing with distance, linear on the screen) of a point in camera axes.
     fn project(&self, p: Vec3, [width, height]: [usize; 2]) -> Vec3 {
         let (half_width, half_height) = (0.5 * width as f32, 0.5 * height as f32);
         let (scale, depth) = match self.lens {
@@ -139,7 +140,7 @@ impl View {
     }
 }
 
-/// Draws the city through a projection.
+/// Renders the city with a depth buffer.
 fn draw(city: &City, view: &View, size: [usize; 2], file: &Path) -> image::ImageResult<()> {
     let [width, height] = size;
     let mut colours = vec![Vec3::new(0.55, 0.7, 0.9); width * height];
@@ -154,7 +155,7 @@ fn draw(city: &City, view: &View, size: [usize; 2], file: &Path) -> image::Image
             let thin = ["glass", "leaves", "needles", "hedge"].iter().any(|thin| name.contains(thin));
             for pair in fan.windows(2).skip(1) {
                 let [a, b, c] = [fan[0], pair[0], pair[1]];
-                // seen from behind: magenta, because only panes and leaves should be
+                // back faces are magenta: only panes and leaves should show them
                 let behind = (b - a).truncate().perp_dot((c - a).truncate()) > 0.0;
                 let colour = if behind && !thin { Vec3::new(1.0, 0.0, 1.0) } else { shade(city, mesh, k, corners) };
                 fill(&mut colours, &mut depths, width, height, [a, b, c], colour);
@@ -180,7 +181,7 @@ fn shade(city: &City, mesh: &Mesh, k: usize, [a, b, c]: [Vec3; 3]) -> Vec3 {
     let light = 0.45 + 0.55 * normal.dot(Vec3::new(-0.4, -0.5, 0.77)).max(0.0);
     let stripes = match material.pattern {
         Pattern::Plain => 1.0,
-        // some variation, for one colour by triangle
+        // some variation between triangles
         _ => 0.94 + 0.12 * (mesh.uvs[mesh.triangles[k][0] as usize].element_sum() * 7.3).fract().abs(),
     };
     material.base_colour * light * stripes

@@ -1,9 +1,9 @@
-//! How many rays a core casts in a second: `cargo run --release -p city --example rays [-- KM2]`, in a generated city of
-//! so many square kilometres, or else in a stand-in whose contents do not change with the generator:
+//! Measures rays per second and core: `cargo run --release -p city --example rays [-- KM2]`, in a generated city of
+//! this area, or by default in a fixed scene that does not change with the generator:
 //!
 //! a square kilometre with 4,000 houses with window frames and panes of twenty sorts, 3,000 trees of 2,000
 //! triangles of five sorts, 400 moving boxes. Three cameras: in a street, over the roofs, from 300 m straight down.
-//! Rays are cast by one thread and measured in its own seconds, so that what else runs on the machine counts little.
+//! Rays are cast by one thread and timed by its CPU time, so that other load on the machine has little influence.
 
 use std::time::Instant;
 
@@ -43,7 +43,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     for (name, centre, forward) in places {
         let shot = Shot::new(name.into(), name, 1.0, camera_towards(lens, centre, forward, DVec3::Y));
         let rays = rays(&shot);
-        let start = busy();
+        let start = cpu_seconds();
         let mut shadows = Vec::new();
         let hits = rays
             .iter()
@@ -54,10 +54,10 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
                 })
             })
             .count();
-        let primary = busy() - start;
-        let start = busy();
+        let primary = cpu_seconds() - start;
+        let start = cpu_seconds();
         let dark = shadows.iter().filter(|ray| moment.is_occluded(ray)).count();
-        let secondary = busy() - start;
+        let secondary = cpu_seconds() - start;
         let rate = |count: usize, seconds: f64| count as f64 / seconds / 1e6;
         rays_of_all += (rays.len() + shadows.len()) as f64;
         seconds_of_all += primary + secondary;
@@ -81,8 +81,8 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     Ok(())
 }
 
-/// Seconds that this thread has been running, where the system says so (Linux); else those of the clock on the wall.
-fn busy() -> f64 {
+/// CPU time of this thread, seconds, where available (Linux); otherwise wall time.
+fn cpu_seconds() -> f64 {
     static START: std::sync::OnceLock<Instant> = std::sync::OnceLock::new();
     let wall = START.get_or_init(Instant::now).elapsed().as_secs_f64();
     let running = std::fs::read_to_string("/proc/thread-self/schedstat").ok();
@@ -108,7 +108,7 @@ fn shadow(moment: &Moment, ray: &Ray) -> Option<Ray> {
 
 fn town() -> City {
     let mut city = test_scene::city();
-    let van = city.actors.pop().expect("the stage has a van");
+    let van = city.actors.pop().expect("the test scene has a van");
     city.actors.clear();
     city.streets = vec![vec![DVec3::new(-300.0, 0.0, 0.0), DVec3::X * 400.0]];
     city.extent_metres = 1000.0;

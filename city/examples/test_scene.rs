@@ -1,5 +1,5 @@
-//! Draws what the tracer makes of the stage, on sheets of pictures:
-//! `cargo run --release -p city --example look -- FOLDER`.
+//! Renders the hand-built test scene with every ground truth layer and fault, on contact sheets:
+//! `cargo run --release -p city --example test_scene -- FOLDER`.
 
 use std::path::Path;
 

@@ -1,5 +1,5 @@
-//! Looks at a generated city from the street, from a surveillance camera and from the air, by day and in trouble:
-//! `cargo run --release -p city --example tour -- FOLDER [KM2 [SEED]]`.
+//! Renders views of a generated city from a street, a surveillance camera and the air, by day and with faults, and
+//! plots lidar, radar and occupancy: `cargo run --release -p city --example tour -- FOLDER [KM2 [SEED]]`.
 
 use std::{path::Path, time::Instant};
 
@@ -42,7 +42,7 @@ fn main() -> Result<()> {
     let world = World::new(&city)?;
     println!("indexed in {:.2} s", start.elapsed().as_secs_f64());
     let day = RenderOptions::default();
-    let trouble =
+    let with_fault =
         |kind| RenderOptions { faults: vec![Fault { kind, strength: 1.0, seed: 3 }], ..RenderOptions::default() };
 
     let street = drive(&city, &Rig { width: 1408, height: 600, ..Rig::default() })?;
@@ -51,7 +51,7 @@ fn main() -> Result<()> {
     for (shot, what) in
         street[round..].iter().zip(["front", "", "left", "", "rear"]).filter(|(_, what)| !what.is_empty())
     {
-        take(&world, shot, &day, folder, what)?;
+        save_render(&world, shot, &day, folder, what)?;
     }
     let path: Vec<&Shot> = street.iter().filter(|shot| shot.sensor == "left").collect();
     let here = &path[path.len() / 2];
@@ -60,27 +60,27 @@ fn main() -> Result<()> {
     let other = &street[street.len() / 5 / 6 * 6];
     for (what, options) in [
         ("street", &day),
-        ("night", &trouble(FaultKind::Night)),
-        ("rain", &trouble(FaultKind::Rain)),
-        ("fog", &trouble(FaultKind::Fog)),
+        ("night", &with_fault(FaultKind::Night)),
+        ("rain", &with_fault(FaultKind::Rain)),
+        ("fog", &with_fault(FaultKind::Fog)),
     ] {
-        take(&world, other, options, folder, what)?;
+        save_render(&world, other, options, folder, what)?;
     }
     let posts = fixed(&world.at(0.0), &Fixed { cameras: 2, pictures: 1, ..Fixed::default() })?;
     for (i, shot) in posts.iter().enumerate() {
-        take(&world, shot, &day, folder, &format!("fixed-{i}"))?;
+        save_render(&world, shot, &day, folder, &format!("fixed-{i}"))?;
     }
     let half = DVec2::splat(60.0);
     let block = Survey { tilt_degrees: 45.0, area: Some([-half, half]), ..Survey::default() };
     let above = survey(&city, &block)?;
     for (i, what) in [(0, "nadir"), (1, "oblique")] {
-        take(&world, &above[i], &day, folder, what)?;
+        save_render(&world, &above[i], &day, folder, what)?;
     }
     Ok(())
 }
 
-/// A lidar's turn by intensity, radar detections (away red, towards us green, ghosts blue) and the occupied voxels by class,
-/// each from above.
+/// Plots a lidar sweep by intensity, radar detections (receding red, approaching green, ghosts blue) and occupied
+/// voxels by class, each from above.
 fn plan(world: &World, pose: &Rigid, here: &Shot, folder: &Path) -> Result<()> {
     let mut points = RgbImage::new(800, 800);
     let mut dot = |x: f64, y: f64, size: i32, colour: [u8; 3]| {
@@ -134,7 +134,7 @@ fn plan(world: &World, pose: &Rigid, here: &Shot, folder: &Path) -> Result<()> {
     Ok(image.save(folder.join("occupancy.png"))?)
 }
 
-fn take(world: &World, shot: &Shot, options: &RenderOptions, folder: &Path, what: &str) -> Result<()> {
+fn save_render(world: &World, shot: &Shot, options: &RenderOptions, folder: &Path, what: &str) -> Result<()> {
     let start = Instant::now();
     let picture = render_frame(world, shot, options)?;
     println!("{what}: {} in {:.2} s", shot.name, start.elapsed().as_secs_f64());

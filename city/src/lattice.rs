@@ -1,4 +1,5 @@
-//! Layout of the road network: spacing of lattice lines, their bends, quarters and blocks, and the extents of crossings.
+//! Layout of the road network: spacing of lattice lines, their bends, quarters and blocks, and the extents of
+//! crossings.
 
 use glam::DVec2;
 use rayon::prelude::*;
@@ -7,7 +8,7 @@ use crate::random::Random;
 use crate::roads::{Block, Edge, Quarter, RoadKind, Roads, SAMPLE_METRES};
 use crate::settings::{CitySettings, Layout};
 
-/// Cities narrower than this have no room for three alleys to a cell, nor, unless compact, for bends, metres.
+/// Cities narrower than this are too narrow for three fine cells per main cell and, unless compact, for bends, metres.
 const NARROW_METRES: f64 = 130.0;
 /// Shortest span of lattice lines that a deck with its ramps fits on in a compact city, metres.
 const MIN_DECK_SPAN: f64 = 128.0;
@@ -37,7 +38,8 @@ struct Lattice {
     region: [f64; 2],
 }
 
-/// A sinusoidal shift of one coordinate along the other. The map is injective while the product of the slopes is under 1.
+/// A sinusoidal shift of one coordinate along the other. The map is injective while the product of the slopes is under
+/// 1.
 #[derive(Clone, Copy)]
 struct Bend {
     layout: Layout,
@@ -68,7 +70,7 @@ impl Lattice {
         let (reach_x, reach_y) = (reach(false) + border, reach(true) + border);
         let fine = match layout {
             Layout::Alley | Layout::Mixed if !is_narrow => 3,
-            // a cell of 30 m has room for one alley
+            // a cell of 30 m fits one alley
             Layout::Alley if is_compact => 2,
             _ => 1,
         };
@@ -136,12 +138,13 @@ impl Lattice {
             let mut i = 0;
             while i < columns {
                 let layout = self.layout_of(i, row);
-                let most = match layout {
+                let max_cells = match layout {
                     Layout::CurvedCorridor => 2 + self.random.below(2),
                     Layout::Winding | Layout::Grid => 1 + usize::from(self.random.chance(0.25)),
                     _ => 1,
                 };
-                let joined = (1..=most).take_while(|k| i + k <= columns && self.layout_of(i + k - 1, row) == layout);
+                let joined =
+                    (1..=max_cells).take_while(|k| i + k <= columns && self.layout_of(i + k - 1, row) == layout);
                 let count = joined.last().unwrap_or(1);
                 let lines = [i * fine, (i + count) * fine, row * fine, (row + 1) * fine];
                 self.split(&mut roads, Quarter { lines, layout, row });
@@ -217,7 +220,7 @@ impl Lattice {
         // all edges of a column or row get the same number of samples, so that opposite sides of a block match
         let lengths: Vec<f64> = lines.iter().map(|l| l.windows(2).map(|w| w[0].distance(w[1])).sum()).collect();
         let longest =
-            |edges: &mut dyn Iterator<Item = usize>| edges.fold(SAMPLE_METRES, |most, e| lengths[e].max(most));
+            |edges: &mut dyn Iterator<Item = usize>| edges.fold(SAMPLE_METRES, |longest, e| lengths[e].max(longest));
         let count = |length: f64| (length / SAMPLE_METRES).ceil() as usize;
         for i in 0..nx {
             let samples = count(longest(&mut (0..=ny).map(|j| roads.horizontal(i, j))));
@@ -267,8 +270,8 @@ impl Bend {
     }
 }
 
-/// The bends of a compact city: shorter waves than those of [`bends`], so that a street of 60 m shows one, and with less
-/// amplitude, because the bends take their reach from the blocks.
+/// The bends of a compact city: shorter waves than those of [`bends`], so that a street of 60 m shows one, and with
+/// less amplitude, because the bends take their reach from the blocks.
 fn compact_bends(layout: Layout, width: f64, random: &mut Random) -> Vec<Bend> {
     let mut bend =
         |layout: Layout, shift_y: bool, length: f64, slope: f64| Bend::new(layout, shift_y, length, slope, random);
@@ -390,7 +393,8 @@ impl Arm {
         Some(Self { arm, points, along, front: roads.edges[index].as_ref()?.profile.front() })
     }
 
-    /// Arc length up to which this arm's front line on the left (1) or right (-1) lies between another arm's front lines.
+    /// Arc length up to which this arm's front line on the left (1) or right (-1) lies between another arm's front
+    /// lines.
     fn within(&self, side: f64, other: &Self) -> f64 {
         let last = self.points.len() - 1;
         let inside = |k: usize| {

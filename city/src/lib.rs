@@ -4,11 +4,11 @@
 //! settings ──generate──▶ City: actors (asset, pose, trajectory), materials ──trace, sense──▶ images, sweeps, ground truth
 //! ```
 //! A city is a list of **actors**: each has an asset, a rigid transform and optionally a trajectory (the scene model of
-//! CarlaOcc, supplement A). An **asset** is a mesh in its own frame, shared by its actors. The same settings give the same
-//! city for any number of threads.
+//! CarlaOcc, supplement A). An **asset** is a mesh in its own frame, shared by its actors. The same settings give the
+//! same city for any number of threads.
 //!
-//! Architecture invariant: no files, no clock; random numbers come from the seed (see [`random`]). World coordinates are
-//! metres, z up, with the city centred on the origin.
+//! Architecture invariant: no files, no clock; random numbers come from the seed (see [`random`]). World coordinates
+//! are metres, z up, with the city centred on the origin.
 
 mod build;
 mod deck;

@@ -1,10 +1,10 @@
 //! The table of materials, the same for all cities.
 //!
-//! Base colours are linear RGB. Reflectivities are for 905 nm at normal incidence, as lidar makers state their ranges by: dark
-//! asphalt about 0.1 to 0.2, concrete 0.3 to 0.45, brick 0.3 to 0.4, white render and paint 0.6 to 0.85, foliage 0.45 to 0.6 (near
-//! infrared plateau of chlorophyll), dark car paint 0.05 to 0.15, light car paint 0.5 to 0.7, tyres 0.04, clear glass under
-//! 0.1, retroreflective sheeting at the top of the scale (see the ECOSTRESS spectral library, Meerdink et al. 2019, for the
-//! shapes of such spectra). They are plausible, not measured.
+//! Base colours are linear RGB. Reflectivities are for 905 nm at normal incidence, as lidar makers state their ranges
+//! by: dark asphalt about 0.1 to 0.2, concrete 0.3 to 0.45, brick 0.3 to 0.4, white render and paint 0.6 to 0.85,
+//! foliage 0.45 to 0.6 (near infrared plateau of chlorophyll), dark car paint 0.05 to 0.15, light car paint 0.5 to 0.7,
+//! tyres 0.04, clear glass under 0.1, retroreflective sheeting at the top of the scale (see the ECOSTRESS spectral
+//! library, Meerdink et al. 2019, for the shapes of such spectra). They are plausible, not measured.
 
 use glam::{Vec2, Vec3};
 

@@ -1,11 +1,11 @@
 //! Panoptic voxel occupancy of the city, computed from its meshes and not from lidar points (CarlaOcc, supplement 2.1).
 //!
-//! A voxel is occupied if a triangle intersects it: the separating-axis test of a triangle and a box (Akenine-Möller 2001),
-//! all thirteen axes, in f64. Voxels are half-open: a face on the boundary of two voxels belongs to the upper one. **Only
-//! surfaces count**: the inside of a house is free.
+//! A voxel is occupied if a triangle intersects it: the separating-axis test of a triangle and a box (Akenine-Möller
+//! 2001), all thirteen axes, in f64. Voxels are half-open: a face on the boundary of two voxels belongs to the upper
+//! one. **Only surfaces count**: the inside of a house is free.
 //!
-//! If several surfaces share a voxel, actors with an instance win over those without, then thin classes over thick ones,
-//! then the actor with the lower row.
+//! If several surfaces share a voxel, actors with an instance win over those without, then thin classes over thick
+//! ones, then the actor with the lower row.
 
 use glam::{DMat3, DVec3, UVec3};
 use rayon::prelude::*;
@@ -217,8 +217,8 @@ impl Face {
         }
     }
 
-    /// Range of x in which the triangle's plane passes through a row of voxels, so that large sloping triangles cost no more
-    /// than their surface.
+    /// Range of x in which the triangle's plane passes through a row of voxels, so that large sloping triangles cost no
+    /// more than their surface.
     fn row_span(&self, y: f64, z: f64) -> Option<(f64, f64)> {
         let [a, b, c] = self.corners;
         let n = (b - a).cross(c - a);

@@ -153,7 +153,8 @@ impl<'a> Parcel<'a> {
         self.placements.push(Placement { prop, pose });
     }
 
-    /// The four sides without corners at an offset from the centre lines, counter-clockwise, with the block on the left.
+    /// The four sides without corners at an offset from the centre lines, counter-clockwise, with the block on the
+    /// left.
     pub(crate) fn sides(&self, distance: &dyn Fn(&Profile) -> f64) -> Vec<(Polyline, Profile)> {
         let (ring, turns) = self.roads.ring(&self.walk, distance);
         let count = ring.len();
@@ -212,11 +213,11 @@ impl<'a> Parcel<'a> {
                 HouseKind::Villa => 2,
                 _ => 0,
             };
-            let fitting_widths = WIDTHS.iter().filter(|&&w| f64::from(w) <= line.length - s).count();
-            if fitting_widths <= min_width {
+            let fitting = WIDTHS.iter().filter(|&&w| f64::from(w) <= line.length - s).count();
+            if fitting <= min_width {
                 break;
             }
-            let max_width = if kind == HouseKind::Old { fitting_widths.min(4) } else { fitting_widths };
+            let max_width = if kind == HouseKind::Old { fitting.min(4) } else { fitting };
             let width = min_width + self.random.below(max_width - min_width);
             let back = if villas { self.random.range(3.0, 6.5) } else { 0.0 };
             self.place_house(line, s, kind, width, back.into(), outline);

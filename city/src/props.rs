@@ -1,4 +1,5 @@
-//! Props: the shared assets. Each kind of house, tree, vehicle, person and street furniture is one asset for all its actors.
+//! Props: the shared assets. Each kind of house, tree, vehicle, person and street furniture is one asset for all its
+//! actors.
 
 use crate::build::furniture::Piece;
 use crate::build::house::{self, HouseKind, WIDTHS};

@@ -7,9 +7,9 @@
 //!  │        ├──┼──┼──┤        │
 //!  └────────┴──┴──┴──┴────────┘
 //! ```
-//! Every block is a rectangle of cells with roads on all sides, so there are no dead ends. Everything beside a road (curbs,
-//! front lines, lanes, pedestrian paths) is a **ring** around blocks: the centre lines at an offset, with rounded corners.
-//! Rings at different offsets do not cross. Architecture invariant: this module builds no meshes.
+//! Every block is a rectangle of cells with roads on all sides, so there are no dead ends. Everything beside a road
+//! (curbs, front lines, lanes, pedestrian paths) is a **ring** around blocks: the centre lines at an offset, with
+//! rounded corners. Rings at different offsets do not cross. Architecture invariant: this module builds no meshes.
 
 use glam::DVec2;
 
@@ -250,7 +250,8 @@ impl Roads {
         steps
     }
 
-    /// The closed line at an offset to the left of the centre lines of a walk, and the indices of the middles of its turns.
+    /// The closed line at an offset to the left of the centre lines of a walk, and the indices of the middles of its
+    /// turns.
     pub(crate) fn ring(&self, walk: &[Step], distance: &dyn Fn(&Profile) -> f64) -> (Vec<RingPoint>, Vec<usize>) {
         let (mut ring, mut turns) = (Vec::new(), Vec::new());
         let mut profile = RoadKind::Street.profile();

@@ -43,15 +43,16 @@ impl CitySettings {
     /// Whether the city is under 0.05 km² (224 m square).
     ///
     /// A larger city is a ring of streets around at least two rows of blocks: generated traffic drives around the first
-    /// row, camera cars drive around the second. Two rows of ordinary blocks between ordinary streets need 200 m. A compact
-    /// city keeps the two rows, and with them one street that has houses on both sides. It saves space at its edge: the
-    /// outer roads are back lanes of 7.6 m between the fronts, and small houses stand along them. At 0.005 km², 71 m square,
-    /// there are 300 m of road in all: 60 m of street and back lanes on all four sides. A square is kept, and not a strip of
-    /// 300 m, because 0.005 km² would be a strip of 17 m: the street alone, without a house. A camera car also drives
-    /// around the whole city, so that photos show every road.
+    /// row, camera cars drive around the second. Two rows of ordinary blocks between ordinary streets need 200 m. A
+    /// compact city keeps the two rows, and with them one street that has houses on both sides. It saves space at its
+    /// edge: the outer roads are back lanes of 7.6 m between the fronts, and small houses stand along them. At 0.005
+    /// km², 71 m square, there are 300 m of road in all: 60 m of street and back lanes on all four sides. A square is
+    /// kept, and not a strip of 300 m, because 0.005 km² would be a strip of 17 m: the street alone, without a house. A
+    /// camera car also drives around the whole city, so that photos show every road.
     ///
-    /// Compact cities have no parks, squares or car parks, which could take the place of all houses. They have a deck only
-    /// where its ramps fit, from about 0.02 km² on. A mixed city shows two layouts under 130 m of side, four above.
+    /// Compact cities have no parks, squares or car parks, which could take the place of all houses. They have a deck
+    /// only where its ramps fit, from about 0.02 km² on. A mixed city shows two layouts under 130 m of side, four
+    /// above.
     pub fn is_compact(&self) -> bool {
         self.area_km2 < COMPACT_BELOW_KM2
     }

@@ -1,7 +1,7 @@
 //! Terrain height: gentle hills, a flat plain in the west, rising slopes beyond the city.
 //!
-//! Waves are long against the 4 m at which ground meshes are sampled (curvature under 0.0016 / m). The mesh therefore stays
-//! within millimetres of the function, and actors placed on the function stand on the mesh.
+//! Waves are long against the 4 m at which ground meshes are sampled (curvature under 0.0016 / m). The mesh therefore
+//! stays within millimetres of the function, and actors placed on the function stand on the mesh.
 
 use std::f64::consts::TAU;
 

@@ -1,5 +1,5 @@
-//! A small hand-built scene with known geometry, for tests of sensors: ground, house, a pane of glass before a wall, pole,
-//! a board with text, bush, and a van that passes at 10 m/s.
+//! A small hand-built scene with known geometry, for tests of sensors: ground, house, a pane of glass before a wall,
+//! pole, a board with text, bush, and a van that passes at 10 m/s.
 //!
 //! ```text
 //! y ▲            wall ▀▀▀▀▀▀▀ y = 12.0           house: x 14…24, y 6…18, 9 m high

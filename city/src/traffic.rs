@@ -1,9 +1,9 @@
 //! Moving actors: vehicles that circle quarters, pedestrians that circle blocks.
 //!
-//! All movers on a route follow the same timetable with an offset, so headways hold everywhere, also at corners. Vehicle
-//! routes run clockwise (right-hand traffic) in the lane beside a quarter. Quarters do not overlap, so routes neither share
-//! a lane nor cross. Vehicles circle the quarters of every second row; the lanes beside the other rows stay free for cars
-//! with sensors ([`City::streets`]).
+//! All movers on a route follow the same timetable with an offset, so headways hold everywhere, also at corners.
+//! Vehicle routes run clockwise (right-hand traffic) in the lane beside a quarter. Quarters do not overlap, so routes
+//! neither share a lane nor cross. Vehicles circle the quarters of every second row; the lanes beside the other rows
+//! stay free for cars with sensors ([`City::streets`]).
 
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use scene::Rigid;
@@ -195,8 +195,8 @@ pub(crate) fn deck_vehicles(deck: &Deck, traffic: Traffic, random: &Random) -> V
     vehicles_on_route(&deck.route(), &level, 1.0, 0, &mut random.fork(0xDEC4))
 }
 
-/// Vehicles at intervals on a route; `pace` is a factor on their speed. No buses or lorries: they would cut into the other
-/// lane at corners.
+/// Vehicles at intervals on a route; `pace` is a factor on their speed. No buses or lorries: they would cut into the
+/// other lane at corners.
 fn vehicles_on_route(
     points: &[DVec3],
     level: &TrafficLevel,
@@ -277,8 +277,8 @@ fn walkers_on_route(
         .collect()
 }
 
-/// The lanes without generated traffic: around every second row of quarters, around single quarters of it (for the cross
-/// streets), through alleys, along the deck, and around a compact city.
+/// The lanes without generated traffic: around every second row of quarters, around single quarters of it (for the
+/// cross streets), through alleys, along the deck, and around a compact city.
 pub(crate) fn free_lanes(roads: &Roads, terrain: &Terrain, deck: Option<&Deck>) -> Vec<Vec<DVec3>> {
     let rows = roads.cells[1] / roads.fine;
     let close = |mut lane: Vec<DVec3>| {

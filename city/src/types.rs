@@ -124,8 +124,8 @@ pub enum Pattern {
         /// Share by which the colour of one panel differs from the next, 0 to 1.
         amount: f32,
     },
-    /// Text in a dot-matrix font, in `ink` on the base colour. The surface's uv run from 0 to 1, u in reading direction, v
-    /// upwards.
+    /// Text in a dot-matrix font, in `ink` on the base colour. The surface's uv run from 0 to 1, u in reading
+    /// direction, v upwards.
     Text {
         /// Row of [`City::texts`].
         row: u32,
@@ -153,8 +153,8 @@ pub struct Material {
     pub pattern: Pattern,
 }
 
-/// Triangles in the frame of an asset: metres, counter-clockwise seen from outside. Two-sided surfaces (leaves, panes) have
-/// one triangle; the ray tracer flips its normal towards the ray.
+/// Triangles in the frame of an asset: metres, counter-clockwise seen from outside. Two-sided surfaces (leaves, panes)
+/// have one triangle; the ray tracer flips its normal towards the ray.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Mesh {
     /// Corners.
@@ -187,8 +187,8 @@ pub struct Waypoint {
     pub world_from_asset: Rigid,
 }
 
-/// A motion: poses at increasing times, interpolated (translation linearly, rotation by slerp), constant before the first
-/// and after the last.
+/// A motion: poses at increasing times, interpolated (translation linearly, rotation by slerp), constant before the
+/// first and after the last.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Trajectory {
     /// In order of time.
@@ -206,8 +206,8 @@ pub struct Actor {
     pub asset: u32,
     /// Class of the actor as a whole, and of its bounding box.
     pub class: Class,
-    /// Instance number from 1, unique per city, for countable things (houses, vehicles, people, trees, poles, signs); 0 for
-    /// ground, hedges, fences and walls.
+    /// Instance number from 1, unique per city, for countable things (houses, vehicles, people, trees, poles, signs); 0
+    /// for ground, hedges, fences and walls.
     pub instance: u32,
     /// The pose of an actor without trajectory.
     pub world_from_asset: Rigid,
@@ -228,7 +228,7 @@ pub struct City {
     pub assets: Vec<Asset>,
     /// Everything in the city, static and moving.
     pub actors: Vec<Actor>,
-    /// Lanes for cars with sensors: polylines on the road surface in driving direction (right-hand traffic), world metres.
-    /// Generated traffic does not use these lanes.
+    /// Lanes for cars with sensors: polylines on the road surface in driving direction (right-hand traffic), world
+    /// metres. Generated traffic does not use these lanes.
     pub streets: Vec<Vec<DVec3>>,
 }

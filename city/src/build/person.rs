@@ -1,8 +1,8 @@
 //! Meshes of people as articulated bodies: walking, in sixteen gait phases, and riding.
 //!
-//! x is forward, y left, z up; the lower foot stands at z = 0. Angles of hip, knee, shoulder and elbow
-//! are sines that approximate measured gait (Winter, "Biomechanics and Motor Control of Human Movement", chapter 3): hips
-//! swing about ±25°, a knee bends to 60° while its leg swings, arms go against the legs.
+//! x is forward, y left, z up; the lower foot stands at z = 0. Angles of hip, knee, shoulder and elbow are sines that
+//! approximate measured gait (Winter, "Biomechanics and Motor Control of Human Movement", chapter 3): hips swing about
+//! ±25°, a knee bends to 60° while its leg swings, arms go against the legs.
 
 use std::f32::consts::TAU;
 

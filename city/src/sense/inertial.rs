@@ -153,7 +153,8 @@ impl Inertial {
         Ok(all)
     }
 
-    /// Adds GPS and attitude errors to reported poses. Shots of the same time get the same error, as cameras on one car do.
+    /// Adds GPS and attitude errors to reported poses. Shots of the same time get the same error, as cameras on one car
+    /// do.
     ///
     /// # Errors
     /// [`SenseError`] for settings out of range, or shots over too long a time.

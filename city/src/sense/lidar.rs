@@ -1,11 +1,11 @@
-//! A spinning lidar, by default that of CarlaOcc (supplement 1.1: 32 channels from −30° to 10°, 80 m, 20 Hz, 250,000 firings
-//! per second).
+//! A spinning lidar, by default that of CarlaOcc (supplement 1.1: 32 channels from −30° to 10°, 80 m, 20 Hz, 250,000
+//! firings per second).
 //!
 //! The received power is `P = ρ · cos θ · e^(−2αr) / r²`: the lidar equation for a diffuse surface larger than the beam
 //! (Jelalian 1992; Wagner 2006), with reflectivity ρ, angle of incidence θ and extinction α. Intensity is `P · r²`,
-//! calibrated for range as sensors report it (Material, appendix C). Pulses are lost at random where P is near the noise
-//! floor; half of the pulses are lost on a surface of 10 % reflectivity at the maximum range. At glass the stronger of two
-//! returns counts: the one of the glass and the one through it.
+//! calibrated for range as sensors report it (Material, appendix C). Pulses are lost at random where P is near the
+//! noise floor; half of the pulses are lost on a surface of 10 % reflectivity at the maximum range. At glass the
+//! stronger of two returns counts: the one of the glass and the one through it.
 
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;

@@ -83,7 +83,8 @@ pub struct Shot {
     pub exposure: f32,
     /// Exposure time, seconds; 0 for no motion blur.
     pub shutter_seconds: f64,
-    /// Readout time from the first to the last row, seconds; 0 for a global shutter. The middle row is exposed at `seconds`.
+    /// Readout time from the first to the last row, seconds; 0 for a global shutter. The middle row is exposed at
+    /// `seconds`.
     pub rolling_shutter_seconds: f64,
 }
 
@@ -119,7 +120,8 @@ pub fn pinhole(width: u32, height: u32, field_degrees: f64) -> Result<Pinhole, S
     Ok(Pinhole { width, height, fx: f, fy: f, cx: 0.5 * f64::from(width), cy: 0.5 * f64::from(height) })
 }
 
-/// A camera at a point with a viewing direction. The image is upright (y down); for a vertical direction its top is `up`.
+/// A camera at a point with a viewing direction. The image is upright (y down); for a vertical direction its top is
+/// `up`.
 pub fn camera_towards(pinhole: Pinhole, centre: DVec3, forward: DVec3, up: DVec3) -> Camera {
     let forward = forward.try_normalize().unwrap_or(DVec3::X);
     let level = DVec3::Z.cross(forward);

@@ -1,10 +1,10 @@
 //! An automotive radar: some hundred detections per sweep, each with range, azimuth and radial velocity.
 //!
-//! A fan of rays samples the field of view. Backscatter depends on the class (metal and vehicles most, walls less, ground
-//! and leaves little) and on the angle of incidence. Power falls with the fourth power of range (radar equation, Skolnik
-//! 2008). The strongest return of each cell of range, azimuth and velocity is a detection; the detections with the largest
-//! range-independent power are kept. **Ghosts** model multipath: a return at twice its range and velocity, or one at a
-//! larger range and mirrored azimuth. Velocities are relative to the sensor and positive away from it.
+//! A fan of rays samples the field of view. Backscatter depends on the class (metal and vehicles most, walls less,
+//! ground and leaves little) and on the angle of incidence. Power falls with the fourth power of range (radar equation,
+//! Skolnik 2008). The strongest return of each cell of range, azimuth and velocity is a detection; the detections with
+//! the largest range-independent power are kept. **Ghosts** model multipath: a return at twice its range and velocity,
+//! or one at a larger range and mirrored azimuth. Velocities are relative to the sensor and positive away from it.
 //!
 //! Street Detection Gaussians (section 3.4) uses radar detections as sparse, geometrically reliable depth.
 

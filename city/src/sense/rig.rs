@@ -1,8 +1,8 @@
 //! A car with six cameras that drives all free lanes of a city.
 //!
-//! Mounting follows KITTI-360 with the additions of CarlaOcc (supplement 1.1): no tilt, perspective lenses with the same
-//! field of view (103.7°, 1408 × 376), a forward stereo pair, one camera to each side and a rear stereo pair. Offsets in
-//! metres from the point of the road under the car's centre, x forward, y left, z up:
+//! Mounting follows KITTI-360 with the additions of CarlaOcc (supplement 1.1): no tilt, perspective lenses with the
+//! same field of view (103.7°, 1408 × 376), a forward stereo pair, one camera to each side and a rear stereo pair.
+//! Offsets in metres from the point of the road under the car's centre, x forward, y left, z up:
 //!
 //! | camera | x | y | z | yaw |
 //! |---|---|---|---|---|
@@ -49,7 +49,8 @@ pub struct Rig {
     pub lane_metres: f64,
     /// City time at the start, seconds.
     pub start_seconds: f64,
-    /// Whether each street has its own car, all starting at the same time. Otherwise one car drives the streets in turn.
+    /// Whether each street has its own car, all starting at the same time. Otherwise one car drives the streets in
+    /// turn.
     pub fleet: bool,
     /// Readout time of the rolling shutter, seconds.
     pub rolling_shutter_seconds: f64,
@@ -146,8 +147,8 @@ pub fn legs(city: &City, rig: &Rig) -> Result<Vec<Vec<Waypoint>>, SenseError> {
     Ok(legs)
 }
 
-/// The pose of a car's sensor at a time of a leg (`world_from_sensor`, x forward, y left, z up) and its motion. `None` for an
-/// empty leg.
+/// The pose of a car's sensor at a time of a leg (`world_from_sensor`, x forward, y left, z up) and its motion. `None`
+/// for an empty leg.
 pub fn sensor_pose_at(leg: &[Waypoint], mount: &Mount, seconds: f64) -> Option<(Rigid, Motion)> {
     const STEP: f64 = 0.01;
     let at = |seconds| {
@@ -191,8 +192,8 @@ impl<'a> Polyline<'a> {
         self.points[next - 1].lerp(self.points[next], share)
     }
 
-    /// A car's pose at an arc length and an offset to the right. The heading is the direction of the road over the car's
-    /// length.
+    /// A car's pose at an arc length and an offset to the right. The heading is the direction of the road over the
+    /// car's length.
     pub(crate) fn pose(&self, way: f64, right: f64) -> Rigid {
         const AXLE: f64 = 2.0;
         let ahead = self.at((way + AXLE).min(self.length())) - self.at((way - AXLE).max(0.0));

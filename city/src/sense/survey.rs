@@ -1,5 +1,5 @@
-//! Camera shots other than from cars: aerial blocks with a given overlap (nadir, or nadir and four obliques), surveillance
-//! cameras over streets, and free camera paths.
+//! Camera shots other than from cars: aerial blocks with a given overlap (nadir, or nadir and four obliques),
+//! surveillance cameras over streets, and free camera paths.
 
 use glam::{DVec2, DVec3};
 use scene::{Camera, Pinhole};

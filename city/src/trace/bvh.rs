@@ -120,8 +120,8 @@ impl Triangle {
         Aabb::new(low.to_array().into(), high.to_array().into())
     }
 
-    /// Distance along the ray and barycentrics of the second and third corner (Möller and Trumbore 1997). The edges have a
-    /// small tolerance, so that no ray passes between two adjacent triangles.
+    /// Distance along the ray and barycentrics of the second and third corner (Möller and Trumbore 1997). The edges
+    /// have a small tolerance, so that no ray passes between two adjacent triangles.
     #[inline(always)]
     fn intersect(&self, origin: Vec3, direction: Vec3) -> Option<(f32, f32, f32)> {
         const TOLERANCE: f32 = -1e-6;
@@ -232,8 +232,9 @@ impl Tlas {
     }
 }
 
-/// The ray in the types of `obvhs`, which uses another version of `glam`. Adding zero turns -0 into +0: `obvhs` takes -0 as
-/// negative where it inverts a direction and as positive where it compares, so an axis-aligned ray would hit nothing.
+/// The ray in the types of `obvhs`, which uses another version of `glam`. Adding zero turns -0 into +0: `obvhs` takes
+/// -0 as negative where it inverts a direction and as positive where it compares, so an axis-aligned ray would hit
+/// nothing.
 #[inline(always)]
 fn obvhs_ray(origin: Vec3, direction: Vec3, to: f32) -> obvhs::ray::Ray {
     let direction = direction + Vec3::ZERO;

@@ -1,8 +1,8 @@
 //! Renders a shot: an RGB image and its ground truth.
 //!
-//! Ground truth comes from the ray through the pixel's centre, at the middle of its row's exposure. The colour comes from
-//! the same ray where the neighbours look alike. At edges and shadow boundaries, and everywhere with motion blur, it is the
-//! mean of stratified samples over the exposure of the row (adaptive supersampling, Whitted 1980).
+//! Ground truth comes from the ray through the pixel's centre, at the middle of its row's exposure. The colour comes
+//! from the same ray where the neighbours look alike. At edges and shadow boundaries, and everywhere with motion blur,
+//! it is the mean of stratified samples over the exposure of the row (adaptive supersampling, Whitted 1980).
 
 use glam::{DVec2, DVec3, Quat, Vec2, Vec3};
 use rayon::prelude::*;
@@ -257,8 +257,8 @@ impl<'a> FrameRenderer<'a> {
         1.2 / (self.shot.camera.pinhole.fx as f32 * side as f32)
     }
 
-    /// Supersamples pixels that differ from a neighbour. Then, repeatedly, neighbours that differ from the new samples on
-    /// their side: this follows thin lines that pass between pixel centres.
+    /// Supersamples pixels that differ from a neighbour. Then, repeatedly, neighbours that differ from the new samples
+    /// on their side: this follows thin lines that pass between pixel centres.
     fn supersample_edges(&self, radiances: &mut [Radiance]) {
         let (width, height) = (self.width as usize, self.height as usize);
         let mut done = vec![false; radiances.len()];
@@ -390,8 +390,8 @@ impl Frame {
     }
 }
 
-/// Combines direct and ambient light. Ambient occlusion is the share of free rays of the pixel and its neighbours on the
-/// same surface; occluders reflect a third of the ambient light.
+/// Combines direct and ambient light. Ambient occlusion is the share of free rays of the pixel and its neighbours on
+/// the same surface; occluders reflect a third of the ambient light.
 fn combine(frame: &Frame, radiances: &[Radiance], open: &[bool]) -> Vec<Vec3> {
     let (width, height) = (frame.width as i32, frame.height as i32);
     let side = TILE as i32;

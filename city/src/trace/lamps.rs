@@ -40,7 +40,8 @@ impl Lamps {
         self.emission[usize::from(material)]
     }
 
-    /// Irradiance of the street lamps on a surface; `is_free` tells whether the segment between two points is unobstructed.
+    /// Irradiance of the street lamps on a surface; `is_free` tells whether the segment between two points is
+    /// unobstructed.
     pub(crate) fn irradiance(&self, point: Vec3, normal: Vec3, is_free: impl Fn(Vec3, Vec3) -> bool) -> Vec3 {
         let here = cell(point);
         let mut sum = Vec3::ZERO;

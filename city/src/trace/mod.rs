@@ -4,8 +4,8 @@
 //! City ──World::new──▶ World ──at(seconds)──▶ Moment ──cast──▶ Hit ──shade──▶ radiance
 //!                      Shot, RenderOptions ──render_frame──▶ Frame: RGB, depth, normals, labels, layer behind glass
 //! ```
-//! Radiance is linear RGB, where 1 is a white wall in full sun. The gain ([`crate::sense::Shot::exposure`]) and the sRGB
-//! curve turn it into bytes. Surfaces are diffuse, except for glass, car paint and metal, which have reflections.
+//! Radiance is linear RGB, where 1 is a white wall in full sun. The gain ([`crate::sense::Shot::exposure`]) and the
+//! sRGB curve turn it into bytes. Surfaces are diffuse, except for glass, car paint and metal, which have reflections.
 
 mod bvh;
 pub(crate) mod degrade;

@@ -1,5 +1,5 @@
-//! Material patterns as procedural textures, filtered over the footprint of a pixel. Without the filter distant patterns
-//! would alias, and views of the same surface would disagree.
+//! Material patterns as procedural textures, filtered over the footprint of a pixel. Without the filter distant
+//! patterns would alias, and views of the same surface would disagree.
 
 use font8x8::legacy::BASIC_LEGACY;
 use glam::{Vec2, Vec3};
@@ -11,8 +11,8 @@ const OCTAVES: u32 = 10;
 /// Mean ink coverage of a letter's cell, over capital letters.
 const INK: f32 = 0.36;
 
-/// The colour of a material at a surface coordinate. `seed` differs by material, `size` is the footprint of the pixel in u
-/// and v, `amount` from 0 (base colour only) to 1 is the strength of the pattern.
+/// The colour of a material at a surface coordinate. `seed` differs by material, `size` is the footprint of the pixel
+/// in u and v, `amount` from 0 (base colour only) to 1 is the strength of the pattern.
 pub(crate) fn colour(material: &Material, seed: u32, texts: &[String], uv: Vec2, size: Vec2, amount: f32) -> Vec3 {
     let base = material.base_colour;
     let painted = match material.pattern {
@@ -54,12 +54,12 @@ fn bricks(
     let shift = if bond { 0.5 * brick.x * (course.rem_euclid(2.0)) } else { 0.0 };
     let along = uv.x + shift;
     let one = unit(hash(seed, (along / brick.x).floor() as i32, course as i32)) - 0.5;
-    let seen = detail_weight(brick.x, size.x) * detail_weight(brick.y, size.y);
+    let visible = detail_weight(brick.x, size.x) * detail_weight(brick.y, size.y);
     let (level, upright) =
         (stripe_coverage(uv.y, brick.y, joint, size.y), stripe_coverage(along, brick.x, joint, size.x));
     let joints = level + upright - level * upright;
     let stains = 0.35 * fractal_noise(uv, 0.5 * brick.y, 4.0, seed ^ 1, size);
-    let tone = (1.0 + amount * (1.4 * seen * one + stains)).max(0.0);
+    let tone = (1.0 + amount * (1.4 * visible * one + stains)).max(0.0);
     (base * tone).lerp(base * shade, joints)
 }
 
@@ -99,9 +99,9 @@ fn fractal_noise(uv: Vec2, finest: f32, coarsest: f32, seed: u32, size: Vec2) ->
         if feature < finest.max(1e-3) * 0.7 {
             break;
         }
-        let seen = detail_weight(feature, footprint);
-        if seen > 0.0 {
-            sum += weight * seen * noise(uv / feature, seed.wrapping_add(octave));
+        let visible = detail_weight(feature, footprint);
+        if visible > 0.0 {
+            sum += weight * visible * noise(uv / feature, seed.wrapping_add(octave));
         }
         power += weight * weight;
         (feature, weight) = (0.5 * feature, 0.97 * weight);

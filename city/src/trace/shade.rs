@@ -1,4 +1,5 @@
-//! Shading: sunlight with hard shadows, ambient light of sky and ground, glass with reflection and transmission, and haze.
+//! Shading: sunlight with hard shadows, ambient light of sky and ground, glass with reflection and transmission, and
+//! haze.
 
 use glam::{Vec2, Vec3, vec3};
 use serde::{Deserialize, Serialize};
@@ -82,8 +83,8 @@ impl Light {
     }
 }
 
-/// Radiance along a ray in two parts. Ambient light is reduced by ambient occlusion, which is computed once per pixel and
-/// not per sample.
+/// Radiance along a ray in two parts. Ambient light is reduced by ambient occlusion, which is computed once per pixel
+/// and not per sample.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub(crate) struct Radiance {
     /// All but ambient light.
@@ -255,8 +256,8 @@ fn fresnel(square: f32, cosine: f32) -> f32 {
     square + (1.0 - square) * (1.0 - cosine.clamp(0.0, 1.0)).powi(5)
 }
 
-/// The uv of a hit and the footprint of the sample in uv: as wide as the sample across the view direction, longer along it
-/// at grazing angles.
+/// The uv of a hit and the footprint of the sample in uv: as wide as the sample across the view direction, longer along
+/// it at grazing angles.
 fn footprint(moment: &Moment, ray: &Ray, hit: &Hit, spread: f32) -> (Vec2, Vec2) {
     let mesh = moment.mesh(hit);
     let corners = mesh.triangles[hit.triangle as usize].map(|c| c as usize);

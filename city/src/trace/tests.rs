@@ -222,26 +222,26 @@ fn every_fault_changes_nothing_at_zero_and_something_at_one() {
     for &kind in FaultKind::ALL {
         let with = |strength| {
             let options = RenderOptions { faults: vec![Fault { kind, strength, seed: 4 }], ..RenderOptions::default() };
-            let spoilt = faults::degrade_shots(shots.clone(), &options.faults);
-            (render_frame(&world, spoilt.first().unwrap_or(&shots[0]), &options).unwrap(), spoilt)
+            let degraded = faults::degrade_shots(shots.clone(), &options.faults);
+            (render_frame(&world, degraded.first().unwrap_or(&shots[0]), &options).unwrap(), degraded)
         };
         let plain = render_frame(&world, &shots[0], &RenderOptions::default()).unwrap();
         let (none, unchanged) = with(0.0);
         assert!(none == plain && unchanged == shots, "{kind:?} at 0");
-        let (full, spoilt) = with(1.0);
+        let (full, degraded) = with(1.0);
         let differs = |a: &Frame, b: &Frame| a.rgb.iter().zip(&b.rgb).filter(|(a, b)| a != b).count() > 50;
         match kind {
             FaultKind::PoseNoise => {
                 let off = |s: &Shot| s.reported.centre().distance(s.camera.centre());
-                assert!(spoilt.iter().all(|s| (0.01..3.0).contains(&off(s))) && full.rgb == plain.rgb);
+                assert!(degraded.iter().all(|s| (0.01..3.0).contains(&off(s))) && full.rgb == plain.rgb);
             }
-            FaultKind::SparseViews => assert!((1..12).contains(&spoilt.len()), "{}", spoilt.len()),
-            FaultKind::SensorDropout => assert!((8..32).contains(&spoilt.len()), "{}", spoilt.len()),
+            FaultKind::SparseViews => assert!((1..12).contains(&degraded.len()), "{}", degraded.len()),
+            FaultKind::SensorDropout => assert!((8..32).contains(&degraded.len()), "{}", degraded.len()),
             FaultKind::MovingUnmasked => {
                 assert!(plain.mask.contains(&1) && full.mask.iter().all(|&m| m == 0) && full.moves == plain.moves);
             }
             FaultKind::ExposureDrift => {
-                assert!(spoilt.iter().any(|s| (s.exposure - 1.0).abs() > 0.3) && differs(&full, &plain))
+                assert!(degraded.iter().any(|s| (s.exposure - 1.0).abs() > 0.3) && differs(&full, &plain))
             }
             _ => assert!(differs(&full, &plain) && full.first == plain.first, "{kind:?} at 1"),
         }

@@ -1,9 +1,9 @@
 //! BVH traversal in the order of `obvhs`, with the eight child boxes of a node tested at once where the CPU has AVX2.
 //!
-//! About half of the time of a rendered image is spent here. A build for any x86-64 counts bits in software and converts
-//! the boxes' bytes one by one. With AVX2 the same arithmetic in the same order, so with identical results, takes a fifth
-//! of the instructions. All code between [`Moment::cast`](super::Moment::cast) and this module is inlined into one
-//! function per instruction set.
+//! About half of the time of a rendered image is spent here. A build for any x86-64 counts bits in software and
+//! converts the boxes' bytes one by one. With AVX2 the same arithmetic in the same order, so with identical results,
+//! takes a fifth of the instructions. All code between [`Moment::cast`](super::Moment::cast) and this module is inlined
+//! into one function per instruction set.
 
 use obvhs::{cwbvh::node::CwBvhNode, ray::Ray};
 
@@ -45,8 +45,8 @@ impl NodeTest for Avx2 {
             (&node.child_min_y, &node.child_max_y),
             (&node.child_min_z, &node.child_max_z),
         ];
-        // SAFETY: the functions that this is inlined into run only where AVX2 was detected (see the module docs), and the
-        // eight bytes that are read are those of an array of eight.
+        // SAFETY: the functions that this is inlined into run only where AVX2 was detected (see the module docs), and
+        // the eight bytes that are read are those of an array of eight.
         let mut met = unsafe {
             let mut near = _mm256_set1_ps(NEAREST);
             let mut far = _mm256_set1_ps(ray.tmax);
@@ -72,9 +72,9 @@ impl NodeTest for Avx2 {
     }
 }
 
-/// Traverses a BVH along a ray, near children first. `traverse_bvh!(node_test, bvh, ray, i => body)` runs the body for each
-/// primitive `i` whose box the ray enters before `ray.tmax`. The body may lower `ray.tmax`, and may leave the traversal by
-/// breaking to a label outside.
+/// Traverses a BVH along a ray, near children first. `traverse_bvh!(node_test, bvh, ray, i => body)` runs the body for
+/// each primitive `i` whose box the ray enters before `ray.tmax`. The body may lower `ray.tmax`, and may leave the
+/// traversal by breaking to a label outside.
 macro_rules! traverse_bvh {
     ($node_test:ty, $bvh:expr, $ray:ident, $i:ident => $body:block) => {{
         #[allow(unused_imports)]
