@@ -17,14 +17,27 @@ if [ ${#targets[@]} -eq 0 ]; then
 fi
 
 rm -rf fuzz/seeds
-PLAT_FUZZ_CASES=0 PLAT_FUZZ_SEEDS="$PWD/fuzz/seeds" cargo test --locked -q -p dataset --test mutated
+# All packages of the workspace, so that dependencies have the features that `cargo test` built them with.
+PLAT_FUZZ_CASES=0 PLAT_FUZZ_SEEDS="$PWD/fuzz/seeds" cargo test --locked -q --test mutated
 
 export RUSTC_BOOTSTRAP=1
 for target in "${targets[@]}"; do
-    echo "== fuzz $target, $seconds s"
-    mkdir -p "fuzz/corpus/$target" "fuzz/seeds/$target"
-    # A gigabyte is four times what a file of 10 MB may take. 10 s for one input is a hang.
-    cargo fuzz run "$target" "fuzz/corpus/$target" "fuzz/seeds/$target" -- \
-        -max_total_time="$seconds" -rss_limit_mb=1024 -malloc_limit_mb=256 -timeout=10 -max_len=65536 -print_final_stats=1
+    mkdir -p "fuzz/corpus/$target" "fuzz/seeds/$target" fuzz/artifacts/"$target"
+    cargo fuzz build "$target"
 done
-echo "all of ${#targets[@]} targets ran for $seconds s without a crash"
+
+logs=$(mktemp -d)
+trap 'rm -rf "$logs"' EXIT
+host=$(rustc -vV | sed -n 's/^host: //p')
+fuzz_one() {
+    # A gigabyte is four times what a file of 10 MB may take. 10 s for one input is a hang.
+    "${CARGO_TARGET_DIR:-fuzz/target}/$host/release/$1" "fuzz/corpus/$1" "fuzz/seeds/$1" "-artifact_prefix=fuzz/artifacts/$1/" \
+        -max_total_time="$seconds" -rss_limit_mb=1024 -malloc_limit_mb=256 -timeout=10 -max_len=65536 -print_final_stats=1 \
+        > "$logs/$1" 2>&1 || { echo "== fuzz $1 failed"; tail -40 "$logs/$1"; return 1; }
+    echo "== fuzz $1, $seconds s: $(sed -n 's/^stat::number_of_executed_units: *//p' "$logs/$1") inputs"
+}
+export -f fuzz_one
+export seconds logs host
+# libFuzzer takes one core; targets run side by side.
+printf '%s\0' "${targets[@]}" | xargs -0 -n 1 -P "$(nproc)" bash -c 'fuzz_one "$0"'
+echo "${#targets[@]} targets ran for $seconds s each without a crash"

@@ -5,7 +5,7 @@ use libfuzzer_sys::fuzz_target;
 use train::State;
 
 /// The same as `train::checkpoint::CHECKPOINT`.
-const CHECKPOINT: ([u8; 4], u32) = (*b"ckpt", 3);
+const CHECKPOINT: ([u8; 4], u32) = (*b"ckpt", 4);
 
 fuzz_target!(|bytes: &[u8]| {
     let _ = State::from_frame(bytes);

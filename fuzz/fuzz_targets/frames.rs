@@ -5,7 +5,7 @@ use blocks::{Plan, plan::PLAN};
 use libfuzzer_sys::fuzz_target;
 use scene::exposures::EXPOSURES;
 use scene::{Capture, Exposures};
-use scene::frame::{self, Kind, SPLATS};
+use scene::frame::{self, Kind, SPLATS, SPLATS_WITH_ATTRIBUTES};
 
 /// The same as `dataset::ingest::CAPTURE`.
 const CAPTURE: Kind = Kind(*b"capt", 1);
@@ -15,6 +15,7 @@ fuzz_target!(|bytes: &[u8]| {
     // A header of splats takes at least three bytes, 66 more with the id of exposures and eight more with a residual.
     for header in 0..bytes.len().min(96) {
         let _ = frame::decode_splats(&sealed(SPLATS, bytes, header));
+        let _ = frame::decode_splats(&sealed(SPLATS_WITH_ATTRIBUTES, bytes, header));
     }
     let _ = Exposures::from_frame(bytes);
     for header in 0..bytes.len().min(10) {

@@ -5,7 +5,7 @@ use std::convert::Infallible;
 use std::path::{Path, PathBuf};
 
 use blocks::{Cut, Plan};
-use scene::{BadInput, BlockId, CodecError, Exposures, Splats, frame, ply, spz};
+use scene::{BLOCK_ATTRIBUTE, BadInput, BlockId, CodecError, Exposures, Splats, frame, ply, spz};
 
 use crate::files::{EXPOSURES_FILE, MANIFEST_FILE, PLAN_FILE, block_file, damaged, load};
 use crate::manifest::{Manifest, VERSION};
@@ -70,6 +70,19 @@ impl Tree {
     pub fn merged(&self, cut: &Cut) -> Splats {
         let parts = self.results.iter().map(|(&block, splats)| Ok((block, splats)));
         blocks::merge_cut(cut, &self.plan.ground, parts).unwrap_or_else(|never: Infallible| match never {})
+    }
+}
+
+impl Tree {
+    /// The finest cut, merged, with the block that each splat belongs to as its attribute [`BLOCK_ATTRIBUTE`].
+    pub fn merged_with_blocks(&self) -> Splats {
+        let leaves = self.plan.leaves();
+        let parts = self.results.iter().map(|(&block, splats)| {
+            let mut kept = leaves.keep(splats, &self.plan.ground, block);
+            kept.set_attribute(BLOCK_ATTRIBUTE, vec![block.code().unwrap_or(0); kept.len()]);
+            (block, kept)
+        });
+        blocks::merge(parts)
     }
 }
 

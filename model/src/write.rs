@@ -1,5 +1,6 @@
 //! Writes the model folder of a finished plan.
 
+use std::collections::BTreeSet;
 use std::fs;
 use std::path::{Path, PathBuf};
 
@@ -57,7 +58,7 @@ pub fn write(
     let (leaves, sh_degree) = (plan.leaves(), plan.settings.sh_degree);
     let owned = |splats: &Splats, block| leaves.keep(splats, &plan.ground, block).with_sh_degree(sh_degree);
 
-    let (mut blocks, mut exposures, mut count) = (Vec::new(), None, 0);
+    let (mut blocks, mut exposures, mut count, mut attributes) = (Vec::new(), None, 0, BTreeSet::new());
     for (index, task) in plan.tasks.iter().enumerate() {
         let block = task.block;
         let artefact = *results.get(index).ok_or(ModelError::NoResult(block))?;
@@ -67,17 +68,19 @@ pub fn write(
         exposures = exposures.or(about.exposures);
         save(&folder.join("blocks").join(block_file(block)), &bytes)?;
         blocks.push(BlockEntry { block, artefact, splats: splats.len() as u64 });
+        attributes.extend(splats.attribute_names());
         count += owned(&splats, block).len();
     }
 
     let mut order: Vec<BlockId> = blocks.iter().map(|entry| entry.block).collect();
     order.sort_unstable();
     let mut merged = AtomicFile::create(&out.join(MERGED_FILE))?;
-    let header = ply::header(count, sh_degree, ply_comments(plan.settings.antialiased));
+    let attributes: Vec<String> = attributes.into_iter().collect();
+    let header = ply::header(count, sh_degree, &attributes, ply_comments(plan.settings.antialiased));
     merged.write(&header)?;
     let mut bytes = header.len() as u64;
     for block in order {
-        let rows = ply::rows(&owned(&read_block(&folder, block)?, block));
+        let rows = ply::rows(&owned(&read_block(&folder, block)?, block).with_attributes(&attributes));
         merged.write(&rows)?;
         bytes += rows.len() as u64;
     }

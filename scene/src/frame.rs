@@ -8,7 +8,7 @@ use serde::{Serialize, de::DeserializeOwned};
 
 use crate::error::CodecError;
 use crate::ids::ArtefactId;
-use crate::splats::Splats;
+use crate::splats::{Attribute, Splats};
 
 const MAGIC: &[u8; 4] = b"plat";
 const PREFIX: usize = 40;
@@ -21,6 +21,8 @@ pub struct Kind(pub [u8; 4], pub u32);
 
 /// Splat columns; the header is [`SplatsHeader`].
 pub const SPLATS: Kind = Kind(*b"spla", 2);
+/// Splat columns with attributes; the header is a [`SplatsHeader`] and the attributes' names.
+pub const SPLATS_WITH_ATTRIBUTES: Kind = Kind(*b"spla", 3);
 
 /// Encodes a frame from a header and bulk bytes.
 pub fn encode<T: Serialize>(kind: Kind, header: &T, bulk: &[u8]) -> Vec<u8> {
@@ -115,15 +117,42 @@ pub struct TrainingInfo {
     pub residual: Option<f64>,
 }
 
-/// Encodes splats: all columns one after the other, f32 little endian.
+/// Encodes splats: all columns one after the other, f32 little endian, then the attributes, u32 little endian.
 pub fn encode_splats(splats: &Splats) -> Vec<u8> {
     encode_result(splats, TrainingInfo::default())
 }
 
 /// Encodes splats with their training information.
 pub fn encode_result(splats: &Splats, training: TrainingInfo) -> Vec<u8> {
-    let bulk: Vec<u8> = splats.columns().iter().flat_map(|c| bytemuck::cast_slice::<f32, u8>(c)).copied().collect();
-    encode(SPLATS, &SplatsHeader { sh_degree: splats.sh_degree(), count: splats.len() as u64, training }, &bulk)
+    let floats = splats.columns().iter().flat_map(|column| bytemuck::cast_slice::<f32, u8>(column));
+    let integers = splats.attributes().iter().flat_map(|attribute| bytemuck::cast_slice::<u32, u8>(&attribute.values));
+    let bulk: Vec<u8> = floats.chain(integers).copied().collect();
+    let header = SplatsHeader { sh_degree: splats.sh_degree(), count: splats.len() as u64, training };
+    // Splats without attributes keep the bytes, and so the id, that they had before attributes existed.
+    match splats.attribute_names() {
+        names if names.is_empty() => encode(SPLATS, &header, &bulk),
+        names => encode(SPLATS_WITH_ATTRIBUTES, &(header, names), &bulk),
+    }
+}
+
+/// Splats with attributes of these names, from their values one attribute after the other, u32 little endian.
+///
+/// # Errors
+/// Names that are not sorted, not unique or not [valid](Attribute::is_name), or too many; bytes of another length.
+pub fn with_attributes(mut splats: Splats, names: &[String], bytes: &[u8]) -> Result<Splats, CodecError> {
+    let sorted = names.windows(2).all(|pair| pair[0] < pair[1]);
+    if !sorted || names.len() > Attribute::MAX_COUNT || !names.iter().all(|name| Attribute::is_name(name)) {
+        return Err(CodecError::new("names of attributes are not valid"));
+    }
+    if Some(bytes.len()) != splats.len().checked_mul(4 * names.len()) {
+        return Err(CodecError::new("attributes do not match their header"));
+    }
+    for (i, name) in names.iter().enumerate() {
+        let column = &bytes[4 * splats.len() * i..4 * splats.len() * (i + 1)];
+        let values = column.chunks_exact(4).map(|b| u32::from_le_bytes(b.try_into().expect("four bytes"))).collect();
+        splats.set_attribute(name, values);
+    }
+    Ok(splats)
 }
 
 /// Decodes splats.
@@ -139,22 +168,28 @@ pub fn decode_splats(bytes: &[u8]) -> Result<Splats, CodecError> {
 /// # Errors
 /// As [`decode`], or a bulk whose length does not match the header.
 pub fn decode_result(bytes: &[u8]) -> Result<(Splats, TrainingInfo), CodecError> {
-    let (header, bulk): (SplatsHeader, _) = decode(SPLATS, bytes)?;
+    let is_version_3 = bytes.get(8..12) == Some(&SPLATS_WITH_ATTRIBUTES.1.to_le_bytes()[..]);
+    let ((header, names), bulk): ((SplatsHeader, Vec<String>), _) = match is_version_3 {
+        true => decode(SPLATS_WITH_ATTRIBUTES, bytes)?,
+        false => decode(SPLATS, bytes).map(|(header, bulk)| ((header, Vec::new()), bulk))?,
+    };
     if header.sh_degree > 3 {
         return Err(CodecError::new(format!("SH degree {} is above 3", header.sh_degree)));
     }
     let columns = Splats::new(header.sh_degree).columns().len();
-    if header.count.checked_mul(4 * columns as u64) != Some(bulk.len() as u64) {
+    let row = 4 * (columns as u64 + names.len().min(Attribute::MAX_COUNT) as u64);
+    if header.count.checked_mul(row) != Some(bulk.len() as u64) {
         return Err(CodecError::new("splat columns do not match their header"));
     }
     if header.count == 0 {
-        return Ok((Splats::new(header.sh_degree), header.training));
+        return Ok((with_attributes(Splats::new(header.sh_degree), &names, &[])?, header.training));
     }
+    let (bulk, attributes) = bulk.split_at(4 * columns * header.count as usize);
     let values =
         |chunk: &[u8]| chunk.chunks_exact(4).map(|b| f32::from_le_bytes(b.try_into().expect("four bytes"))).collect();
     let columns = bulk.chunks_exact(4 * header.count as usize).map(values).collect();
-    let splats = Splats::from_columns(columns);
-    Ok((splats.ok_or_else(|| CodecError::new("splat columns of unequal length"))?, header.training))
+    let splats = Splats::from_columns(columns).ok_or_else(|| CodecError::new("splat columns of unequal length"))?;
+    Ok((with_attributes(splats, &names, attributes)?, header.training))
 }
 
 #[cfg(test)]
@@ -187,11 +222,22 @@ mod tests {
         assert_eq!(decode_result(&bytes).unwrap(), (splats.clone(), TrainingInfo::default()));
         let training = TrainingInfo { exposures: Some(ArtefactId::of(b"exposures")), residual: Some(0.1) };
         let exposed = encode_result(&splats, training);
-        assert_eq!(decode_result(&exposed).unwrap(), (splats, training));
-        for at in 0..bytes.len() {
-            let mut damaged = bytes.clone();
-            damaged[at] ^= 0x40;
-            assert!(decode_splats(&damaged).is_err(), "flip at {at} was not detected");
+        assert_eq!(decode_result(&exposed).unwrap(), (splats.clone(), training));
+        let mut labelled = splats.clone();
+        labelled.set_attribute("block", vec![1, 2, 3, 4, 5]);
+        labelled.set_attribute("label", vec![9; 5]);
+        let with_attributes = encode_result(&labelled, training);
+        assert_eq!(decode_result(&with_attributes).unwrap(), (labelled, training));
+        for bytes in [&bytes, &with_attributes] {
+            for at in 0..bytes.len() {
+                let mut damaged = bytes.clone();
+                damaged[at] ^= 0x40;
+                assert!(decode_splats(&damaged).is_err(), "flip at {at} was not detected");
+            }
+        }
+        for names in [vec!["b".to_owned(), "a".into()], vec!["Label".into()], vec!["a".into(); 2]] {
+            let header = SplatsHeader { sh_degree: 0, count: 0, training };
+            assert!(decode_splats(&encode(SPLATS_WITH_ATTRIBUTES, &(header, names), &[])).is_err());
         }
         assert!(decode_splats(&bytes[..bytes.len() - 1]).is_err());
         let mut oversized = bytes;

@@ -23,6 +23,8 @@ impl BlockId {
     pub const ROOT: Self = Self { level: 0, x: 0, y: 0 };
     /// Deepest level: 2^20 blocks per side are blocks of 1 m in a scene of 1,000 km.
     pub const MAX_LEVEL: u8 = 20;
+    /// Deepest level whose blocks have a [`BlockId::code`] of 32 bits.
+    pub const MAX_CODE_LEVEL: u8 = 15;
 
     /// The block one level up, `None` at the root.
     pub fn parent(self) -> Option<Self> {
@@ -33,6 +35,25 @@ impl BlockId {
     pub fn children(self) -> [Self; 4] {
         let child = |i: u32| Self { level: self.level + 1, x: self.x * 2 + (i & 1), y: self.y * 2 + (i >> 1) };
         [child(0), child(1), child(2), child(3)]
+    }
+
+    /// A number for the block, from 1 on: blocks by level, then in Morton order. Labels splats with their block
+    /// ([`BLOCK_ATTRIBUTE`](crate::splats::BLOCK_ATTRIBUTE)). `None` below [`BlockId::MAX_CODE_LEVEL`].
+    pub fn code(self) -> Option<u32> {
+        let spread = |value: u32| (0..16).fold(0u32, |code, bit| code | (value >> bit & 1) << (2 * bit));
+        let before = |level: u8| ((1u64 << (2 * level)) / 3) as u32;
+        (self.level <= Self::MAX_CODE_LEVEL).then(|| 1 + before(self.level) + (spread(self.x) | spread(self.y) << 1))
+    }
+
+    /// The block with this [`BlockId::code`].
+    pub fn from_code(code: u32) -> Option<Self> {
+        let index = code.checked_sub(1)?;
+        let before = |level: u8| ((1u64 << (2 * level)) / 3) as u32;
+        let level = (0..=Self::MAX_CODE_LEVEL).rev().find(|&level| index >= before(level))?;
+        let morton = index - before(level);
+        let gather = |code: u32| (0..16).fold(0u32, |value, bit| value | (code >> (2 * bit) & 1) << bit);
+        let block = Self { level, x: gather(morton), y: gather(morton >> 1) };
+        (block.x >> level == 0 && block.y >> level == 0).then_some(block)
     }
 
     /// The ancestor at `level`; the block itself if `level >= self.level`.
@@ -141,6 +162,25 @@ mod tests {
         for bad in ["", "3", "3/8/0", "3/0/0/0", "21/0/0", "-1/0/0", "a/b/c"] {
             assert!(bad.parse::<BlockId>().is_err(), "{bad}");
         }
+    }
+
+    #[test]
+    fn block_codes_are_unique_and_round_trip() {
+        let mut codes = Vec::new();
+        for level in 0..4u8 {
+            let side = 0..1u32 << level;
+            for block in side.clone().flat_map(|y| side.clone().map(move |x| BlockId { level, x, y })) {
+                let code = block.code().unwrap();
+                assert_eq!(BlockId::from_code(code), Some(block));
+                codes.push(code);
+            }
+        }
+        codes.sort_unstable();
+        assert_eq!(codes, (1..=85).collect::<Vec<u32>>());
+        let last = BlockId { level: 15, x: (1 << 15) - 1, y: (1 << 15) - 1 };
+        assert_eq!(last.code().and_then(BlockId::from_code), Some(last));
+        assert_eq!(BlockId { level: 16, x: 0, y: 0 }.code(), None);
+        assert_eq!([0, last.code().unwrap() + 1, u32::MAX].map(BlockId::from_code), [None; 3]);
     }
 
     #[test]

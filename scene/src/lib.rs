@@ -29,4 +29,4 @@ pub use error::{BadInput, CodecError};
 pub use exposures::{Exposure, Exposures};
 pub use ids::{ArtefactId, BlockId};
 pub use image::Pixels;
-pub use splats::{Splat, Splats, column};
+pub use splats::{Attribute, BLOCK_ATTRIBUTE, SH_C0, Splat, Splats, column};

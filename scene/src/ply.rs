@@ -11,15 +11,16 @@ mod packed;
 
 use glam::DVec3;
 
-use self::header::{Header, Kind};
+use self::header::{Header, Kind, Property};
 pub(crate) use self::packed::logit_of_byte;
 use crate::error::CodecError;
-use crate::splats::{Splats, column, sh_coefficients};
+use crate::splats::{Attribute, Splats, column, sh_coefficients};
 
 /// Rows transposed at a time, few enough to stay in cache.
 const ROWS: usize = 128;
 
-/// Decodes splats of SH degree 0 to 3 (0, 9, 24 or 45 `f_rest` properties). Other properties and elements are ignored.
+/// Decodes splats of SH degree 0 to 3 (0, 9, 24 or 45 `f_rest` properties). Properties of type `uint` become
+/// [attributes](Attribute) where their name is valid. Other properties and elements are ignored.
 /// PlayCanvas' packed splats are unpacked.
 ///
 /// # Errors
@@ -35,28 +36,40 @@ pub fn read(bytes: &[u8]) -> Result<Splats, CodecError> {
         .find(|&d| 3 * (sh_coefficients(d) - 1) == rest)
         .ok_or_else(|| CodecError::new(format!("{rest} f_rest properties, SH degrees 0 to 3 have 0, 9, 24 or 45")))?;
     let wanted = column_names(sh_degree).iter().map(|name| vertices.find(name)).collect::<Result<Vec<_>, _>>()?;
-    Splats::from_columns(vertices.columns(&wanted)?).ok_or_else(|| CodecError::new("columns of unequal length"))
+    let mut splats =
+        Splats::from_columns(vertices.columns(&wanted)?).ok_or_else(|| CodecError::new("columns of unequal length"))?;
+    let is_attribute = |p: &&Property| p.kind == Kind::U32 && Attribute::is_name(&p.name);
+    let names: Vec<&str> = vertices.properties.iter().filter(is_attribute).map(|p| p.name.as_str()).collect();
+    for name in names.into_iter().take(Attribute::MAX_COUNT) {
+        if splats.attribute(name).is_none() && !column_names(sh_degree).iter().any(|column| column == name) {
+            let values = vertices.columns::<u32>(&[vertices.find(name)?])?.pop().unwrap_or_default();
+            splats.set_attribute(name, values);
+        }
+    }
+    Ok(splats)
 }
 
 /// Encodes splats as a `binary_little_endian` PLY with zero normals and one header line per comment.
 pub fn write(splats: &Splats, comments: &[&str]) -> Vec<u8> {
-    let header = header(splats.len(), splats.sh_degree(), comments);
-    let stride = 4 * properties(splats.sh_degree()).len();
+    let names = splats.attribute_names();
+    let header = header(splats.len(), splats.sh_degree(), &names, comments);
+    let stride = 4 * (properties(splats.sh_degree()).len() + names.len());
     let mut bytes = Vec::with_capacity(header.len() + stride * splats.len());
     bytes.extend_from_slice(&header);
     append_rows(&mut bytes, splats);
     bytes
 }
 
-/// The header of [`write`] for this number of splats. The [`rows`] of that many splats follow it, in any number of
-/// parts.
-pub fn header(splats: usize, sh_degree: u8, comments: &[&str]) -> Vec<u8> {
+/// The header of [`write`] for this number of splats with these attributes. The [`rows`] of that many splats follow it,
+/// in any number of parts, each of which has all these attributes.
+pub fn header(splats: usize, sh_degree: u8, attributes: &[String], comments: &[&str]) -> Vec<u8> {
     let mut header = String::from("ply\nformat binary_little_endian 1.0\n");
     for comment in comments {
         header += &format!("comment {}\n", comment.replace(['\n', '\r'], " "));
     }
     header += &format!("element vertex {splats}\n");
     properties(sh_degree).iter().for_each(|(name, _)| header += &format!("property float {name}\n"));
+    attributes.iter().for_each(|name| header += &format!("property uint {name}\n"));
     header += "end_header\n";
     header.into_bytes()
 }
@@ -70,12 +83,17 @@ pub fn rows(splats: &Splats) -> Vec<u8> {
 
 fn append_rows(bytes: &mut Vec<u8>, splats: &Splats) {
     let properties = properties(splats.sh_degree());
-    let (start, stride) = (bytes.len(), 4 * properties.len());
+    let (start, stride) = (bytes.len(), 4 * (properties.len() + splats.attributes().len()));
     bytes.resize(start + stride * splats.len(), 0);
     for (block, rows) in bytes[start..].chunks_mut(stride * ROWS).enumerate() {
         for (slot, (_, source)) in properties.iter().enumerate() {
             let Some(source) = *source else { continue };
             for (row, value) in rows.chunks_exact_mut(stride).zip(&splats.col(source)[block * ROWS..]) {
+                row[4 * slot..4 * slot + 4].copy_from_slice(&value.to_le_bytes());
+            }
+        }
+        for (attribute, slot) in splats.attributes().iter().zip(properties.len()..) {
+            for (row, value) in rows.chunks_exact_mut(stride).zip(&attribute.values[block * ROWS..]) {
                 row[4 * slot..4 * slot + 4].copy_from_slice(&value.to_le_bytes());
             }
         }

@@ -51,17 +51,49 @@ impl Splat {
 }
 
 /// Splats as columns (structure of arrays); see [`column`] for the order. All columns have the same length.
+///
+/// Beside the float columns, which rendering and training use, splats may carry [attributes](Attribute): named integer
+/// columns that every operation on rows carries along.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Splats {
     sh_degree: u8,
     columns: Vec<Vec<f32>>,
+    /// Sorted by name.
+    attributes: Vec<Attribute>,
 }
+
+/// A named integer column of splats: a class label, an object id, the block of origin ([`BLOCK_ATTRIBUTE`]). The value 0
+/// means unset.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Attribute {
+    /// 1 to [`Attribute::MAX_NAME`] lower-case letters, digits and underscores; also the name of the PLY property.
+    pub name: String,
+    /// One value per splat.
+    pub values: Vec<u32>,
+}
+
+impl Attribute {
+    /// Longest name, bytes.
+    pub const MAX_NAME: usize = 32;
+    /// Largest number of attributes that files may declare.
+    pub const MAX_COUNT: usize = 16;
+
+    /// True for names that files may declare.
+    pub fn is_name(name: &str) -> bool {
+        let is_fine = |byte: u8| byte.is_ascii_lowercase() || byte.is_ascii_digit() || byte == b'_';
+        (1..=Self::MAX_NAME).contains(&name.len()) && name.bytes().all(is_fine)
+    }
+}
+
+/// The attribute that names the block which trained a splat: [`BlockId::code`](crate::BlockId::code).
+pub const BLOCK_ATTRIBUTE: &str = "block";
 
 impl Splats {
     /// No splats, with this SH degree (0 to 3).
     pub fn new(sh_degree: u8) -> Self {
         assert!(sh_degree <= 3, "SH degree {sh_degree} is above 3");
-        Self { sh_degree, columns: vec![Vec::new(); column::SH + 3 * sh_coefficients(sh_degree)] }
+        let columns = vec![Vec::new(); column::SH + 3 * sh_coefficients(sh_degree)];
+        Self { sh_degree, columns, attributes: Vec::new() }
     }
 
     /// Splats from columns in the order of [`column`]. `None` unless there are 14, 23, 38 or 59 columns of equal
@@ -69,7 +101,7 @@ impl Splats {
     pub fn from_columns(columns: Vec<Vec<f32>>) -> Option<Self> {
         let sh_degree = (0..=3).find(|&d| columns.len() == column::SH + 3 * sh_coefficients(d))?;
         let n = columns[0].len();
-        columns.iter().all(|c| c.len() == n).then_some(Self { sh_degree, columns })
+        columns.iter().all(|c| c.len() == n).then_some(Self { sh_degree, columns, attributes: Vec::new() })
     }
 
     /// The number of splats.
@@ -102,6 +134,49 @@ impl Splats {
         &self.columns[index]
     }
 
+    /// The attributes, sorted by name.
+    pub fn attributes(&self) -> &[Attribute] {
+        &self.attributes
+    }
+
+    /// The names of the attributes, sorted.
+    pub fn attribute_names(&self) -> Vec<String> {
+        self.attributes.iter().map(|attribute| attribute.name.clone()).collect()
+    }
+
+    /// The values of an attribute, one per splat; `None` where the splats do not carry it.
+    pub fn attribute(&self, name: &str) -> Option<&[u32]> {
+        self.attributes.iter().find(|attribute| attribute.name == name).map(|attribute| attribute.values.as_slice())
+    }
+
+    /// Adds an attribute, or replaces the one of this name. There must be one value per splat.
+    pub fn set_attribute(&mut self, name: &str, values: Vec<u32>) {
+        assert_eq!(values.len(), self.len(), "attribute {name} has another length than the splats");
+        match self.attributes.binary_search_by(|attribute| attribute.name.as_str().cmp(name)) {
+            Ok(at) => self.attributes[at].values = values,
+            Err(at) => self.attributes.insert(at, Attribute { name: name.to_owned(), values }),
+        }
+    }
+
+    /// The same splats with at least these attributes, unset where they were missing.
+    #[must_use]
+    pub fn with_attributes(mut self, names: &[String]) -> Self {
+        for name in names {
+            if self.attribute(name).is_none() {
+                self.set_attribute(name, vec![0; self.len()]);
+            }
+        }
+        self
+    }
+
+    /// The same float columns with the attributes of `other`, which must have as many splats.
+    #[must_use]
+    pub fn with_attributes_of(mut self, other: &Self) -> Self {
+        assert_eq!(self.len(), other.len(), "attributes belong to the same rows");
+        self.attributes.clone_from(&other.attributes);
+        self
+    }
+
     /// The centre of splat `i`.
     pub fn mean(&self, i: usize) -> Vec3 {
         Vec3::new(self.columns[0][i], self.columns[1][i], self.columns[2][i])
@@ -123,22 +198,43 @@ impl Splats {
         }
     }
 
-    /// Overwrites row `i`, without coefficients above the SH degree.
+    /// Overwrites the floats of row `i`, without coefficients above the SH degree.
     pub fn set(&mut self, i: usize, splat: &Splat) {
         for (k, value) in row(splat).take(self.columns.len()).enumerate() {
             self.columns[k][i] = value;
         }
     }
 
-    /// Appends a row, without coefficients above the SH degree.
+    /// Appends a row, without coefficients above the SH degree. Its attributes are unset.
     pub fn push(&mut self, splat: &Splat) {
         for (column, value) in self.columns.iter_mut().zip(row(splat)) {
             column.push(value);
         }
+        self.attributes.iter_mut().for_each(|attribute| attribute.values.push(0));
     }
 
-    /// Appends all rows of `other`. Coefficients above this SH degree are dropped, missing ones are zero.
+    /// Appends a row with the attributes of row `like`, such as the second half of a splat that was split.
+    pub fn push_like(&mut self, like: usize, splat: &Splat) {
+        self.push(splat);
+        for Attribute { values, .. } in &mut self.attributes {
+            let value = values[like];
+            *values.last_mut().expect("a row was pushed") = value;
+        }
+    }
+
+    /// Appends all rows of `other`. Coefficients above this SH degree are dropped, missing ones are zero. The result has
+    /// the attributes of both, unset where one side lacks them.
     pub fn append(&mut self, other: &Self) {
+        let (before, after) = (self.len(), self.len() + other.len());
+        for Attribute { name, values } in &other.attributes {
+            let mut joined = self.attribute(name).map_or_else(|| vec![0; before], <[u32]>::to_vec);
+            joined.extend_from_slice(values);
+            match self.attributes.binary_search_by(|attribute| attribute.name.cmp(name)) {
+                Ok(at) => self.attributes[at].values = joined,
+                Err(at) => self.attributes.insert(at, Attribute { name: name.clone(), values: joined }),
+            }
+        }
+        self.attributes.iter_mut().for_each(|attribute| attribute.values.resize(after, 0));
         for (k, column) in self.columns.iter_mut().enumerate() {
             match other.columns.get(k) {
                 Some(values) => column.extend_from_slice(values),
@@ -155,7 +251,15 @@ impl Splats {
     /// The rows with these indices, in that order.
     pub fn select(&self, rows: &[u32]) -> Self {
         let pick = |column: &Vec<f32>| rows.iter().map(|&i| column[i as usize]).collect();
-        Self { sh_degree: self.sh_degree, columns: self.columns.iter().map(pick).collect() }
+        let attributes = self.attributes.iter().map(|Attribute { name, values }| Attribute {
+            name: name.clone(),
+            values: rows.iter().map(|&i| values[i as usize]).collect(),
+        });
+        Self {
+            sh_degree: self.sh_degree,
+            columns: self.columns.iter().map(pick).collect(),
+            attributes: attributes.collect(),
+        }
     }
 
     /// The rows for which `keep` is true, in order.
@@ -201,5 +305,28 @@ mod tests {
         assert_eq!(flat.get(0).sh[0], splat.sh[0]);
         assert_eq!(flat.with_sh_degree(3).get(0).sh[15], [0.0; 3]);
         assert_eq!(Splats::from_columns(splats.columns().to_vec()), Some(splats));
+    }
+
+    #[test]
+    fn attributes_follow_their_rows() {
+        let at = |x: f32| Splat::round(Vec3::new(x, 0.0, 0.0), -2.0, Vec3::ONE, 0.7);
+        let mut splats = Splats::new(1);
+        (0..4).for_each(|i| splats.push(&at(i as f32)));
+        splats.set_attribute("label", vec![10, 11, 12, 13]);
+        splats.push(&at(4.0));
+        splats.push_like(2, &at(5.0));
+        assert_eq!(splats.attribute("label"), Some(&[10, 11, 12, 13, 0, 12][..]));
+        assert_eq!(splats.select(&[5, 0]).attribute("label"), Some(&[12, 10][..]));
+        assert_eq!(splats.with_sh_degree(0).attribute("label"), splats.attribute("label"));
+
+        let mut other = Splats::new(0);
+        other.push(&at(6.0));
+        other.set_attribute("block", vec![7]);
+        other.append(&splats.filter(|i| i < 2));
+        let names: Vec<&str> = other.attributes().iter().map(|attribute| attribute.name.as_str()).collect();
+        assert_eq!(names, ["block", "label"]);
+        assert_eq!(other.attribute("block"), Some(&[7, 0, 0][..]));
+        assert_eq!(other.attribute("label"), Some(&[0, 10, 11][..]));
+        assert_eq!(["label", "a_1", "", "Label", "a b"].map(Attribute::is_name), [true, true, false, false, false]);
     }
 }

@@ -13,8 +13,9 @@ use crate::optimiser::Adam;
 /// A checkpoint. The header is [`Header`]. The bulk holds, little endian:
 /// - all columns of the splats, of the first and of the second Adam moments (f32);
 /// - densification statistics per splat: error, weight (f32), views (u32);
-/// - per trained exposure: view, steps (u32), then value, first and second moment (twelve f32 each).
-const CHECKPOINT: Kind = Kind(*b"ckpt", 3);
+/// - per trained exposure: view, steps (u32), then value, first and second moment (twelve f32 each);
+/// - all attributes of the splats (u32).
+const CHECKPOINT: Kind = Kind(*b"ckpt", 4);
 
 /// Everything that a training step depends on besides its job.
 #[derive(Debug, Clone)]
@@ -48,6 +49,8 @@ struct Header {
     stats_count: u64,
     /// Number of exposures, where they are trained.
     exposure_count: Option<u64>,
+    /// Names of the splats' attributes.
+    attributes: Vec<String>,
 }
 
 /// 32-bit words of an exposure in a checkpoint.
@@ -73,6 +76,7 @@ impl State {
             count: self.splats.len() as u64,
             stats_count: views.len() as u64,
             exposure_count: self.exposures.as_ref().map(|exposures| exposures.views.len() as u64),
+            attributes: self.splats.attribute_names(),
         };
         let columns = self.splats.columns().iter().chain(first).chain(second);
         let floats = columns.chain([error, weight]).flatten().flat_map(|value| value.to_le_bytes());
@@ -81,6 +85,8 @@ impl State {
             bulk.extend(views.iter().chain(steps).flat_map(|value| value.to_le_bytes()));
             bulk.extend(values.iter().flatten().flatten().flat_map(|value| value.to_le_bytes()));
         }
+        let attributes = self.splats.attributes().iter().flat_map(|attribute| &attribute.values);
+        bulk.extend(attributes.flat_map(|value| value.to_le_bytes()));
         frame::encode(CHECKPOINT, &header, &bulk)
     }
 
@@ -100,6 +106,8 @@ impl State {
         let words = words.and_then(|words| words.checked_add(header.stats_count.checked_mul(3)?));
         let exposed = header.exposure_count.unwrap_or(0);
         let words = words.and_then(|words| words.checked_add(exposed.checked_mul(EXPOSURE_WORDS as u64)?));
+        let attribute_words = (header.attributes.len() as u64).checked_mul(header.count);
+        let words = words.and_then(|words| words.checked_add(attribute_words?));
         if words.and_then(|words| words.checked_mul(4)) != Some(bulk.len() as u64)
             || ![0, header.count].contains(&header.stats_count)
             || header.count == 0
@@ -108,12 +116,14 @@ impl State {
         }
         let (count, stats_count) = (header.count as usize, header.stats_count as usize);
         let (columns_bytes, rest) = bulk.split_at(4 * count * 3 * columns);
-        let (stats_bytes, exposure_bytes) = rest.split_at(4 * stats_count * 3);
+        let (stats_bytes, rest) = rest.split_at(4 * stats_count * 3);
+        let (exposure_bytes, attribute_bytes) = rest.split_at(4 * EXPOSURE_WORDS * exposed as usize);
         let word = |bytes: &[u8]| <[u8; 4]>::try_from(bytes).expect("four bytes");
         let floats =
             |bytes: &[u8]| -> Vec<f32> { bytes.chunks_exact(4).map(|bytes| f32::from_le_bytes(word(bytes))).collect() };
         let mut all = columns_bytes.chunks_exact(4 * count).map(floats);
         let splats = Splats::from_columns(all.by_ref().take(columns).collect()).ok_or_else(wrong)?;
+        let splats = frame::with_attributes(splats, &header.attributes, attribute_bytes)?;
         let first = all.by_ref().take(columns).collect();
         let second = all.collect();
         let part = |n: usize| &stats_bytes[4 * stats_count * n..4 * stats_count * (n + 1)];
@@ -168,7 +178,10 @@ mod tests {
         };
         for (densification, exposures) in [(stats, None), (DensificationStats::default(), Some(exposures))] {
             let adam = Adam::from_parts(Isa::detect(), 41, moments(0.5), moments(2.0));
-            let (splats, coarse_to_fine) = (splats.clone(), CoarseToFine::default());
+            let (mut splats, coarse_to_fine) = (splats.clone(), CoarseToFine::default());
+            if exposures.is_some() {
+                splats.set_attribute("block", (1..=20).collect());
+            }
             let loss = f64::NAN;
             let (step, skipped, start_count) = (40, 1, 7);
             let state =
@@ -199,6 +212,7 @@ mod tests {
                 count,
                 stats_count: 0,
                 exposure_count,
+                attributes: Vec::new(),
             };
             assert!(State::from_frame(&frame::encode(CHECKPOINT, &header, &[0; 64])).is_err());
         }

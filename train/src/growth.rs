@@ -187,7 +187,7 @@ pub fn refine(
         let (one, other) = halve(splats, i as usize, growth);
         grown.set(new_row[i as usize] as usize, &one);
         rows[new_row[i as usize] as usize] = None;
-        grown.push(&other);
+        grown.push_like(new_row[i as usize] as usize, &other);
         rows.push(None);
     }
     stats.clear();

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use blocks::{Cut, Plan, Task, ViewUse};
 use dataset::windows::WindowReader;
 use glam::DVec3;
-use scene::{BlockId, Capture, Exposures, Splats};
+use scene::{BLOCK_ATTRIBUTE, BlockId, Capture, Exposures, Splats};
 use train::TrainView;
 use train::prune::Pruning;
 
@@ -119,6 +119,13 @@ impl Block<'_> {
         distances.sort_by(f64::total_cmp);
         let far = distances.get(distances.len() * 98 / 100).copied().unwrap_or(1.0);
         (centre, 5.0 * far.max(self.plan.ground.edge_metres * 0.5))
+    }
+
+    /// The splats with this block in their attribute [`BLOCK_ATTRIBUTE`].
+    pub(crate) fn labelled(&self, mut splats: Splats) -> Splats {
+        let code = self.task.block.code().unwrap_or(0);
+        splats.set_attribute(BLOCK_ATTRIBUTE, vec![code; splats.len()]);
+        splats
     }
 
     /// The splats as other blocks, viewers and the merged model render them: at full resolution. In anti-aliased mode they already are,

@@ -115,6 +115,7 @@ impl Block<'_> {
         let exposed = exposures.as_ref().or(self.given_exposures);
         let residual = self.root_residual(&splats, &views, exposed).map_err(|error| self.failure(error))?;
         let splats = self.at_full_resolution(splats, &views);
+        let splats = if plan.settings.label_blocks && !is_settled { self.labelled(splats) } else { splats };
         if is_evaluated {
             finished.insert(self.order.plan, plan, task.block, &splats);
         }

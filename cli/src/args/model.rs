@@ -76,6 +76,10 @@ pub(crate) struct RenderArgs {
     /// Size of the pictures; by default that of each camera
     #[arg(long, value_name = "WxH")]
     pub(crate) size: Option<Size>,
+    /// Colour splats by an integer attribute, such as block, instead of their own colours. A folder that `plat train` wrote always
+    /// has block: the block that a splat belongs to
+    #[arg(long, value_name = "ATTRIBUTE")]
+    pub(crate) by: Option<String>,
     /// Also write depth as <view>.depth.npy: float32, metres, 0 = no surface
     #[arg(long)]
     pub(crate) depth: bool,

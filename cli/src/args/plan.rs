@@ -64,6 +64,9 @@ pub(crate) struct PlanOptions {
     /// balance; not with --blocks flat
     #[arg(long)]
     pub(crate) exposure: bool,
+    /// Label each splat with the block that trained it, as the integer property `block` of merged.ply
+    #[arg(long)]
+    pub(crate) label_blocks: bool,
     /// Use photos at one N-th of their size
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
     pub(crate) downscale: u32,
@@ -94,6 +97,7 @@ impl PlanOptions {
             test_every: self.test_every,
             antialiased: self.antialiased,
             exposure: self.exposure,
+            label_blocks: self.label_blocks,
             ..PlanSettings::default()
         }
     }

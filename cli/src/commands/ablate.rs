@@ -135,6 +135,7 @@ fn plan_options(args: &AblateArgs, seed: u64) -> PlanOptions {
         test_every: args.test_every,
         antialiased: false,
         exposure: false,
+        label_blocks: false,
         downscale: args.downscale,
     }
 }

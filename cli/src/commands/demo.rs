@@ -135,6 +135,7 @@ pub(crate) fn settings(args: &DemoArgs) -> (Settings, TrainArgs) {
             seed: 0,
             antialiased: false,
             exposure: false,
+            label_blocks: false,
             test_every: 8,
             downscale: 1,
         },

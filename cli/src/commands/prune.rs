@@ -24,7 +24,7 @@ use crate::run_record::{Record, commit, invocation};
 const TOLERANCE_DB: f64 = 0.1;
 /// The file of comparisons.
 const LINES: &str = "prune.jsonl";
-/// OwnershipWeights that `bench prune` cuts to without recovery.
+/// Shares of the splats that `bench prune` cuts to without recovery.
 const SHARES: [f64; 3] = [0.8, 0.6, 0.4];
 
 #[derive(Debug, Serialize)]

@@ -7,7 +7,7 @@ use std::path::{Component, Path, PathBuf};
 
 use ::render::{Frame, Options};
 use eval::{Renderer, frame_image, write_png};
-use scene::{BadInput, npy};
+use scene::{BLOCK_ATTRIBUTE, BadInput, Splats, npy};
 use serde::Serialize;
 use store::file::save;
 
@@ -36,7 +36,10 @@ struct Rendered<'a> {
 
 pub(crate) fn run(args: &RenderArgs, output: &Output) -> Result<(), Failure> {
     let backend = backend::open(args.backend)?;
-    let model = model::read(&args.model)?;
+    let mut model = model::read(&args.model)?;
+    if let Some(attribute) = &args.by {
+        model.splats = coloured(&model.splats, attribute, &args.model)?;
+    }
     let views = captures::read_cameras(&args.cameras)?;
     // All names are checked before the first picture is rendered.
     let names: Vec<PathBuf> = views.iter().map(|(name, _)| stem(name)).collect::<Result<_, _>>()?;
@@ -87,6 +90,31 @@ pub(crate) fn run(args: &RenderArgs, output: &Output) -> Result<(), Failure> {
         args.out.display()
     );
     output.result(&rendered, &text)
+}
+
+/// The model's splats, coloured by an attribute.
+fn coloured(splats: &Splats, attribute: &str, path: &Path) -> Result<Splats, Failure> {
+    if let Some(coloured) = eval::coloured_by(splats, attribute) {
+        return Ok(coloured);
+    }
+    if attribute == BLOCK_ATTRIBUTE && path.is_dir() {
+        let labelled = model::read_tree(path)?.merged_with_blocks();
+        return eval::coloured_by(&labelled, attribute)
+            .ok_or_else(|| Failure::Work("splats without their blocks".into()));
+    }
+    let problem = format!(
+        "has no attribute '{attribute}', it has {}",
+        match splats.attribute_names().join(", ") {
+            names if names.is_empty() => "none".into(),
+            names => names,
+        }
+    );
+    Err(BadInput::new(
+        path.display().to_string(),
+        problem,
+        "train with --label-blocks, or give a folder and --by block",
+    )
+    .into())
 }
 
 /// Path of a view's files below the output folder: its name without extension.

@@ -199,3 +199,20 @@ fn inria_file_round_trips() {
         assert!(body(&again) == body(&bytes), "the bodies differ");
     }
 }
+
+#[test]
+fn attributes_are_uint_properties() {
+    let mut labelled = splats(1, &[3, 5, 7, 11]);
+    labelled.set_attribute("block", (0..labelled.len() as u32).collect());
+    labelled.set_attribute("label", vec![u32::MAX; labelled.len()]);
+    let bytes = write(&labelled, &[]);
+    let header = String::from_utf8_lossy(&bytes[..bytes.len() - rows(&labelled).len()]).into_owned();
+    assert!(header.contains("property uint block\nproperty uint label\nend_header\n"), "{header}");
+    let read_back = read(&bytes).unwrap();
+    assert_eq!(read_back.attributes(), labelled.attributes());
+    assert_eq!(bits(&read_back), bits(&labelled));
+    // Names that are not valid, and types other than uint, are ignored as before.
+    let changed = header.replace("uint block", "uint Block").replace("uint label", "int label");
+    let bytes = [changed.as_bytes(), &rows(&labelled)].concat();
+    assert_eq!(read(&bytes).unwrap().attributes(), []);
+}

@@ -307,7 +307,8 @@ impl TrainDevice for GpuDevice {
         state.loss = f64::from(optimiser.loss);
         state.coarse_to_fine.tally = Tally { sum: f64::from(optimiser.epoch_l1), count: optimiser.epoch_views };
         if part >= StatePart::Splats {
-            state.splats = self.splats.download()?;
+            // The device holds floats only. Rows change on the host alone, so its attributes still fit.
+            state.splats = self.splats.download()?.with_attributes_of(&state.splats);
         }
         if part >= StatePart::All {
             let (gpu, n, stride) = (&*self.gpu, self.splats.len(), self.splats.columns().stride());
