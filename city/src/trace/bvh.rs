@@ -166,7 +166,7 @@ impl Instance {
     }
 
     #[inline(always)]
-    fn to_asset(&self, ray: &Ray) -> (Vec3, Vec3) {
+    fn ray_in_asset(&self, ray: &Ray) -> (Vec3, Vec3) {
         (self.asset_from_world * (ray.origin - self.origin), self.asset_from_world * ray.direction)
     }
 }
@@ -192,7 +192,7 @@ impl Tlas {
         let mut outer = obvhs_ray(ray.origin, ray.direction, ray.t_max);
         traverse_bvh!(B, self.bvh, outer, i => {
             let instance = &self.instances[i];
-            let (origin, direction) = instance.to_asset(ray);
+            let (origin, direction) = instance.ray_in_asset(ray);
             if let Some((t, triangle, corners)) =
                 meshes[instance.blas as usize].cast::<B>(origin, direction, ray, outer.tmax, mask)
             {
@@ -222,7 +222,7 @@ impl Tlas {
         'met: {
             traverse_bvh!(B, self.bvh, outer, i => {
                 let instance = &self.instances[i];
-                let (origin, direction) = instance.to_asset(ray);
+                let (origin, direction) = instance.ray_in_asset(ray);
                 if meshes[instance.blas as usize].occludes::<B>(origin, direction, ray) {
                     break 'met true;
                 }
