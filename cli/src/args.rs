@@ -27,7 +27,7 @@ pub(crate) use cluster::{
 };
 pub(crate) use model::{EvalArgs, ExportArgs, Format, PruneArgs, PruneCapture, RenderArgs};
 pub(crate) use plan::{Blocks, PlanOptions, RESIDUAL};
-pub(crate) use sweep::{Named, Sweep};
+pub(crate) use sweep::Named;
 pub(crate) use synth::SynthArgs;
 pub(crate) use values::{Auto, Backend, Size};
 

@@ -1,4 +1,4 @@
-//! A tree as deep as the scene needs: a bare plain stays at its parent's resolution beside the houses that are refined.
+//! Adaptive refinement: a bare plain stays at its parent's resolution while houses are refined.
 
 mod common;
 
@@ -9,7 +9,7 @@ use dataset::synth::{self, Settings};
 use scene::{BlockId, Splats, frame};
 
 #[test]
-fn a_plain_stays_coarse_beside_houses() {
+fn a_plain_stays_coarse_while_houses_are_refined() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
     let small = common::small(72, 144, 96);
@@ -28,8 +28,7 @@ fn a_plain_stays_coarse_beside_houses() {
     let result = |out: &str, BlockId { level, x, y }: BlockId| -> Splats {
         frame::decode_splats(&bytes(&format!("{out}/model/blocks/{level}-{x}-{y}.plat"))).unwrap()
     };
-    // A settled block has the splats that its parent had there: nothing was added. Along a face it has those of a neighbour that was
-    // trained before it.
+    // A settled block has exactly its parent's splats. Along a face it has those of a neighbour that was trained before it.
     let owned = |splats: &Splats, task: &Task| {
         let place = |i: usize| splats.mean(i).as_dvec3();
         let of_block =
@@ -49,7 +48,7 @@ fn a_plain_stays_coarse_beside_houses() {
     assert!(number(&adaptive, "settled") >= settled.len() as f64 && number(&fixed, "settled") == 0.0);
     assert!(number(&adaptive, "splats") < 0.97 * number(&fixed, "splats"), "{adaptive} {fixed}");
 
-    // Whatever is settled and whenever the schedule looks closer: the same bytes, and a plain that is as good.
+    // Adaptation is deterministic, and the plain is as good as without it.
     train("again", &["--threads", "1"]);
     assert!(bytes("adaptive/merged.ply") == bytes("again/merged.ply"));
     assert!(number(&adaptive, "psnr") > number(&fixed, "psnr") - 0.5, "{adaptive} {fixed}");

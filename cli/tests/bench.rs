@@ -1,4 +1,4 @@
-//! `plat bench`: sweeps that go on where they were stopped, and recipes compared.
+//! `plat bench`: resumable sweeps, and comparisons of recipes.
 
 mod common;
 
@@ -13,7 +13,7 @@ fn lines(at: &Path, file: &str) -> Vec<Value> {
 }
 
 #[test]
-fn a_sweep_has_a_line_for_each_combination_and_goes_on_where_it_was_stopped() {
+fn a_sweep_has_a_line_for_each_combination_and_can_be_resumed() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
     city(at, 16, 64, 48);
@@ -21,7 +21,7 @@ fn a_sweep_has_a_line_for_each_combination_and_goes_on_where_it_was_stopped() {
         let usual = ["bench", "pareto", "--label", "plat", "--out", "o", "--results", "results", "--levels", "0"];
         done(at, &[&usual[..], &["--tolerance-db", "0", "--budget", "300", "--threads", "1"], words].concat())
     };
-    // As if it had been stopped after the first.
+    // A sweep of one run, as if it had been interrupted after the first.
     let first = sweep(&["a=city", "--steps", "5"]);
     let swept = sweep(&["a=city", "b=city", "--steps", "5,10"]);
     assert_eq!((&swept["skipped"], swept["lines"].as_array().unwrap().len()), (&1.into(), 4));
@@ -31,9 +31,9 @@ fn a_sweep_has_a_line_for_each_combination_and_goes_on_where_it_was_stopped() {
     let has = |scene: &str, steps: u32| kept.iter().any(|line| line["scene"] == scene && line["steps"] == steps);
     assert!(has("a", 5) && has("a", 10) && has("b", 5) && has("b", 10));
     assert!(kept.iter().all(|line| line["budget"] == 300 && line["tolerance_db"] == 0.0 && line["psnr"].is_f64()));
-    assert!(!at.join("o/a-auto-5-steps-300-splats-0-dB-seed-0/store").exists(), "photos of every run pile up");
+    assert!(!at.join("o/a-auto-5-steps-300-splats-0-dB-seed-0/store").exists(), "the photos of every run are kept");
 
-    // All of it is there; another configuration, label or wish is not.
+    // All lines exist; other seeds and labels, and --fresh, add lines.
     assert_eq!(sweep(&["a=city", "b=city", "--steps", "5,10"])["skipped"], 4);
     assert_eq!(sweep(&["a=city", "--steps", "5"]), first);
     assert_eq!(lines(at, "plat.jsonl").len(), 4);
@@ -62,7 +62,7 @@ fn a_sweep_has_a_line_for_each_combination_and_goes_on_where_it_was_stopped() {
 }
 
 #[test]
-fn variants_of_the_recipe_are_compared_as_a_worker_trains() {
+fn variants_of_the_recipe_are_trained_as_by_a_worker() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
     city(at, 16, 64, 48);
@@ -78,7 +78,7 @@ fn variants_of_the_recipe_are_compared_as_a_worker_trains() {
     let who = |line: &Value| (line["variant"].as_str().unwrap().to_owned(), line["seed"].as_u64().unwrap());
     let order: Vec<_> = kept.iter().map(who).collect();
     let wanted = [("default", 0), ("all-colours", 0), ("default", 1), ("all-colours", 1)];
-    assert_eq!(order, wanted.map(|(variant, seed)| (variant.to_owned(), seed)), "variants come in turn");
+    assert_eq!(order, wanted.map(|(variant, seed)| (variant.to_owned(), seed)), "variants are not interleaved");
     let number = |value: &Value| value.as_f64().expect("a number");
     let of_default = || kept.iter().filter(|line| line["variant"] == "default");
     let ends = |get: fn(&Value) -> &Value| of_default().map(|line| number(get(line))).sum::<f64>() / 2.0;
@@ -92,7 +92,7 @@ fn variants_of_the_recipe_are_compared_as_a_worker_trains() {
     assert!(said["means"][0]["reached"][0]["cpu_seconds"].is_f64() && said["means"][0]["variant"] == "default");
     assert_ne!(kept[0]["psnr"], kept[1]["psnr"], "the variant makes no difference");
 
-    // The default is what a worker makes of the same plan, to the bit.
+    // The default variant gives the bits of a worker for the same plan.
     for (line, seed) in [(0, "0"), (2, "1")] {
         let plan = ["--levels", "0", "--tolerance-db", "0", "--seed", seed];
         let trained = done(at, &[&["train", "--out", &format!("o{seed}")], &job[..], &plan].concat());

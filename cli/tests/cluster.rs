@@ -6,16 +6,16 @@ mod common;
 use std::path::Path;
 use std::time::Duration;
 
-use common::cluster::{Running, is_at_work};
+use common::cluster::{Running, has_task};
 use serde_json::Value;
 
 #[rustfmt::skip]
 const PLAN: [&str; 8] = ["--steps", "960", "--budget", "900", "--levels", "1", "--blocks", "tree"];
 
-/// A coordinator that leads, and the URL at which it listens.
+/// A coordinator that is the leader, and its URL.
 fn coordinator(at: &Path) -> (Running, String) {
     let words = ["coordinator", "--store", "shared", "--listen", "127.0.0.1:0", "--lease-seconds", "1"];
-    let running = Running::begin(&mut common::command(at, &words));
+    let running = Running::start(&mut common::command(at, &words));
     let line = running.line_with("http://");
     running.line_with("leading");
     let url = line.split_whitespace().find(|word| word.starts_with("http://")).unwrap();
@@ -24,11 +24,11 @@ fn coordinator(at: &Path) -> (Running, String) {
 
 fn worker(at: &Path, url: &str, name: &str) -> Running {
     let words = ["worker", "--coordinator", url, "--name", name, "--threads", "1", "--checkpoint-every", "0.05"];
-    Running::begin(&mut common::command(at, &[&words[..], &["--quiet", "--json"]].concat()))
+    Running::start(&mut common::command(at, &[&words[..], &["--quiet", "--json"]].concat()))
 }
 
 #[test]
-fn a_cluster_whose_workers_die_and_leave_makes_the_bytes_of_one_process() {
+fn a_cluster_whose_workers_are_killed_and_stopped_gives_the_bytes_of_one_process() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
     common::city(at, 20, 64, 48);
@@ -36,15 +36,15 @@ fn a_cluster_whose_workers_die_and_leave_makes_the_bytes_of_one_process() {
     let asked = |words: &[&str]| common::done(at, &[words, &["--coordinator", &url]].concat());
     assert_eq!(asked(&["jobs"])["jobs"].as_array().unwrap().len(), 0);
     let words = ["submit", "city", "--coordinator", &url, "--wait", "--out", "far", "--json"];
-    let submit = Running::begin(&mut common::command(at, &[&words[..], &PLAN].concat()));
+    let submit = Running::start(&mut common::command(at, &[&words[..], &PLAN].concat()));
 
-    // One is killed at its work; one is told to go and leaves its work to whoever comes. Each is alone until then, so that
-    // the work is its own.
+    // One worker is killed while it trains; one is stopped and returns its task. Each is the only worker until then, so that it has a
+    // task.
     let first = worker(at, &url, "first");
-    assert!(is_at_work(at, &["--coordinator", &url], "first"));
+    assert!(has_task(at, &["--coordinator", &url], "first"));
     first.signal("-KILL");
     let second = worker(at, &url, "second");
-    assert!(is_at_work(at, &["--coordinator", &url], "second"));
+    assert!(has_task(at, &["--coordinator", &url], "second"));
     second.signal("-TERM");
     let left = second.end();
     assert!(left.status.success(), "{}", left.stderr);
@@ -62,18 +62,18 @@ fn a_cluster_whose_workers_die_and_leave_makes_the_bytes_of_one_process() {
         worker.signal("-TERM");
         serde_json::from_str::<Value>(&worker.end().stdout).unwrap()
     });
-    assert!(ends.iter().any(|end| end["resumed"].as_u64() >= Some(1)), "one went on from a checkpoint: {ends:?}");
+    assert!(ends.iter().any(|end| end["resumed"].as_u64() >= Some(1)), "no worker resumed from a checkpoint: {ends:?}");
 
     let calm = common::done(at, &[&["train", "city", "--out", "calm", "--workers", "1"][..], &PLAN].concat());
     let bytes = |path: &str| std::fs::read(at.join(path)).unwrap();
-    assert!(bytes("far/merged.ply") == bytes("calm/merged.ply"), "the cluster shows in the result");
+    assert!(bytes("far/merged.ply") == bytes("calm/merged.ply"), "the cluster changes the result");
     assert_eq!((&said["plan"], &said["splats"]), (&calm["plan"], &calm["splats"]));
-    assert!(common::done(at, &["eval", "far", "city"])["psnr"].is_f64(), "it is a model as any other");
+    assert!(common::done(at, &["eval", "far", "city"])["psnr"].is_f64(), "the model cannot be evaluated");
 
-    // What happened is written down, and nothing is left to do.
+    // The log is complete, and no task is left.
     let log = asked(&["logs", "1"]);
     let lines: Vec<&str> = log["lines"].as_array().unwrap().iter().map(|line| line["what"].as_str().unwrap()).collect();
-    assert!(lines[0].starts_with("submitted") && lines.last() == Some(&"over: Done"), "{lines:?}");
+    assert!(lines[0].starts_with("submitted") && lines.last() == Some(&"finished: Done"), "{lines:?}");
     let trouble =
         |line: &&str| line.starts_with("ended without a result, GivenBack") || *line == "waits for a worker again";
     assert!(lines.iter().any(trouble), "{lines:?}");
@@ -84,19 +84,19 @@ fn a_cluster_whose_workers_die_and_leave_makes_the_bytes_of_one_process() {
 }
 
 #[test]
-fn a_damaged_result_is_made_again() {
+fn a_damaged_result_is_recomputed() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
     common::city(at, 20, 64, 48);
     let (_host, url) = coordinator(at);
     let words = ["submit", "city", "--coordinator", &url, "--wait", "--out", "far"];
-    let submit = Running::begin(&mut common::command(at, &[&words[..], &PLAN].concat()));
-    // The root's result is there, and those who need it are not finished.
+    let submit = Running::start(&mut common::command(at, &[&words[..], &PLAN].concat()));
+    // The root's result exists, and its dependents are not finished.
     let first = worker(at, &url, "first");
     let results = at.join("shared/names/results");
     let root = loop {
         let found = std::fs::read_dir(&results).into_iter().flatten().filter_map(|entry| entry.ok());
-        // A record on its way in has another name, and may be gone by now.
+        // A file that is being written has a temporary name and may be gone by now.
         let mut records = found.filter_map(|entry| std::fs::read(entry.path()).ok()).filter(|bytes| bytes.len() == 32);
         match records.next() {
             Some(root) => break root,
@@ -114,23 +114,23 @@ fn a_damaged_result_is_made_again() {
     let second = worker(at, &url, "second");
     let submit = submit.end();
     assert!(submit.status.success(), "{}", submit.stderr);
-    assert!(std::fs::read(&artefact).unwrap() == sound, "it is not what it was");
+    assert!(std::fs::read(&artefact).unwrap() == sound, "the recomputed artefact differs");
     second.signal("-TERM");
     assert!(second.end().status.success());
     common::done(at, &[&["train", "city", "--out", "calm", "--workers", "1"][..], &PLAN].concat());
     let bytes = |path: &str| std::fs::read(at.join(path)).unwrap();
-    assert!(bytes("far/merged.ply") == bytes("calm/merged.ply"), "the damage shows in the result");
+    assert!(bytes("far/merged.ply") == bytes("calm/merged.ply"), "the damage changes the result");
 }
 
 #[test]
-fn whoever_waits_for_a_job_waits_for_the_next_coordinator() {
+fn waiting_for_a_job_survives_a_restart_of_the_coordinator() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
     common::city(at, 20, 64, 48);
     let (host, _) = coordinator(at);
     let store = format!("file://{}", at.join("shared").display());
     let words = ["submit", "city", "--coordinator", &store, "--wait"];
-    let submit = Running::begin(&mut common::command(at, &[&words[..], &PLAN].concat()));
+    let submit = Running::start(&mut common::command(at, &[&words[..], &PLAN].concat()));
     submit.line_with("job 1 of");
     host.signal("-KILL");
     submit.line_with("waiting for the coordinator");
@@ -141,14 +141,14 @@ fn whoever_waits_for_a_job_waits_for_the_next_coordinator() {
 }
 
 #[test]
-fn a_block_goes_to_a_worker_that_has_the_memory() {
+fn a_block_is_given_to_a_worker_with_enough_memory() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
     common::city(at, 20, 64, 48);
     let (_host, url) = coordinator(at);
     let asked = |words: &[&str]| common::done(at, &[words, &["--coordinator", &url]].concat());
     let until = |job: &str, state: &str| {
-        // As long as other tests wait for a line: a block that nobody is given would be waited for without end.
+        // The same timeout as for lines: a block that no worker gets would be waited for forever.
         for _ in 0..1200 {
             let status = asked(&["status", job]);
             if status["state"] == state {
@@ -159,13 +159,13 @@ fn a_block_goes_to_a_worker_that_has_the_memory() {
         }
         panic!("job {job} does not become {state}");
     };
-    // 40,000 splats under training are thought to take more than a hundred MiB, 2,000 less than 24: the program alone comes near that.
+    // The estimate for training 40,000 splats is over 100 MiB, for 2,000 under 24 MiB, which the program alone nearly needs.
     let plan = ["--blocks", "whole", "--steps", "200", "--tolerance-db", "0"];
     asked(&[&["submit", "city", "--budget", "40000"][..], &plan].concat());
     asked(&[&["submit", "city", "--budget", "2000"][..], &plan].concat());
     let begin = |name: &str, memory: &str| {
         let words = ["worker", "--coordinator", &url, "--name", name, "--threads", "1", "--memory", memory, "--json"];
-        Running::begin(&mut common::command(at, &words))
+        Running::start(&mut common::command(at, &words))
     };
     let small = begin("small", "24");
     let failed = until("2", "incomplete");
@@ -183,7 +183,11 @@ fn a_block_goes_to_a_worker_that_has_the_memory() {
         serde_json::from_str::<Value>(&worker.end().stdout).unwrap()
     });
     assert_eq!((&small["done"], &small["memory_bytes"]), (&0.into(), &(24 << 20).into()));
-    assert_eq!((&large["done"], &large["resumed"]), (&2.into(), &1.into()), "it goes on from the checkpoint: {large}");
+    assert_eq!(
+        (&large["done"], &large["resumed"]),
+        (&2.into(), &1.into()),
+        "it did not resume from the checkpoint: {large}"
+    );
     assert!(large["memory_bytes"].as_u64() > Some(256 << 20), "{large}");
     common::refused(at, &["worker", "--coordinator", &url, "--memory", "8"], "--memory");
 }
@@ -202,7 +206,7 @@ fn clusters_of_several_sizes_are_compared() {
     assert_eq!(workers, [1, 2]);
     for line in &lines {
         assert!(line["plan"] == lines[0]["plan"] && line["tasks"].as_u64() > Some(2), "{line}");
-        // Nothing was left over from the cluster before: photos and context were read, results written.
+        // Every cluster starts with an empty store: photos and context were read, results written.
         assert!(line["bytes_read"].as_u64() > Some(10_000) && line["bytes_written"].as_u64() > Some(10_000), "{line}");
         assert!(line["job_seconds"].as_f64() > Some(0.0) && line["cpu_seconds"].as_f64() > Some(0.0), "{line}");
     }
@@ -210,7 +214,7 @@ fn clusters_of_several_sizes_are_compared() {
 }
 
 #[test]
-fn people_steer_jobs_and_wrong_requests_are_refused_with_a_line() {
+fn jobs_can_be_controlled_and_wrong_requests_are_refused_in_one_line() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
     common::city(at, 20, 64, 48);
@@ -225,7 +229,7 @@ fn people_steer_jobs_and_wrong_requests_are_refused_with_a_line() {
     refused(&["status", "1"], "no job 1");
     let said = asked(&[&["submit", "city"][..], &PLAN].concat());
     assert_eq!((&said["job"], said["tasks"].as_u64() > Some(2)), (&1.into(), true));
-    // Nobody works: all of it waits.
+    // There is no worker, so all tasks wait.
     assert_eq!((&asked(&["status", "1"])["done"], &asked(&["pause", "1"])["state"]), (&0.into(), &"paused".into()));
     assert_eq!(asked(&["resume", "1"])["state"], "running");
     refused(&["retry", "1", "0/0/0"], "neither failed");
@@ -236,7 +240,7 @@ fn people_steer_jobs_and_wrong_requests_are_refused_with_a_line() {
     refused(&["worker", "--name", "two words"], "--name");
     assert_eq!(asked(&["cancel", "1"])["state"], "cancelled");
     let watched = common::plat(at, &["status", "1", "--watch", "--coordinator", &url, "--json"]);
-    assert_eq!(watched.status.code(), Some(1), "it says how the job ended");
+    assert_eq!(watched.status.code(), Some(1), "the exit code is not that of the job");
     let words: Vec<String> = asked(&["logs", "1", "--follow"])["lines"]
         .as_array()
         .unwrap()
@@ -245,16 +249,22 @@ fn people_steer_jobs_and_wrong_requests_are_refused_with_a_line() {
         .collect();
     assert_eq!(
         words[1..],
-        ["asked: pause", "asked: resume", "asked: retry task 0", "asked: cancel", "over: Cancelled"]
+        [
+            "requested: pause",
+            "requested: resume",
+            "requested: retry task 0",
+            "requested: cancel",
+            "finished: Cancelled"
+        ]
     );
-    // Its plan is all that it left; whoever knows the store finds who leads.
+    // Only the plan is left; the store names the leader.
     let store = format!("file://{}", at.join("shared").display());
     let forgotten = common::done(at, &["forget", "1", "--coordinator", &store]);
     assert_eq!((&forgotten["job"], &forgotten["deleted"]), (&1.into(), &1.into()));
     refused(&["status", "1"], "no job 1");
     drop(host);
 
-    // Nobody is there; no trust; no token; no store that is the coordinator's.
+    // No coordinator; no CA certificate; no token; another store.
     common::stopped(&mut common::command(at, &["jobs", "--coordinator", &url]), 1, "check that it is running");
     common::refused(at, &["jobs", "--coordinator", "https://127.0.0.1:1"], "--tls-ca");
     common::refused(at, &["jobs"], "--coordinator");

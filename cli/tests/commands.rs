@@ -1,4 +1,4 @@
-//! The program as scripts see it: exit codes, files, bytes.
+//! The program as run by scripts: exit codes, files, bytes.
 
 mod common;
 
@@ -58,7 +58,7 @@ fn bad_usage_and_bad_input_exit_with_2_and_one_line() {
 }
 
 #[test]
-fn views_are_drawn_from_cameras_alone() {
+fn views_are_rendered_from_cameras_without_photos() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
     std::fs::write(at.join("red.ply"), red_splat()).unwrap();
@@ -70,7 +70,7 @@ fn views_are_drawn_from_cameras_alone() {
     let [red, green, _] = front.get_pixel(10, 5).0;
     assert!(red > 200 && green < 40, "{red} {green}");
     let back = image::open(at.join("o/b.png")).unwrap().to_rgb8();
-    assert!(back.pixels().all(|pixel| pixel.0 == [0; 3]), "the view that looks away sees nothing");
+    assert!(back.pixels().all(|pixel| pixel.0 == [0; 3]), "the view in the opposite direction is not black");
     let (shape, depth) = npy::read_f32(&std::fs::read(at.join("o/front/a.depth.npy")).unwrap()).unwrap();
     assert_eq!(shape, [10, 20]);
     assert!((depth[5 * 20 + 10] - 5.0).abs() < 1e-4 && depth[0] == 0.0, "{} {}", depth[5 * 20 + 10], depth[0]);
@@ -83,7 +83,7 @@ fn views_are_drawn_from_cameras_alone() {
 }
 
 #[test]
-fn a_city_is_trained_measured_and_exported_the_same_twice() {
+fn a_city_is_trained_measured_and_exported_reproducibly() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
     city(at, 20, 64, 48);
@@ -94,13 +94,16 @@ fn a_city_is_trained_measured_and_exported_the_same_twice() {
     let report = train("one", "1");
     train("two", "2");
     let bytes = |path: &str| std::fs::read(at.join(path)).unwrap();
-    assert!(bytes("one/merged.ply") == bytes("two/merged.ply"), "the number of threads shows in the result");
+    assert!(bytes("one/merged.ply") == bytes("two/merged.ply"), "the number of threads changes the result");
     assert_eq!(bytes("one/plan.json"), bytes("two/plan.json"));
 
     let text = |path: &str| String::from_utf8(bytes(path)).unwrap();
     let lines: Vec<Value> = text("one/metrics.jsonl").lines().map(|l| serde_json::from_str(l).unwrap()).collect();
     assert!(lines.iter().all(|l| l["task"].is_string() && l["cpu_seconds"].is_f64() && l["splats"].is_u64()));
-    assert!(lines.is_sorted_by_key(|l| l["cpu_seconds"].as_f64().map(|s| (s * 1e6) as u64)), "clocks run on");
+    assert!(
+        lines.is_sorted_by_key(|l| l["cpu_seconds"].as_f64().map(|s| (s * 1e6) as u64)),
+        "times are not increasing"
+    );
     assert!(lines.iter().any(|l| l["psnr"].is_f64()));
     assert!(text("one/plan.svg").starts_with("<svg"));
     let stored: Value = serde_json::from_slice(&bytes("one/report.json")).unwrap();
@@ -111,13 +114,13 @@ fn a_city_is_trained_measured_and_exported_the_same_twice() {
     let antialiased = ply::comments(&bytes("one/merged.ply")).iter().any(|c| c == "antialiased");
     assert_eq!(report["antialiased"], antialiased);
 
-    // The configuration that a run leaves makes the same plan.
+    // The configuration file of a run gives the same plan.
     done(at, &["train", "city", "--out", "three", "--config", "one/config.toml", "--threads", "2"]);
     assert!(bytes("three/merged.ply") == bytes("one/merged.ply"));
 
     let measured = done(at, &["eval", "one", "city"]);
     assert_eq!(measured["views"].as_array().unwrap().len(), 3);
-    // What is measured on the way is the merged model, so the last figure is the model's, and so is the splats' number.
+    // The merged model is measured during training, so the last figures are those of the model.
     assert_eq!(report["psnr"], measured["psnr"]);
     let on_the_way: Vec<&Value> = lines.iter().filter(|l| l["psnr"].is_f64()).collect();
     let tasks = report["tasks"].as_u64().unwrap() as usize;
@@ -127,11 +130,11 @@ fn a_city_is_trained_measured_and_exported_the_same_twice() {
     assert!(report["bytes_moved"].as_u64() > report["bytes"].as_u64(), "{}", report["bytes_moved"]);
     assert!(measured["psnr"].as_f64().unwrap() > 8.0 && at.join("one/eval/sheet.png").is_file());
     let again = done(at, &["eval", "one/merged.ply", "city"]);
-    assert_eq!(again["psnr"], measured["psnr"], "the merged file is the model");
+    assert_eq!(again["psnr"], measured["psnr"], "merged.ply differs from the model");
     done(at, &["export", "one", "--to", "ply", "--out", "deep/er/city.ply"]);
     assert!(bytes("deep/er/city.ply") == bytes("one/merged.ply"));
 
-    // Cameras without their photos are enough to draw.
+    // Rendering needs cameras, but no photos.
     std::fs::remove_dir_all(at.join("city/images")).unwrap();
     let drawn = done(at, &["render", "one", "--cameras", "city", "--out", "views"]);
     assert_eq!((&drawn["views"], &drawn["antialiased"]), (&20.into(), &antialiased.into()));
@@ -149,7 +152,7 @@ fn captures_are_inspected_and_planned() {
     assert!(planned["tasks"].as_u64().unwrap() >= 2);
     let plan: blocks::Plan = serde_json::from_slice(&std::fs::read(at.join("plan.json")).unwrap()).unwrap();
     assert_eq!(planned["plan"], plan.id().to_string());
-    // Training plans the same, but for the photos' contents.
+    // Training uses the same plan, except for the contents of the photos.
     done(at, &["train", "city", "--out", "o", "--levels", "1", "--steps", "1", "--blocks", "tree"]);
     let trained: blocks::Plan = serde_json::from_slice(&std::fs::read(at.join("o/plan.json")).unwrap()).unwrap();
     let same = done(at, &["plan", "city", "--out", "one.json", "--levels", "1", "--steps", "1"]);
@@ -161,11 +164,11 @@ fn captures_are_inspected_and_planned() {
 }
 
 #[test]
-fn a_cap_in_time_shortens_every_task_and_leaves_a_whole_model() {
+fn a_time_limit_shortens_every_task_and_gives_a_complete_model() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
     city(at, 20, 64, 48);
-    // Without the cap this would take half an hour.
+    // Without the limit this would take half an hour.
     let options = ["--steps", "1000000", "--budget", "800", "--levels", "1", "--minutes", "0.05", "--store", "store"];
     for blocks in ["whole", "tree"] {
         let train = ["train", "city", "--out", blocks, "--blocks", blocks];
@@ -184,7 +187,7 @@ fn a_cap_in_time_shortens_every_task_and_leaves_a_whole_model() {
         assert_eq!(report["splats"], splats.len());
         assert!(done(at, &["eval", blocks, "city"])["psnr"].is_f64());
     }
-    // A cap that is not reached changes nothing.
+    // A limit that is not reached changes nothing.
     let options = ["--steps", "20", "--budget", "800", "--levels", "0", "--store", "store"];
     let free = done(at, &[&["train", "city", "--out", "free"][..], &options].concat());
     let far = done(at, &[&["train", "city", "--out", "far", "--minutes", "600"][..], &options].concat());
@@ -205,7 +208,7 @@ fn number(field: u8, value: u8) -> Vec<u8> {
     vec![field << 3, value]
 }
 
-/// An ONNX graph of LPIPS's signature that says the mean squared difference of its `inputs` pictures' first and last.
+/// An ONNX graph with the signature of LPIPS that returns the mean squared difference of the first and the last of its `inputs`.
 fn squares(inputs: usize) -> Vec<u8> {
     let node = |operator: &str, inputs: [&str; 2], output: &str| {
         let inputs = inputs.iter().filter(|input| !input.is_empty()).flat_map(|input| field(1, input));
@@ -232,7 +235,7 @@ fn squares(inputs: usize) -> Vec<u8> {
 }
 
 #[test]
-fn lpips_is_measured_with_a_network_that_the_user_names() {
+fn lpips_is_measured_with_the_given_network() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
     city(at, 16, 64, 48);
@@ -241,7 +244,7 @@ fn lpips_is_measured_with_a_network_that_the_user_names() {
     assert!(done(at, &["eval", "red.ply", "city", "--out", "o"])["lpips"].is_null());
     let measured = done(at, &["eval", "red.ply", "city", "--lpips", "net.onnx", "--out", "o"]);
     for view in measured["views"].as_array().unwrap() {
-        // Values are in -1..1, so a difference counts twice.
+        // Values are in -1..1, so differences are doubled.
         let expected = 4.0 * 10f64.powf(-0.1 * view["psnr"].as_f64().unwrap());
         assert!((view["lpips"].as_f64().unwrap() - expected).abs() < 1e-4 * expected, "{view} {expected}");
     }
@@ -253,7 +256,7 @@ fn lpips_is_measured_with_a_network_that_the_user_names() {
     std::fs::write(at.join("one.onnx"), squares(1)).unwrap();
     std::fs::write(at.join("text.onnx"), "no network\n").unwrap();
     std::fs::write(at.join("none.onnx"), "").unwrap();
-    // (What follows the operators may be missing.)
+    // (Truncation after the operators is not detected.)
     for (i, length) in (1..whole.len() / 2).step_by(17).enumerate() {
         std::fs::write(at.join(format!("cut{i}.onnx")), &whole[..length]).unwrap();
         refused(at, &["eval", "red.ply", "city", "--quiet", "--lpips", &format!("cut{i}.onnx")], "cut");
@@ -264,7 +267,7 @@ fn lpips_is_measured_with_a_network_that_the_user_names() {
 }
 
 #[test]
-fn measurements_are_kept_as_lines() {
+fn measurements_are_appended_as_lines() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
     city(at, 16, 64, 48);
@@ -291,7 +294,7 @@ fn measurements_are_kept_as_lines() {
         run["lpips"].is_f64() && run["bytes_moved"].is_u64() && run["curve"].as_array().unwrap().len() > 4,
         "{run}"
     );
-    // The chart shows the run and minds nothing else.
+    // The chart shows the run and ignores other lines.
     std::fs::write(at.join("README.md"), "<!-- bench:begin -->\n<!-- bench:end -->\n").unwrap();
     assert_eq!(done(at, &["bench", "chart", "--results", "results"])["lines"], 1);
 }

@@ -1,7 +1,7 @@
-//! Places that take nothing, and disks that are full: exit code 1, one line, and nothing that looks whole and is not.
+//! Paths that cannot be written and full disks: exit code 1, one line, and no incomplete file under its final name.
 //!
-//! A full disk is played by the limit on the size of a file (`ulimit -f`), which needs no privilege and refuses a write in
-//! its middle, as a disk does, and by `/dev/full`.
+//! A full disk is simulated by a limit on file size (`ulimit -f`), which needs no privilege and fails a write in its middle, and by
+//! `/dev/full`.
 #![cfg(target_os = "linux")]
 
 mod common;
@@ -17,24 +17,24 @@ use glam::Vec3;
 use scene::{ArtefactId, Splat, Splats, colmap, frame, npy, ply, spz};
 use serde_json::Value;
 
-/// Bytes of a block of `ulimit -f`.
+/// Bytes per block of `ulimit -f`.
 const BLOCK: u64 = 512;
 const TRAIN: [&str; 12] =
     ["train", "city", "--steps", "20", "--budget", "400", "--levels", "1", "--threads", "2", "--checkpoint-every", "0"];
 
 const SYNTH: [&str; 9] = ["synth", "--area-km2", "0.05", "--views", "8", "--size", "64x36", "--traffic", "light"];
 
-/// The command where no file may become longer than so many blocks.
+/// The command with files limited to this many blocks.
 fn limited(at: &Path, blocks: u64, words: &[&str]) -> Command {
     let mut shell = Command::new("sh");
-    // Without the trap the signal would kill the program, which no full disk does.
+    // Without the trap a signal would kill the program, which a full disk does not do.
     let script = format!("trap '' XFSZ; ulimit -f {blocks}; exec \"$@\"");
     shell.args(["-c", &script, "sh", env!("CARGO_BIN_EXE_plat")]).args(words).arg("--quiet").current_dir(at);
     shell
 }
 
-/// A capture, a model as a file, one as a folder, and cameras to draw from.
-fn furnish(at: &Path) {
+/// Creates a capture with cameras, a model as a file, and one as a folder.
+fn create_inputs(at: &Path) {
     city(at, 16, 64, 48);
     let mut splats = Splats::new(0);
     for i in 0..40 {
@@ -44,7 +44,7 @@ fn furnish(at: &Path) {
     done(at, &[&TRAIN[..], &["--out", "model", "--store", "store"]].concat());
 }
 
-/// Asserts that all files under a folder are what their names say, and returns their contents.
+/// Asserts that all files under a folder are complete, and returns their contents.
 fn whole(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
     let mut files = BTreeMap::new();
     let mut folders = vec![folder.to_path_buf()];
@@ -84,7 +84,7 @@ fn is_whole(path: &Path, bytes: &[u8]) -> bool {
         "bin" if name == "cameras.bin" => colmap::read_cameras_bin(bytes).is_ok(),
         "bin" if name == "images.bin" => colmap::read_images_bin(bytes).is_ok(),
         "bin" => colmap::read_points_bin(bytes).is_ok(),
-        // A store: artefacts are named by their hash; names hold an id, a frame, or nothing any more.
+        // A store: artefacts are named by their hash; records hold an id, a frame, or nothing.
         "" if has(path, "artefacts") => ArtefactId::of(bytes).to_string() == name,
         "" => has(path, "names") && (matches!(bytes.len(), 0 | 32) || bytes.starts_with(b"plat")),
         _ => false,
@@ -92,15 +92,15 @@ fn is_whole(path: &Path, bytes: &[u8]) -> bool {
 }
 
 #[test]
-fn a_place_that_takes_nothing_is_named() {
+fn a_path_that_cannot_be_written_is_named() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
-    furnish(at);
+    create_inputs(at);
     fs::write(at.join("notes.txt"), "notes").unwrap();
     fs::create_dir(at.join("locked")).unwrap();
     fs::set_permissions(at.join("locked"), fs::Permissions::from_mode(0o555)).unwrap();
     let mut places = vec!["notes.txt", "/proc"];
-    // Nothing is locked for root.
+    // Root can write to locked folders.
     if fs::write(at.join("locked/probe"), "").is_err() {
         places.push("locked");
     }
@@ -128,10 +128,10 @@ fn a_place_that_takes_nothing_is_named() {
 }
 
 #[test]
-fn a_full_device_is_an_error_and_stays_a_device() {
+fn a_full_device_is_an_error_and_is_not_replaced() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
-    furnish(at);
+    create_inputs(at);
     let full = |name: &str| symlink("/dev/full", at.join(name)).unwrap();
     ["full.json", "full.svg", "full.ply"].into_iter().for_each(full);
     for words in [
@@ -144,19 +144,19 @@ fn a_full_device_is_an_error_and_stays_a_device() {
         stopped(&mut command(at, words), 1, "the disk is full; free some space");
     }
     assert!(at.join("full.ply").is_symlink());
-    // A journal that cannot be kept fails the run, at its end.
+    // A metrics log that cannot be written fails the run at its end.
     fs::create_dir(at.join("o")).unwrap();
     full("o/metrics.jsonl");
     let train = [&TRAIN[..], &["--out", "o", "--quiet"]].concat();
     stopped(&mut command(at, &train), 1, "o/metrics.jsonl: cannot be written: the disk is full");
     assert!(!at.join("o/model").exists() && !at.join("o/merged.ply").exists());
-    // Nor is there a model before all of it is.
+    // The model folder appears only when it is complete.
     fs::remove_file(at.join("o/metrics.jsonl")).unwrap();
     fs::create_dir(at.join("o/merged.ply")).unwrap();
     stopped(&mut command(at, &train), 1, "o/merged.ply: cannot be replaced");
     assert!(!at.join("o/model/model.json").exists());
 
-    // Standard output too holds a result; a reader that went away has what it wanted.
+    // Standard output holds a result too. A closed pipe is not an error.
     let open = || fs::OpenOptions::new().write(true).open("/dev/full").unwrap();
     for words in [&["inspect", "city"][..], &["plan", "city", "--json"], &["--help"]] {
         let output = command(at, words).arg("--quiet").stdout(open()).output().unwrap();
@@ -164,19 +164,22 @@ fn a_full_device_is_an_error_and_stays_a_device() {
         assert_eq!(output.status.code(), Some(1), "{words:?}: {line}");
         assert!(line.contains("standard output: cannot be written: the disk is full"), "{words:?}: {line}");
     }
-    assert!(command(at, &["inspect", "city"]).stderr(open()).output().unwrap().status.success(), "notes are no result");
-    // A reader that goes away at once: the pipe is broken before the program writes.
+    assert!(
+        command(at, &["inspect", "city"]).stderr(open()).output().unwrap().status.success(),
+        "a note that cannot be printed is an error"
+    );
+    // A reader that closes the pipe before the program writes.
     let mut early = command(at, &["inspect", "city"]).stdout(Stdio::piped()).stderr(Stdio::null()).spawn().unwrap();
     drop(early.stdout.take());
     assert!(early.wait().unwrap().success());
 }
 
 #[test]
-fn a_full_disk_leaves_nothing_that_looks_whole() {
+fn a_full_disk_leaves_no_incomplete_file_under_its_final_name() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
-    furnish(at);
-    // Each with how many blocks all of its files fit. What was there before stays, or is gone.
+    create_inputs(at);
+    // Each with the number of blocks that fits all of its files. Older files are kept or removed.
     let mut failures = 0;
     for words in [
         &["plan", "city", "--out", "out/plan.json"][..],
@@ -206,14 +209,14 @@ fn a_full_disk_leaves_nothing_that_looks_whole() {
     assert_eq!(failures, 40);
 }
 
-/// Runs it where there is room, and returns how many blocks its longest file has.
+/// Runs the command without a limit and returns the blocks of its longest file.
 fn json_and_longest(at: &Path, words: &[&str], out: &Path) -> u64 {
     done(at, words);
     whole(out).values().map(|bytes| (bytes.len() as u64).div_ceil(BLOCK)).max().unwrap()
 }
 
 #[test]
-fn training_on_a_disk_that_fills_up_goes_on_when_there_is_room() {
+fn training_on_a_full_disk_can_be_resumed_when_there_is_space() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
     city(at, 16, 64, 48);
@@ -234,14 +237,14 @@ fn training_on_a_disk_that_fills_up_goes_on_when_there_is_room() {
         failures += 1;
     }
     assert!(failures >= 4, "{failures} of the limits were too small");
-    assert!(merged("o") == merged("calm"), "a full disk shows in the result");
+    assert!(merged("o") == merged("calm"), "a full disk changes the result");
 }
 
 #[test]
-fn a_demo_on_a_full_disk_is_no_capture() {
+fn a_demo_on_a_full_disk_leaves_no_capture() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
-    // Photos fail; then they fit and the sparse points do not.
+    // First photos do not fit; then photos fit and the sparse points do not.
     for blocks in [8, 100] {
         stopped(&mut limited(at, blocks, &["demo", "--quick", "--out", "o"]), 1, "cannot be written: ");
         whole(&at.join("o"));
@@ -251,7 +254,7 @@ fn a_demo_on_a_full_disk_is_no_capture() {
 }
 
 #[test]
-fn a_rehearsal_on_a_full_disk_is_no_capture_and_is_finished_where_there_is_room() {
+fn a_synthetic_capture_on_a_full_disk_is_incomplete_and_can_be_resumed_when_there_is_space() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
     let synth = |out: &'static str| [&SYNTH[..], &["--truth", "--occupancy", "2", "--out", out]].concat();
@@ -260,7 +263,7 @@ fn a_rehearsal_on_a_full_disk_is_no_capture_and_is_finished_where_there_is_room(
         serde_json::from_slice::<Value>(&fs::read(at.join(out).join("manifest.json")).unwrap()).unwrap()["complete"]
             .clone()
     };
-    // the claim fails; then a photo, then depths, then voxels
+    // First the claim fails, then a photo, then depths, then voxels.
     let mut failures = 0;
     for blocks in [0, 4, 12, 40] {
         let mut run = limited(at, blocks, &synth("o"));
@@ -282,5 +285,5 @@ fn a_rehearsal_on_a_full_disk_is_no_capture_and_is_finished_where_there_is_room(
         names.sort();
         names.into_iter().map(|name| (fs::read(at.join(out).join(&name)).unwrap(), name)).collect::<Vec<_>>()
     };
-    assert!(files("o") == files("calm"), "a full disk shows in the capture");
+    assert!(files("o") == files("calm"), "a full disk changes the capture");
 }

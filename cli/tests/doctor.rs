@@ -1,11 +1,11 @@
-//! `plat doctor` as an operator sees it.
+//! `plat doctor` as run by scripts.
 
 mod common;
 
 use common::{command, done, plat, refused, stopped};
 
 #[test]
-fn a_folder_is_tried_out_and_left_empty() {
+fn a_folder_is_tested_and_left_empty() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
     let output = plat(at, &["doctor", "--store", "store"]);
@@ -23,12 +23,12 @@ fn a_folder_is_tried_out_and_left_empty() {
 }
 
 #[test]
-fn what_is_no_store_is_refused_and_what_cannot_be_written_fails() {
+fn bad_urls_are_refused_and_unwritable_stores_fail() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
     refused(at, &["doctor"], "--store");
     refused(at, &["doctor", "--store", "gs://bucket"], "gs://");
-    // Half a key is said before anything is asked of a server.
+    // Incomplete keys are reported before any request to the server.
     let mut half = command(at, &["doctor", "--store", "s3://bucket/prefix"]);
     stopped(half.env("AWS_ACCESS_KEY_ID", "k").env_remove("AWS_SECRET_ACCESS_KEY"), 2, "half of its keys");
     std::fs::create_dir(at.join("store")).unwrap();

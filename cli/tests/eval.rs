@@ -1,4 +1,4 @@
-//! `plat eval` of cuts and seams, as scripts see it.
+//! `plat eval` of cuts and seams as run by scripts.
 
 mod common;
 
@@ -23,13 +23,13 @@ fn cuts_and_seams_of_a_tree_are_measured() {
     let figure = |cut: usize, key: &str| cuts[cut][key].as_f64().unwrap_or(f64::NAN);
     assert_eq!(cuts.len(), 3);
     assert_eq!((&cuts[0]["level"], &cuts[1]["level"], &cuts[2]["budget"]), (&0.into(), &1.into(), &1_000_000.into()));
-    // The finest level is the model itself: it loses nothing, and as many of its splats are all of them.
+    // The finest level is the model itself: it loses nothing, and pruning to as many splats removes none.
     assert_eq!([figure(1, "loss_db"), figure(1, "away_loss_db"), figure(1, "away_gain_db")], [0.0; 3]);
     assert_eq!((&cuts[1]["full"]["psnr"], &cuts[1]["splats"]), (&said["psnr"], &said["splats"].as_f64().into()));
     assert!(figure(0, "loss_db") > 0.1, "{}", figure(0, "loss_db"));
     let [coarse, fine] = [0, 1].map(|cut| figure(cut, "away_mip"));
-    assert!(coarse > fine, "coarser pixels fit smaller pictures: {coarse} {fine}");
-    // Three ways to draw from afar, three results; which is best is for real scenes to say.
+    assert!(coarse > fine, "the viewing distance of the coarser level is not larger: {coarse} {fine}");
+    // The three ways to render give three results; which is best depends on the scene.
     let away = |way: &str| cuts[0]["away"][way]["psnr"].as_f64().unwrap();
     assert!(away("thinned") != away("classic") && away("antialiased") != away("classic"));
     assert!(figure(0, "away_loss_db").is_finite() && figure(0, "away_gain_db").is_finite());
@@ -45,12 +45,12 @@ fn cuts_and_seams_of_a_tree_are_measured() {
     }
     assert_eq!(done(at, &["eval", "tree", "city", "--seams"])["seams"]["faces"], seams["faces"]);
 
-    // The same places of a model without faces.
+    // The same regions of a model without faces.
     let control = done(at, &["eval", "whole", "city", "--seams-of", "tree"]);
     assert_eq!(control["seams"]["of"]["seam_psnr"], seams["seam_psnr"]);
     assert_ne!(control["seams"]["seam_psnr"], seams["seam_psnr"]);
     assert!(control["seams"]["faces_cost_db"].is_f64() && control["seams"]["faces"][0]["control_step"].is_f64());
-    // The same figures as a line of results.
+    // The same figures as a result line.
     let line = done(at, &["bench", "tree", "tree", "city", "--whole", "whole", "--results", "results"]);
     assert_eq!(line["faces"]["psnr"][0], seams["seam_psnr"]);
     assert_eq!(line["faces"]["without_psnr"][0], control["seams"]["seam_psnr"]);

@@ -1,4 +1,4 @@
-//! Exposures of views, and far content, through a whole job: what the root has, all blocks have, and no one else's.
+//! Exposures and the backdrop through a whole job: all blocks use those of the root.
 
 mod common;
 
@@ -24,7 +24,7 @@ fn done(folder: &Path, words: &[&str]) -> Value {
     serde_json::from_str(text.lines().last().expect("an object on the last line")).unwrap()
 }
 
-/// Multiplies each photo that is trained on by a gain from 0.7 to 1.2; the held-out ones stay. Returns the gains by view, 1 for those.
+/// Multiplies each training photo by a gain from 0.7 to 1.2. Returns the gains by view; held-out photos have gain 1.
 fn expose_photos(images: &Path) -> Vec<f64> {
     let mut names: Vec<_> = std::fs::read_dir(images).unwrap().map(|entry| entry.unwrap().path()).collect();
     names.sort();
@@ -39,7 +39,7 @@ fn expose_photos(images: &Path) -> Vec<f64> {
     (0..names.len()).map(gain).collect()
 }
 
-/// Of the splats that are far, their rows as bits.
+/// Rows of the background splats as bits, sorted.
 fn far(splats: &Splats, plan: &Plan) -> Vec<Vec<u32>> {
     let is_far = |&i: &usize| plan.ground.is_background(splats.mean(i).as_dvec3());
     let row = |i: usize| splats.columns().iter().map(|column| column[i].to_bits()).collect();
@@ -48,26 +48,56 @@ fn far(splats: &Splats, plan: &Plan) -> Vec<Vec<u32>> {
     rows
 }
 
+/// Standard error of a command.
+fn stderr(output: &Output) -> String {
+    String::from_utf8_lossy(&output.stderr).into_owned()
+}
+
+fn train(at: &Path, out: &str, more: &[&str]) -> Value {
+    let job = ["train", "city", "--out", out, "--steps", "1500", "--budget", "4000", "--tolerance-db", "0"];
+    done(at, &[&job[..], more].concat())
+}
+
 #[test]
-fn exposures_and_the_sky_come_from_the_root_and_stay_as_they_are() {
+fn exposures_and_the_backdrop_come_from_the_root_and_do_not_change() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
     let settings = common::small(32, 80, 60);
     synth::write(&at.join("city"), &settings, &|_, _, _| ()).unwrap();
     let gains = expose_photos(&at.join("city/images"));
-    let train = |out: &str, more: &[&str]| {
-        let job = ["train", "city", "--out", out, "--steps", "1500", "--budget", "4000", "--tolerance-db", "0"];
-        done(at, &[&job[..], more].concat())
-    };
-    train("on", &["--levels", "2", "--exposure", "--threads", "1"]);
-    train("again", &["--levels", "2", "--exposure", "--threads", "2"]);
+    train(at, "on", &["--levels", "2", "--exposure", "--threads", "1"]);
+    train(at, "again", &["--levels", "2", "--exposure", "--threads", "2"]);
     let bytes = |path: &str| std::fs::read(at.join(path)).unwrap();
     for file in ["merged.ply", "model/model.json", "model/exposures.plat"] {
-        assert!(bytes(&format!("on/{file}")) == bytes(&format!("again/{file}")), "{file} shows the number of threads");
+        let same = bytes(&format!("on/{file}")) == bytes(&format!("again/{file}"));
+        assert!(same, "{file} depends on the number of threads");
     }
+    check_exposures(at, &gains);
+    check_backdrop(at);
+    check_quality(at);
+    check_pruning(at, settings);
 
-    // The exposures: of all training views and no other, their mean the identity, and in all blocks the same.
-    let file = bytes("on/model/exposures.plat");
+    let refused = plat(at, &["train", "city", "--out", "flat", "--blocks", "flat", "--exposure"]);
+    assert_eq!(refused.status.code(), Some(2));
+    let line = stderr(&refused);
+    assert!(line.contains("--exposure") && line.trim_end().lines().count() == 1, "{line}");
+}
+
+fn plan_and_results(at: &Path) -> (Plan, impl Fn(BlockId) -> (Splats, Option<ArtefactId>)) {
+    let folder = at.join("on/model");
+    let plan = Plan::from_frame(&std::fs::read(folder.join("plan.plat")).unwrap()).unwrap();
+    let result = move |block: BlockId| {
+        let BlockId { level, x, y } = block;
+        let bytes = std::fs::read(folder.join(format!("blocks/{level}-{x}-{y}.plat"))).unwrap();
+        let (splats, about) = frame::decode_result(&bytes).unwrap();
+        (splats, about.exposures)
+    };
+    (plan, result)
+}
+
+/// All training views and no others have exposures; their mean is the identity; all blocks refer to the same file.
+fn check_exposures(at: &Path, gains: &[f64]) {
+    let file = std::fs::read(at.join("on/model/exposures.plat")).unwrap();
     let exposures = Exposures::from_frame(&file).unwrap();
     let trained: Vec<u32> = (0..32).filter(|&view| !Capture::is_test(view as usize, 8)).collect();
     assert_eq!(exposures.iter().map(|(view, _)| view).collect::<Vec<_>>(), trained);
@@ -77,59 +107,53 @@ fn exposures_and_the_sky_come_from_the_root_and_stay_as_they_are() {
     let given = |view: u32| gains[view as usize] / mean(&|view| gains[view as usize]);
     let [a, b] = [mean(&|view| (found(view) - 1.0) * (given(view) - 1.0)), mean(&|view| (given(view) - 1.0).powi(2))];
     assert!(a > 0.4 * b, "of the given deviations {a} of {b} was found");
-    let plan = Plan::from_frame(&bytes("on/model/plan.plat")).unwrap();
+    let (plan, result) = plan_and_results(at);
     assert!(plan.levels == 2 && plan.tasks.len() > 5, "{}", plan.tasks.len());
-    let result = |block: BlockId| {
-        let BlockId { level, x, y } = block;
-        frame::decode_result(&bytes(&format!("on/model/blocks/{level}-{x}-{y}.plat"))).unwrap()
-    };
-    let named: BTreeSet<_> = plan.tasks.iter().map(|task| result(task.block).1.exposures).collect();
+    let named: BTreeSet<_> = plan.tasks.iter().map(|task| result(task.block).1).collect();
     assert_eq!(named, BTreeSet::from([Some(ArtefactId::of(&file))]));
+}
 
-    // The sky: the root's, to the bit, once; and no block has any of it.
+/// The merged model has the root's backdrop exactly once, and no other block has any of it.
+fn check_backdrop(at: &Path) {
+    let (plan, result) = plan_and_results(at);
     let root = far(&result(BlockId::ROOT).0, &plan);
-    assert!(root.len() > 150, "a backdrop is there: {}", root.len());
-    assert!(
-        far(&ply::read(&bytes("on/merged.ply")).unwrap(), &plan) == root,
-        "far content was doubled, lost or changed"
-    );
+    assert!(root.len() > 150, "the backdrop has only {} splats", root.len());
+    let merged = ply::read(&std::fs::read(at.join("on/merged.ply")).unwrap()).unwrap();
+    assert!(far(&merged, &plan) == root, "the backdrop was doubled, lost or changed");
     for task in plan.tasks.iter().filter(|task| task.block != BlockId::ROOT) {
         let (splats, _) = result(task.block);
         let strayed = far(&splats, &plan).len();
-        assert!(strayed * 100 <= splats.len(), "block {} has {strayed} far splats", task.block);
+        assert!(strayed * 100 <= splats.len(), "block {} has {strayed} background splats", task.block);
     }
+}
 
-    // Photos that were not changed are nearer. (Of so small a city a tree's root sees too little to be exact.)
-    let on = train("whole", &["--blocks", "whole", "--exposure"]);
-    let off = train("off", &["--blocks", "whole"]);
+/// With exposures the model is closer to unchanged photos. One block is trained, as the root of a tree of so small a city sees too
+/// little to be exact.
+fn check_quality(at: &Path) {
+    let on = train(at, "whole", &["--blocks", "whole", "--exposure"]);
+    let off = train(at, "off", &["--blocks", "whole"]);
     assert!(!at.join("off/model/exposures.plat").exists());
     let psnr = |report: &Value| report["psnr"].as_f64().unwrap();
     let [on, off] =
         [("whole", on), ("off", off)].map(|(out, report)| (psnr(&report), done(at, &["eval", out, "city"])));
     println!("{:.2} dB with exposures, {:.2} without", on.0, off.0);
-    let corrected = |said: &Value| said["cc_psnr"].as_f64().unwrap();
+    let corrected = |report: &Value| report["cc_psnr"].as_f64().unwrap();
     assert!(corrected(&on.1) > psnr(&on.1) && corrected(&off.1) > psnr(&off.1));
     assert!(on.0 > psnr(&off.1) && corrected(&on.1) > corrected(&off.1), "{} {}", corrected(&on.1), corrected(&off.1));
     assert!(on.1["views"][0]["cc_psnr"].is_f64());
+}
 
-    // A model keeps them when it is pruned, and other photos are told from its own.
+/// Pruning keeps the exposures, and uses them only with the photos that they belong to.
+fn check_pruning(at: &Path, settings: Settings) {
     let prune = |capture: &str, out: &str| {
         plat(at, &["prune", "on", "--capture", capture, "--downscale", "1", "--keep", "0.6", "--out", out])
     };
-    let said = |output: &Output| String::from_utf8_lossy(&output.stderr).into_owned();
     let pruned = prune("city", "pruned");
-    assert!(pruned.status.success() && !said(&pruned).contains("exposures"), "{}", said(&pruned));
-    assert_eq!(bytes("pruned/model/exposures.plat"), file);
+    assert!(pruned.status.success() && !stderr(&pruned).contains("exposures"), "{}", stderr(&pruned));
+    let [kept, before] = ["pruned", "on"].map(|out| std::fs::read(at.join(out).join("model/exposures.plat")).unwrap());
+    assert_eq!(kept, before);
     let other = Settings { city: CitySettings { seed: 4, ..settings.city }, ..settings };
     synth::write(&at.join("other"), &other, &|_, _, _| ()).unwrap();
     let pruned = prune("other", "by_others");
-    assert!(said(&pruned).contains("exposures are left out"), "{}", said(&pruned));
-
-    let refused = plat(at, &["train", "city", "--out", "flat", "--blocks", "flat", "--exposure"]);
-    assert_eq!(refused.status.code(), Some(2));
-    assert!(
-        said(&refused).contains("--exposure") && said(&refused).trim_end().lines().count() == 1,
-        "{}",
-        said(&refused)
-    );
+    assert!(stderr(&pruned).contains("exposures are left out"), "{}", stderr(&pruned));
 }

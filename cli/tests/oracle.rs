@@ -1,4 +1,4 @@
-//! `plat render` against images that an independent float64 program made (reference tensors kept outside the repository).
+//! `plat render` against images of an independent float64 renderer (reference tensors are kept outside the repository).
 
 mod common;
 
@@ -35,7 +35,7 @@ fn oracle(name: &str) -> Option<BTreeMap<String, Vec<f64>>> {
     Some(arrays)
 }
 
-/// The capture and the model of a reference case, written into a folder.
+/// Writes the capture and the model of a reference case into a folder.
 fn write_case(case: &BTreeMap<String, Vec<f64>>, folder: &Path) {
     let n = case["opac_logit"].len();
     let mut splats = Splats::new(case["sh_degree"][0] as u8);
@@ -72,7 +72,7 @@ fn rendered_pngs_agree_with_an_independent_float64_renderer() {
         write_case(&case, folder.path());
         common::done(folder.path(), &["render", "model.ply", "--cameras", "transforms.json", "--out", "renders"]);
         let png = image::open(folder.path().join("renders/view.png")).unwrap().to_rgb8();
-        // plat draws on black: take the reference's background out again.
+        // plat renders on black, so the reference's background is removed.
         let (image, alpha, background) = (&case["image"], &case["alpha"], &case["bg"]);
         let far = png.pixels().enumerate().filter(|(i, pixel)| {
             let black = |c: usize| image[i * 3 + c] - background[c] * (1.0 - alpha[*i]);

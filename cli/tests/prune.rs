@@ -1,4 +1,4 @@
-//! `plat prune` as scripts see it.
+//! `plat prune` as run by scripts.
 
 mod common;
 
@@ -20,7 +20,7 @@ fn a_file_is_pruned_by_opacity_and_size_alone() {
     assert_eq!((&said["splats_before"], &said["splats"], &said["order"]), (&10.into(), &5.into(), &"surface".into()));
     let bytes = std::fs::read(at.join("new/five.ply")).unwrap();
     assert_eq!(ply::read(&bytes).unwrap(), splats.select(&[0, 2, 4, 6, 8]));
-    assert!(ply::comments(&bytes).iter().any(|comment| comment == "antialiased"), "how it is drawn is kept");
+    assert!(ply::comments(&bytes).iter().any(|comment| comment == "antialiased"), "the antialiased comment was lost");
 
     let out = ["--out", "o.ply"];
     let prune = |words: &[&'static str]| [&["prune", "ten.ply"][..], &out, words].concat();
@@ -41,7 +41,7 @@ fn a_file_is_pruned_by_opacity_and_size_alone() {
 }
 
 #[test]
-fn a_trained_folder_is_pruned_within_a_tolerance_the_same_twice() {
+fn a_trained_folder_is_pruned_within_a_tolerance_reproducibly() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
     city(at, 20, 64, 48);
@@ -54,7 +54,7 @@ fn a_trained_folder_is_pruned_within_a_tolerance_the_same_twice() {
     let said = prune("one", "1", &["--tolerance-db", "0.3"]);
     prune("two", "2", &["--tolerance-db", "0.3"]);
     let bytes = |path: &str| std::fs::read(at.join(path)).unwrap();
-    assert!(bytes("one/merged.ply") == bytes("two/merged.ply"), "the number of threads shows in the result");
+    assert!(bytes("one/merged.ply") == bytes("two/merged.ply"), "the number of threads changes the result");
     assert_eq!(bytes("one/model/model.json"), bytes("two/model/model.json"));
 
     let before = ply::read(&bytes("model/merged.ply")).unwrap().len();
@@ -63,7 +63,7 @@ fn a_trained_folder_is_pruned_within_a_tolerance_the_same_twice() {
     assert_eq!((&said["splats_before"], &said["splats"]), (&before.into(), &merged.len().into()));
     let held_in = said["held_in_psnr"].as_array().unwrap();
     assert!(held_in[1].as_f64().unwrap() >= held_in[0].as_f64().unwrap() - 0.3 - 1e-6, "{said}");
-    // The folder is a model like any other: its blocks sew to the same splats, and measure the same.
+    // The folder is a complete model: its blocks merge to the same splats and give the same figures.
     done(at, &["export", "one", "--to", "ply", "--out", "sewn.ply"]);
     assert_eq!(bytes("sewn.ply"), bytes("one/merged.ply"));
     let measured = done(at, &["eval", "one", "city"])["psnr"].as_f64().unwrap();

@@ -1,4 +1,4 @@
-//! A job that is killed goes on where it was, and ends with the same bytes.
+//! A killed job is resumed and ends with the same bytes.
 
 mod common;
 
@@ -13,7 +13,7 @@ const JOB: [&str; 11] = [
     "train", "city", "--steps", "240", "--budget", "900", "--levels", "1", "--checkpoint-every", "0", "--exposure",
 ];
 
-/// The job, not yet begun.
+/// The command of the job, not yet started.
 fn job(at: &Path, words: &[&str]) -> Command {
     common::command(at, &[&JOB, words].concat())
 }
@@ -23,14 +23,14 @@ fn done(at: &Path, words: &[&str]) -> Value {
 }
 
 #[test]
-fn killed_five_times_the_bytes_are_the_same() {
+fn a_job_killed_five_times_gives_the_same_bytes() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
     common::city(at, 20, 64, 48);
     let undisturbed = done(at, &["--out", "calm", "--threads", "1"]);
     assert_eq!(undisturbed["resumed"], 0);
 
-    // Lines of a run's journal after which it is killed: within the root, within leaves, in between.
+    // Lines of metrics.jsonl after which a run is killed: within the root, within leaves, in between.
     let mut kills = 0;
     for (n, lines) in [2, 9, 1, 14, 5].into_iter().enumerate() {
         let threads = ["1", "2"][n % 2];
@@ -52,15 +52,15 @@ fn killed_five_times_the_bytes_are_the_same() {
             std::thread::sleep(Duration::from_millis(2));
         }
     }
-    assert!(kills >= 3, "{kills} kills found it at work");
+    assert!(kills >= 3, "only {kills} kills came before the end");
     let resumed = done(at, &["--out", "killed", "--threads", "2"]);
     assert!(resumed["resumed"].as_u64() >= Some(1), "{resumed}");
     let bytes = |path: &str| std::fs::read(at.join(path)).unwrap();
-    assert!(bytes("calm/merged.ply") == bytes("killed/merged.ply"), "a kill shows in the result");
+    assert!(bytes("calm/merged.ply") == bytes("killed/merged.ply"), "a kill changes the result");
     assert!(bytes("calm/model/exposures.plat") == bytes("killed/model/exposures.plat"));
     assert_eq!(undisturbed["psnr"], resumed["psnr"]);
 
-    // All is there already, unless it is asked for anew.
+    // All tasks are finished already, unless --fresh is given.
     let again = done(at, &["--out", "killed"]);
     assert_eq!((&again["resumed"], &again["psnr"]), (&again["tasks"], &resumed["psnr"]));
     let anew = done(at, &["--out", "killed", "--fresh"]);

@@ -1,10 +1,10 @@
-//! `plat synth` as scripts see it.
+//! `plat synth` as run by scripts.
 
 mod common;
 
 use common::{done, plat, refused};
 
-/// The least city, with few small photos.
+/// The smallest city, with few small photos.
 const TINY: [&str; 7] = ["synth", "--area-km2", "0.05", "--views", "24", "--size", "96x54"];
 
 fn tiny<'a>(more: &[&'a str]) -> Vec<&'a str> {
@@ -12,7 +12,7 @@ fn tiny<'a>(more: &[&'a str]) -> Vec<&'a str> {
 }
 
 #[test]
-fn a_rehearsal_can_be_planned_and_is_what_it_says() {
+fn a_synthetic_capture_can_be_planned_and_matches_its_manifest() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
     let made = done(at, &tiny(&["--out", "city", "--fault", "fog=0.3", "--fault", "pose-noise=0.1", "--seed", "4"]));
@@ -28,12 +28,12 @@ fn a_rehearsal_can_be_planned_and_is_what_it_says() {
     assert!(inspected.to_string().contains("24"), "{inspected}");
     let planned = plat(at, &["plan", "city", "--out", "plan.json"]);
     assert!(planned.status.success() && at.join("plan.json").is_file());
-    // another city over it would leave photos of both
+    // Another city in the same folder would leave photos of both.
     refused(at, &tiny(&["--out", "city", "--seed", "5", "--quiet"]), "not empty");
 }
 
 #[test]
-fn what_cannot_be_is_refused_before_anything_is_made() {
+fn bad_settings_are_refused_before_anything_is_written() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
     for (words, wanted) in [
@@ -59,7 +59,7 @@ fn what_cannot_be_is_refused_before_anything_is_made() {
 }
 
 #[test]
-fn a_rehearsal_trains_and_what_is_trained_shows_it() {
+fn a_synthetic_capture_can_be_trained() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
     let voxels = ["--occupancy", "0.5", "--occupancy-around", "0,0,1,4,30"];
@@ -77,12 +77,12 @@ fn a_rehearsal_trains_and_what_is_trained_shows_it() {
 }
 
 #[test]
-fn the_gallery_is_a_picture_and_nothing_else() {
+fn the_gallery_is_a_single_picture() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
     done(at, &["synth", "--area-km2", "0.05", "--size", "48x28", "--gallery", "all.png"]);
     let picture = image::open(at.join("all.png")).unwrap();
-    // six panes a row of 31, each with a frame and a line of text
+    // Six panes a row of 31, each with a frame and a line of text.
     assert_eq!((picture.width(), picture.height()), (6 * 50, 6 * 40));
     assert_eq!(std::fs::read_dir(at).unwrap().count(), 1);
     refused(at, &["synth", "--gallery", "all.png", "--out", "o"], "--out");

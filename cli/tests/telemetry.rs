@@ -1,4 +1,4 @@
-//! A cluster that is watched: one trace of a job over all processes, metrics, and logs in which no secret stands.
+//! Telemetry of a cluster: one trace of a job over all processes, metrics, and logs without secrets.
 #![cfg(unix)]
 
 mod common;
@@ -11,7 +11,7 @@ use std::process::Command;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
-use common::cluster::{Running, is_at_work};
+use common::cluster::{Running, has_task};
 use opentelemetry_proto::tonic::collector::trace::v1::trace_service_server::{TraceService, TraceServiceServer};
 use opentelemetry_proto::tonic::collector::trace::v1::{ExportTraceServiceRequest, ExportTraceServiceResponse};
 use opentelemetry_proto::tonic::common::v1::KeyValue;
@@ -25,10 +25,10 @@ use tonic::{Request, Response, Status};
 const PLAN: [&str; 8] = ["--steps", "960", "--budget", "900", "--levels", "1", "--blocks", "tree"];
 const TOKEN: &str = "d34db33f-secret-of-the-cluster";
 
-/// What a span is: its service, and itself.
+/// A span with its service.
 type Told = (String, Span);
 
-/// A collector as an operator has one.
+/// An OpenTelemetry collector.
 #[derive(Clone, Default)]
 struct Collector(Arc<Mutex<Vec<Told>>>);
 
@@ -48,7 +48,7 @@ impl TraceService for Collector {
 }
 
 impl Collector {
-    /// One that listens, where, and what keeps it.
+    /// A listening collector, its URL, and the guard that keeps it running.
     fn start() -> (Self, String, tokio::runtime::Runtime) {
         let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build().unwrap();
         let collector = Self::default();
@@ -72,13 +72,13 @@ fn text(attributes: &[KeyValue], key: &str) -> String {
     }
 }
 
-/// Whole numbers go out as text: tracing's are unsigned, OpenTelemetry's are not.
+/// Integers are exported as text: tracing's are unsigned, OpenTelemetry's are signed.
 fn number(span: &Span, key: &str) -> u64 {
     let text = text(&span.attributes, key);
     text.parse().unwrap_or_else(|_| panic!("{} has {key} '{text}'", span.name))
 }
 
-/// What Prometheus reads at this URL, by metric and labels.
+/// The metrics at this URL, by name and labels.
 fn scraped(url: &str) -> BTreeMap<String, f64> {
     let address = url.strip_prefix("http://").unwrap().strip_suffix("/metrics").unwrap();
     let mut stream = TcpStream::connect(address).unwrap();
@@ -93,7 +93,7 @@ fn scraped(url: &str) -> BTreeMap<String, f64> {
         .collect()
 }
 
-/// The program with a token, telling everything it can.
+/// The program with a token and with all telemetry enabled.
 fn watched(at: &Path, words: &[&str], collector: &str) -> Command {
     let mut command = common::command(at, &[words, &["--token-file", "token"]].concat());
     command
@@ -105,10 +105,10 @@ fn watched(at: &Path, words: &[&str], collector: &str) -> Command {
 
 fn worker(at: &Path, url: &str, name: &str, collector: &str) -> Running {
     let words = ["worker", "--coordinator", url, "--name", name, "--threads", "1", "--checkpoint-every", "0.05"];
-    Running::begin(&mut watched(at, &[&words[..], &["--metrics", "0", "--log-format", "json"]].concat(), collector))
+    Running::start(&mut watched(at, &[&words[..], &["--metrics", "0", "--log-format", "json"]].concat(), collector))
 }
 
-/// The URL in a line of this program's log that begins so.
+/// The URL in the line of this program's log that begins with these words.
 fn url_after(running: &Running, words: &str) -> String {
     let line = running.line(|line| object(line)["message"].as_str().is_some_and(|message| message.starts_with(words)));
     let message = object(&line)["message"].as_str().unwrap().to_owned();
@@ -121,7 +121,7 @@ fn object(line: &str) -> Value {
 }
 
 #[test]
-fn a_job_is_one_trace_and_nobody_tells_the_token() {
+fn a_job_is_one_trace_and_the_token_is_never_printed() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
     common::city(at, 20, 64, 48);
@@ -130,16 +130,16 @@ fn a_job_is_one_trace_and_nobody_tells_the_token() {
 
     let words =
         ["coordinator", "--store", "shared", "--listen", "127.0.0.1:0", "--metrics", "0", "--log-format", "json"];
-    let host = Running::begin(&mut watched(at, &words, &otlp));
+    let host = Running::start(&mut watched(at, &words, &otlp));
     let url = url_after(&host, "listening on");
     let host_metrics = url_after(&host, "metrics at");
     let first = worker(at, &url, "first", &otlp);
     let words = ["submit", "city", "--coordinator", &url, "--wait", "--json"];
     let mut submit = watched(at, &[&words[..], &PLAN].concat(), &otlp);
-    let submit = Running::begin(submit.env("OTEL_SERVICE_NAME", "tester"));
-    // Of two workers each has a task, as the second comes when the first has one, and the first goes before the end.
+    let submit = Running::start(submit.env("OTEL_SERVICE_NAME", "tester"));
+    // Each of two workers trains a task: the second starts when the first has one, and the first stops before the end.
     let asked = ["--coordinator", &url, "--token-file", "token"];
-    assert!(is_at_work(at, &asked, "first"));
+    assert!(has_task(at, &asked, "first"));
     let second = worker(at, &url, "second", &otlp);
     let second_metrics = url_after(&second, "metrics at");
     first.signal("-TERM");
@@ -154,7 +154,7 @@ fn a_job_is_one_trace_and_nobody_tells_the_token() {
     assert!(seen["plat_worker_tasks_done_total"] >= 2.0 && seen["plat_worker_steps_total"] > 100.0, "{seen:?}");
     assert!(seen["plat_worker_cpu_seconds_total"] > 0.0 && seen["plat_worker_checkpoints_total"] > 0.0, "{seen:?}");
     assert!(seen["plat_worker_store_read_bytes_total"] > 1e4 && seen["plat_worker_splats"] == 0.0, "{seen:?}");
-    // They are brought up to date once a second.
+    // They are updated once per second.
     let seen = loop {
         let seen = scraped(&host_metrics);
         if seen["plat_completions_total"] >= tasks as f64 {
@@ -189,15 +189,15 @@ fn a_job_is_one_trace_and_nobody_tells_the_token() {
             "{wanted}: {named:?}"
         );
     }
-    // Whatever is logged within a task says of which, however deep it comes from.
+    // Log lines within a task name the task, at any depth.
     let pruned = second.stderr.lines().map(object).find(|line| line["message"] == "pruned").expect("leaves are pruned");
     assert!(pruned["job"] == 1 && pruned["attempt"].is_u64() && pruned["worker"] == "second", "{pruned}");
     for ended in [&first, &second, &host, &submit] {
-        assert!(!ended.stderr.contains(TOKEN) && !ended.stdout.contains(TOKEN), "it tells the token");
+        assert!(!ended.stderr.contains(TOKEN) && !ended.stdout.contains(TOKEN), "the token was printed");
     }
 }
 
-/// All spans of a job are of one trace, each below what it is a part of.
+/// All spans of a job belong to one trace, each below its parent.
 fn check_trace(told: &[Told], tasks: u64) {
     let names: Vec<&str> = told.iter().map(|(_, span)| &span.name[..]).collect();
     let all = |name: &str| -> Vec<&Told> { told.iter().filter(|(_, span)| span.name == name).collect() };
@@ -224,7 +224,7 @@ fn check_trace(told: &[Told], tasks: u64) {
     assert_eq!(workers, ["first", "second"].map(String::from).into());
     let done: Vec<&&Span> = by_id.values().filter(|task| !text(&task.attributes, "artefact").is_empty()).collect();
     let numbers: BTreeSet<u64> = done.iter().map(|task| number(task, "task")).collect();
-    assert_eq!(numbers, (0..tasks).collect(), "each task is done");
+    assert_eq!(numbers, (0..tasks).collect(), "a task has no span");
 
     let task_of = |span: &Span| {
         *by_id.get(&span.parent_span_id[..]).unwrap_or_else(|| panic!("{} is no task's: {names:?}", span.name))
@@ -246,28 +246,28 @@ fn check_trace(told: &[Told], tasks: u64) {
 }
 
 #[test]
-fn a_collector_that_is_away_costs_one_line() {
+fn an_unreachable_collector_costs_one_line() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
     common::city(at, 16, 64, 48);
     std::fs::write(at.join("token"), TOKEN).unwrap();
-    // Nobody listens there any more.
+    // Nothing listens at this address any more.
     let away = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
     let away = format!("http://{away}");
     let words = ["coordinator", "--store", "shared", "--listen", "127.0.0.1:0", "--log-format", "json"];
-    let host = Running::begin(watched(at, &words, &away).env("RUST_LOG", "info"));
+    let host = Running::start(watched(at, &words, &away).env("RUST_LOG", "info"));
     let url = url_after(&host, "listening on");
     let submit = |number: usize| {
         let words = ["submit", "city", "--coordinator", &url, "--json", "--quiet"];
         let mut submit = watched(at, &[&words[..], &PLAN].concat(), &away);
-        let submit = Running::begin(submit.env_remove("RUST_LOG")).end();
+        let submit = Running::start(submit.env_remove("RUST_LOG")).end();
         assert!(submit.status.success(), "{}", submit.stderr);
         assert_eq!(object(submit.stdout.trim())["job"], number);
         assert!(submit.stderr.lines().count() == 1 && submit.stderr.contains("traces are lost"), "{}", submit.stderr);
     };
     submit(1);
     submit(2);
-    // Both jobs' spans were refused by then, each in a batch of its own.
+    // The spans of both jobs have been rejected by now, each in a batch of its own.
     host.line_with("traces are lost");
     host.signal("-TERM");
     let host = host.end();

@@ -188,6 +188,8 @@ fn described(line: &ResultLine) -> String {
 
 #[cfg(test)]
 mod tests {
+    use std::path::Path;
+
     use clap::Parser;
 
     use super::*;

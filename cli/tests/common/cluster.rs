@@ -1,4 +1,4 @@
-//! Processes of a cluster, none of which outlives its test.
+//! Processes of a cluster that are killed with their test.
 
 use std::io::{BufRead, BufReader, Read};
 use std::path::Path;
@@ -9,15 +9,15 @@ use std::time::Duration;
 
 use serde_json::Value;
 
-/// A process whose words are kept; it is killed with the test.
+/// A process whose output is collected; killed when dropped.
 pub(crate) struct Running {
     child: Child,
-    /// Of stderr, as they come.
+    /// Lines of stderr as they arrive.
     lines: mpsc::Receiver<String>,
-    said: Option<[JoinHandle<String>; 2]>,
+    output: Option<[JoinHandle<String>; 2]>,
 }
 
-/// What came of a process.
+/// Status and output of a process that has ended.
 pub(crate) struct Ended {
     pub(crate) status: ExitStatus,
     pub(crate) stdout: String,
@@ -25,11 +25,11 @@ pub(crate) struct Ended {
 }
 
 impl Running {
-    pub(crate) fn begin(command: &mut Command) -> Self {
+    pub(crate) fn start(command: &mut Command) -> Self {
         let mut child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().expect("plat runs");
         let (mut stdout, stderr) = (child.stdout.take().unwrap(), BufReader::new(child.stderr.take().unwrap()));
         let (sender, lines) = mpsc::channel();
-        // Both are read to their ends, so that it is never held up.
+        // Both pipes are drained, so that the process is never blocked.
         let stdout = std::thread::spawn(move || {
             let mut all = String::new();
             stdout.read_to_string(&mut all).unwrap();
@@ -44,20 +44,20 @@ impl Running {
             }
             all
         });
-        Self { child, lines, said: Some([stdout, stderr]) }
+        Self { child, lines, output: Some([stdout, stderr]) }
     }
 
-    /// The next line on stderr that is such.
-    pub(crate) fn line(&self, is_it: impl Fn(&str) -> bool) -> String {
+    /// The next line on stderr that matches.
+    pub(crate) fn line(&self, matches: impl Fn(&str) -> bool) -> String {
         loop {
-            let line = self.lines.recv_timeout(Duration::from_secs(60)).expect("it says so before long");
-            if is_it(&line) {
+            let line = self.lines.recv_timeout(Duration::from_secs(60)).expect("the line appears within a minute");
+            if matches(&line) {
                 return line;
             }
         }
     }
 
-    /// The next line on stderr in which these words stand.
+    /// The next line on stderr that contains these words.
     pub(crate) fn line_with(&self, words: &str) -> String {
         self.line(|line| line.contains(words))
     }
@@ -66,10 +66,10 @@ impl Running {
         assert!(Command::new("kill").args([name, &self.child.id().to_string()]).status().unwrap().success());
     }
 
-    /// Its end, which must come.
+    /// Waits for its end.
     pub(crate) fn end(mut self) -> Ended {
         let status = self.child.wait().unwrap();
-        let [stdout, stderr] = self.said.take().unwrap().map(|said| said.join().unwrap());
+        let [stdout, stderr] = self.output.take().unwrap().map(|output| output.join().unwrap());
         Ended { status, stdout, stderr }
     }
 }
@@ -81,10 +81,10 @@ impl Drop for Running {
     }
 }
 
-/// Waits until the worker has a task of job 1 in hand, or there is nothing left to have; whether it has.
-pub(crate) fn is_at_work(at: &Path, connection: &[&str], name: &str) -> bool {
+/// Waits until the worker has a task of job 1, and returns true; returns false if the job ends first.
+pub(crate) fn has_task(at: &Path, connection: &[&str], name: &str) -> bool {
     loop {
-        // The job may not be there yet.
+        // The job may not have been submitted yet.
         let asked = super::plat(at, &[&["status", "1", "--json", "--quiet"], connection].concat());
         let status: Value = serde_json::from_slice(&asked.stdout).unwrap_or_default();
         let running = status["running"].as_array().cloned().unwrap_or_default();

@@ -1,4 +1,4 @@
-//! plat as scripts run it, and what must come of that.
+//! Runs plat as scripts do and checks exit codes and output.
 #![allow(dead_code, reason = "each test program uses some of it")]
 
 #[cfg(unix)]
@@ -11,24 +11,24 @@ use city::{CitySettings, Layout, Traffic};
 use dataset::synth::{self, Settings};
 use serde_json::Value;
 
-/// The program in a folder with these words, not yet run.
+/// The command with these arguments in a folder, not yet started.
 pub(crate) fn command(folder: &Path, words: &[&str]) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_plat"));
     command.args(words).current_dir(folder);
     command
 }
 
-/// Runs it.
+/// Runs a command.
 pub(crate) fn plat(folder: &Path, words: &[&str]) -> Output {
     command(folder, words).output().expect("plat runs")
 }
 
-/// Runs a command that must succeed, and its JSON.
+/// Runs a command that must succeed, and returns its JSON.
 pub(crate) fn done(folder: &Path, words: &[&str]) -> Value {
     json_of(&mut command(folder, words))
 }
 
-/// As [`done`], of a command that is set up in another way too.
+/// As [`done`] for a command with further settings.
 pub(crate) fn json_of(command: &mut Command) -> Value {
     let output = command.arg("--json").output().expect("plat runs");
     assert!(output.status.success(), "{command:?}: {}", String::from_utf8_lossy(&output.stderr));
@@ -36,12 +36,12 @@ pub(crate) fn json_of(command: &mut Command) -> Value {
     serde_json::from_str(text.lines().last().expect("an object on the last line")).unwrap()
 }
 
-/// Runs a command that must be refused with one line that says this.
+/// Runs a command that must exit with 2 and one line that contains `wanted`.
 pub(crate) fn refused(folder: &Path, words: &[&str], wanted: &str) {
     stopped(&mut command(folder, words), 2, wanted);
 }
 
-/// Runs a command that must end with this exit code and one line that says this; that line.
+/// Runs a command that must exit with this code and one line that contains `wanted`; returns the line.
 pub(crate) fn stopped(command: &mut Command, code: i32, wanted: &str) -> String {
     let output = command.output().expect("plat runs");
     let line = String::from_utf8(output.stderr).unwrap();
@@ -51,7 +51,7 @@ pub(crate) fn stopped(command: &mut Command, code: i32, wanted: &str) -> String 
     line
 }
 
-/// A small city where nothing moves, mostly from the air, so that few photos show all of it.
+/// A small city without traffic, mostly from the air, so that few photos cover it.
 pub(crate) fn small(views: u32, width: u32, height: u32) -> Settings {
     let city = CitySettings { seed: 3, layout: Layout::Grid, traffic: Traffic::None, ..CitySettings::default() };
     Settings { city, views, width, height, aerial: 0.75, ..Settings::default() }
