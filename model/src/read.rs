@@ -125,3 +125,49 @@ pub(crate) fn read_block(folder: &Path, block: BlockId) -> Result<Splats, BadInp
     let path = folder.join("blocks").join(block_file(block));
     frame::decode_splats(&load(&path)?).map_err(|error| damaged(&path, &error))
 }
+
+#[cfg(test)]
+mod tests {
+    use glam::Vec3;
+    use scene::Splat;
+
+    use super::*;
+
+    fn model(antialiased: bool) -> Model {
+        let mut splats = Splats::new(0);
+        splats.push(&Splat::round(Vec3::new(1.0, 2.0, 3.0), -1.0, Vec3::splat(0.5), 0.9));
+        Model { splats, antialiased, exposures: None, trained: None }
+    }
+
+    #[test]
+    fn files_keep_splats_and_antialiasing() {
+        let folder = tempfile::tempdir().unwrap();
+        for antialiased in [false, true] {
+            let written = model(antialiased);
+            let [ply, spz] = ["a.PLY", "a.spz"].map(|name| folder.path().join(name));
+            std::fs::write(&ply, written.to_ply()).unwrap();
+            std::fs::write(&spz, written.to_spz().unwrap()).unwrap();
+            let [ply, spz] = [ply, spz].map(|path| super::read(&path).unwrap());
+            assert_eq!((&ply.splats, ply.antialiased), (&written.splats, antialiased));
+            assert_eq!((spz.splats.len(), spz.antialiased), (1, antialiased));
+            assert_eq!((ply.test_every(), ply.downscale()), (8, 1));
+        }
+    }
+
+    #[test]
+    fn paths_without_a_model_are_named() {
+        let folder = tempfile::tempdir().unwrap();
+        std::fs::write(folder.path().join("notes.txt"), "").unwrap();
+        std::fs::write(folder.path().join("cut.ply"), "ply\n").unwrap();
+        for (name, wanted) in [
+            ("", "holds no model/model.json"),
+            ("none.ply", "does not exist"),
+            ("notes.txt", "is neither a folder nor a .ply or .spz"),
+            ("cut.ply", "cut.ply"),
+        ] {
+            let error = super::read(&folder.path().join(name)).unwrap_err().to_string();
+            assert!(error.contains(wanted) && error.contains(name), "{name}: {error}");
+        }
+        assert!(read_tree(folder.path()).is_err());
+    }
+}

@@ -85,3 +85,25 @@ fn finish(out: &Path, folder: &Path, manifest: &Manifest, model: &Model) -> Resu
     save_json(&folder.join(MANIFEST_FILE), manifest)?;
     Ok(merged.len() as u64)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_rewritten_model_goes_to_another_path_in_the_same_format() {
+        let folder = tempfile::tempdir().unwrap();
+        let at = |name: &str| folder.path().join(name);
+        fs::create_dir_all(at("trained/model")).unwrap();
+        fs::write(at("trained/model/model.json"), "{}").unwrap();
+        fs::write(at("a.ply"), "").unwrap();
+        let problem = |path: &str, out: &str| check_out(&at(path), &at(out)).err().map(|error| error.problem);
+        assert_eq!(problem("a.ply", "new/b.PLY"), None);
+        assert_eq!(problem("trained", "pruned"), None);
+        assert_eq!(problem("a.ply", "a.ply").as_deref(), Some("is the model itself"));
+        assert_eq!(problem("trained/model", "trained").as_deref(), Some("is the model itself"));
+        assert_eq!(problem("a.ply", "a.spz").as_deref(), Some("has another format than the model"));
+        assert_eq!(problem("a.ply", "trained").as_deref(), Some("has another format than the model"));
+        assert_eq!(problem("trained", "a.ply").as_deref(), Some("is a file"));
+    }
+}

@@ -43,7 +43,7 @@ const ABSENT: [(&str, &[&str]); 10] = [
     ("city", &["tokio", "object_store", "tonic"]),
     ("render", &["tokio", "object_store", "tonic"]),
     ("train", &["tokio", "object_store", "tonic"]),
-    ("model", &["dataset", "train", "wgpu", "clap", "indicatif"]),
+    ("model", &["dataset", "train", "clap", "indicatif"]),
     ("eval", &["clap", "indicatif"]),
     ("telemetry", &["cluster", "proto", "store", "train"]),
     ("coordinator", &["render", "train", "dataset", "worker", "wgpu"]),
