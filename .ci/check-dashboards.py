@@ -1,4 +1,4 @@
-"""Whether dashboards and the autoscaler ask for metrics that docs/src/metrics.md lists, and for data sources that are provisioned."""
+"""Checks that dashboards and the autoscaler query only metrics that docs/src/metrics.md lists, and only provisioned data sources."""
 
 import json
 import re
@@ -11,7 +11,7 @@ OBSERVABILITY = Path("infra/observability")
 sources = {source["uid"] for source in yaml.safe_load((OBSERVABILITY / "grafana/datasources/plat.yaml").read_text())["datasources"]}
 for file in sorted(OBSERVABILITY.glob("*.yaml")):
     yaml.safe_load(file.read_text())
-faults, asked = [], set()
+faults, queried = [], set()
 for file in sorted((OBSERVABILITY / "grafana/dashboards").glob("*.json")):
     board = json.loads(file.read_text())
     ids = [panel["id"] for panel in board["panels"]]
@@ -19,18 +19,18 @@ for file in sorted((OBSERVABILITY / "grafana/dashboards").glob("*.json")):
         faults.append(f"{file}: two panels have the same id")
     for panel in board["panels"]:
         if panel["datasource"]["uid"] not in sources:
-            faults.append(f"{file}: '{panel['title']}' asks {panel['datasource']['uid']}, which is not provisioned")
+            faults.append(f"{file}: '{panel['title']}' queries {panel['datasource']['uid']}, which is not provisioned")
         for target in panel["targets"]:
-            asked |= set(re.findall(r"\bplat_\w+", target.get("expr", "")))
-asked |= set(re.findall(r"\bplat_tasks_(?:ready|leased)\b", Path("infra/kubernetes/base/worker.yaml").read_text()))
+            queried |= set(re.findall(r"\bplat_\w+", target.get("expr", "")))
+queried |= set(re.findall(r"\bplat_tasks_(?:ready|leased)\b", Path("infra/kubernetes/base/worker.yaml").read_text()))
 listed = Path("docs/src/metrics.md")
 if listed.is_file():
     known = set(re.findall(r"\bplat_\w+", listed.read_text()))
-    # A histogram's parts, and counters with their suffix.
+    # Series of histograms and counters have suffixes.
     base = lambda name: re.sub(r"_(bucket|sum|count|total)$", "", name)
     known |= {base(name) for name in known}
-    faults += [f"{name}: not in {listed}" for name in sorted(asked) if name not in known and base(name) not in known]
+    faults += [f"{name}: not in {listed}" for name in sorted(queried) if name not in known and base(name) not in known]
 else:
-    print(f"{listed} is not there yet: the names of metrics are not checked")
-print("\n".join(faults) or f"{len(asked)} metrics asked for")
+    print(f"{listed} does not exist: metric names are not checked")
+print("\n".join(faults) or f"{len(queried)} metrics queried")
 sys.exit(1 if faults else 0)

@@ -1,4 +1,4 @@
-"""Whether each container of rendered manifests is kept small and unprivileged, and whether plat knows the arguments that it is started with."""
+"""Checks that each container of rendered manifests is limited and unprivileged, and that plat accepts its arguments."""
 
 import os
 import subprocess
@@ -10,20 +10,20 @@ import yaml
 def container_faults(kind, pod, container):
     security, limits = container.get("securityContext", {}), container.get("resources", {}).get("limits", {})
     wanted = {
-        "runs as no root": pod.get("securityContext", {}).get("runAsNonRoot"),
+        "runs as non-root": pod.get("securityContext", {}).get("runAsNonRoot"),
         "has a seccomp profile": pod.get("securityContext", {}).get("seccompProfile"),
         "has a read-only root file system": security.get("readOnlyRootFilesystem"),
         "cannot gain privileges": security.get("allowPrivilegeEscalation") is False,
         "drops all capabilities": security.get("capabilities", {}).get("drop") == ["ALL"],
-        "has a limit of memory": limits.get("memory"),
-        "has no token of Kubernetes": pod.get("automountServiceAccountToken") is False,
+        "has a memory limit": limits.get("memory"),
+        "has no Kubernetes token": pod.get("automountServiceAccountToken") is False,
     }
-    faults = [f"not: {what}" for what, holds in wanted.items() if not holds]
-    # Files and names of the cluster are not here, so it must stop at one of those and at nothing else.
+    faults = [f"violated: {rule}" for rule, holds in wanted.items() if not holds]
+    # The cluster's files do not exist here, so plat must fail at one of them and at nothing else.
     arguments = [word.replace("$(PLAT_STORE)", "s3://bucket/prefix") for word in container["args"]]
-    said = subprocess.run([os.environ["PLAT"], *arguments], capture_output=True, text=True, timeout=60)
-    if said.returncode != 2 or "/cluster/" not in said.stderr + said.stdout and "/secrets/" not in said.stderr:
-        faults.append(f"plat {' '.join(arguments)}: {said.returncode}: {said.stderr.strip()}")
+    done = subprocess.run([os.environ["PLAT"], *arguments], capture_output=True, text=True, timeout=60)
+    if done.returncode != 2 or "/cluster/" not in done.stderr + done.stdout and "/secrets/" not in done.stderr:
+        faults.append(f"plat {' '.join(arguments)}: {done.returncode}: {done.stderr.strip()}")
     return [f"{kind}, {container['name']}: {fault}" for fault in faults]
 
 

@@ -1,5 +1,5 @@
-"""Whether a Terraform module parses, and refers to no variable, resource, local or module of its own that is not there. What a provider
-calls its arguments only the provider knows, which takes a network."""
+"""Checks that a Terraform module parses and refers only to variables, resources and modules that it defines. Arguments of providers are
+not checked, as that needs the network."""
 
 import re
 import sys
@@ -9,12 +9,12 @@ import hcl2
 
 
 def names(parsed, kind):
-    """Names of the blocks of a kind, without the quotes that the parser leaves."""
+    """Names of the blocks of a kind, without the parser's quotes."""
     return [tuple(part.strip('"') for part in labels(block)) for block in parsed.get(kind, [])]
 
 
 def labels(block):
-    """Labels of a block: the keys that lead down to its body."""
+    """Labels of a block: the keys on the path to its body."""
     found = []
     while isinstance(block, dict) and len(keys := [key for key in block if not key.startswith("__")]) == 1:
         if not isinstance(block[keys[0]], dict):
@@ -32,15 +32,15 @@ def main(folder):
         with file.open() as source:
             for kind, blocks in hcl2.load(source).items():
                 parsed.setdefault(kind, []).extend(blocks)
-    there = {f"var.{name[0]}" for name in names(parsed, "variable")}
-    there |= {f"module.{name[0]}" for name in names(parsed, "module")}
-    there |= {".".join(name[:2]) for name in names(parsed, "resource")}
+    defined = {f"var.{name[0]}" for name in names(parsed, "variable")}
+    defined |= {f"module.{name[0]}" for name in names(parsed, "module")}
+    defined |= {".".join(name[:2]) for name in names(parsed, "resource")}
     code = re.sub(r"#.*", "", text)
     referred = set(re.findall(r"\b(?:var|module)\.\w+|\baws_\w+\.\w+", code))
-    faults = [f"{folder}: {name} is not there" for name in sorted(referred - there)]
-    unused = {name for name in there if name.startswith("var.")} - referred
+    faults = [f"{folder}: {name} is not defined" for name in sorted(referred - defined)]
+    unused = {name for name in defined if name.startswith("var.")} - referred
     faults += [f"{folder}: {name} is never used" for name in sorted(unused)]
-    print("\n".join(faults) or f"{len(files)} files, {len(there)} names, {len(referred)} referred to")
+    print("\n".join(faults) or f"{len(files)} files, {len(defined)} names, {len(referred)} referred to")
     return 1 if faults or not referred else 0
 
 

@@ -1,6 +1,9 @@
-//! The state of all jobs, without I/O: it translates between the wire's words and the scheduler's, and remembers what
-//! the scheduler does not care for (names of workers, plans, who watches). What a step changes gathers here, and so do the answers
-//! and the news that must not go out before that is durable.
+//! The state of all jobs, without I/O: translates between protocol messages and scheduler events, and holds what the scheduler does not
+//! need (names of workers, plans, watchers). Collects the changes of each step, and the replies and updates that wait until those are
+//! durable.
+
+mod forget;
+mod queries;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -8,29 +11,25 @@ use std::sync::Arc;
 use cluster::journal::{Line, digest, to_text};
 use cluster::{
     Action, AttemptId, Changes, Event, Failure, Fence, JobId, JobSpec, Offer, Outcome, RestoreError, Scheduler,
-    Settings, Snapshot, TaskIndex, TaskState, WorkerId,
+    Settings, Snapshot, TaskIndex, WorkerId,
 };
-use proto::WatchEvent;
 use proto::control_request::What;
 use proto::lease_reply::Reply;
-use proto::watch_event::Event as News;
+use proto::watch_event::Event as Update;
 use scene::ArtefactId;
 use telemetry::TraceParent;
 use tokio::sync::mpsc;
 use tonic::Status;
 
-use crate::Options;
-use crate::collect::Leftovers;
 use crate::log::Log;
-use crate::metrics::{Leads, Metrics};
-use crate::news::{Watched, Watchers, changed, finished, to_wire};
+use crate::metrics::{LeaderMetrics, Metrics};
+use crate::options::Options;
 use crate::state::{Batch, Origin, Restored};
+use crate::watchers::{Watchers, changed, finished};
 
-/// Different names of workers.
+/// Largest number of different worker names.
 const WORKERS_LIMIT: usize = 100_000;
-/// Failures that a status lists, and tasks under way.
-const TASKS_LISTED: usize = 100;
-/// Debug builds check the invariants at each step while there are no more tasks than this.
+/// Debug builds check the invariants at each step up to this number of tasks.
 const CHECKED_TASKS: usize = 1000;
 
 /// All jobs.
@@ -44,39 +43,39 @@ pub(crate) struct Jobs {
     log: Log,
     journal: Option<mpsc::Sender<String>>,
     batch: Batch,
-    due: Vec<Due>,
-    /// The job whose leftovers are being deleted.
+    due: Vec<Pending>,
+    /// The job whose objects are being deleted.
     collecting: Option<JobId>,
 }
 
-/// What the scheduler does not care for.
+/// What the scheduler does not need of a job.
 struct Job {
     origin: Origin,
     watchers: Watchers,
 }
 
-/// What must not go out before all that was changed up to then is durable.
-pub(crate) enum Due {
-    /// The answer to a call.
-    Answer(Box<dyn FnOnce() + Send>),
-    /// For whoever watches the job.
-    News(JobId, News),
-    /// The last news.
-    Over(JobId, Outcome),
+/// Something that waits until all changes before it are durable.
+pub(crate) enum Pending {
+    /// The reply to a call.
+    Reply(Box<dyn FnOnce() + Send>),
+    /// An update for the job's watchers.
+    Update(JobId, Update),
+    /// The last update of a job.
+    Finished(JobId, Outcome),
 }
 
 impl Jobs {
-    /// None yet, in memory.
+    /// No jobs, in memory.
     pub(crate) fn new(options: Options) -> Self {
         let epoch = options.epoch.max(1);
         let snapshot = Snapshot { epoch: epoch - 1, jobs: Vec::new() };
         let settings = Self::settings(&options);
         let mut jobs = Self::of(options, Scheduler::new(settings, epoch));
-        jobs.write(|| Line::Began { settings, snapshot, epoch, now_millis: 0 });
+        jobs.write_journal(|| Line::Began { settings, snapshot, epoch, now_millis: 0 });
         jobs
     }
 
-    /// Those that were durable, under an epoch of their own.
+    /// The durable jobs, under a new epoch.
     ///
     /// # Errors
     /// A state that no coordinator could have written.
@@ -90,7 +89,7 @@ impl Jobs {
         let job = |(id, origin)| (id, Job { origin, watchers: Watchers::default() });
         jobs.jobs = origins.into_iter().map(job).collect();
         jobs.next_job = next_job;
-        jobs.write(|| Line::Began { settings, snapshot: began.unwrap_or_default(), epoch, now_millis: 0 });
+        jobs.write_journal(|| Line::Began { settings, snapshot: began.unwrap_or_default(), epoch, now_millis: 0 });
         Ok(jobs)
     }
 
@@ -114,7 +113,7 @@ impl Jobs {
         Settings { poll_millis: options.wait_millis.into(), ..options.settings }
     }
 
-    /// Under which epoch they are handed out.
+    /// The epoch of this coordinator's grants.
     pub(crate) fn epoch(&self) -> u64 {
         self.scheduler.epoch()
     }
@@ -123,39 +122,39 @@ impl Jobs {
         self.options.metrics.clone()
     }
 
-    /// Tells how they stand.
-    pub(crate) fn measure(&self, leads: &mut Leads<'_>) {
-        leads.measure(&self.scheduler);
+    /// Updates the metrics.
+    pub(crate) fn update_metrics(&self, leading: &mut LeaderMetrics<'_>) {
+        leading.update(&self.scheduler);
     }
 
-    /// How many there are.
+    /// Number of jobs.
     pub(crate) fn len(&self) -> usize {
         self.jobs.len()
     }
 
-    /// Does this once all that was changed up to now is durable.
-    pub(crate) fn once_durable(&mut self, answer: impl FnOnce() + Send + 'static) {
-        self.due.push(Due::Answer(Box::new(answer)));
+    /// Calls `reply` once all changes up to now are durable.
+    pub(crate) fn after_durable(&mut self, reply: impl FnOnce() + Send + 'static) {
+        self.due.push(Pending::Reply(Box::new(reply)));
     }
 
-    /// What is to be made durable, and what waits for that.
-    pub(crate) fn take_gathered(&mut self) -> (Batch, Vec<Due>) {
+    /// Takes the changes to make durable, and what waits for them.
+    pub(crate) fn take_batch(&mut self) -> (Batch, Vec<Pending>) {
         (std::mem::take(&mut self.batch), std::mem::take(&mut self.due))
     }
 
-    /// Lets out what waited.
-    pub(crate) fn deliver(&mut self, due: Vec<Due>) {
+    /// Sends replies and updates that are durable now.
+    pub(crate) fn release(&mut self, due: Vec<Pending>) {
         for due in due {
             match due {
-                Due::Answer(answer) => answer(),
-                Due::News(id, news) => {
+                Pending::Reply(reply) => reply(),
+                Pending::Update(id, update) => {
                     if let Some(job) = self.jobs.get_mut(&id) {
-                        job.watchers.tell(news);
+                        job.watchers.send(update);
                     }
                 }
-                Due::Over(id, outcome) => {
+                Pending::Finished(id, outcome) => {
                     if let Some(job) = self.jobs.get_mut(&id) {
-                        job.watchers.tell(finished(outcome));
+                        job.watchers.send(finished(outcome));
                         job.watchers = Watchers::default();
                     }
                 }
@@ -163,7 +162,7 @@ impl Jobs {
         }
     }
 
-    /// `traced` is the span that its tasks are part of.
+    /// Submits a plan as a job; `traced` is the parent span of its tasks.
     pub(crate) fn submit(
         &mut self,
         now: u64,
@@ -171,19 +170,19 @@ impl Jobs {
         spec: JobSpec,
         traced: Option<TraceParent>,
     ) -> Result<u64, Status> {
-        self.check_collecting()?;
+        self.check_no_collection()?;
         if self.jobs.len() >= self.options.settings.jobs_limit as usize {
-            // The oldest that is over makes room.
-            let over = self.jobs.keys().find(|id| self.scheduler.finished(**id).is_some()).copied();
-            let over =
-                over.ok_or_else(|| Status::resource_exhausted(format!("{} jobs are running", self.jobs.len())))?;
-            self.step(now, Event::ForgetRequested { job: over });
-            self.jobs.remove(&over);
+            // The oldest finished job is forgotten.
+            let oldest = self.jobs.keys().find(|id| self.scheduler.finished(**id).is_some()).copied();
+            let oldest =
+                oldest.ok_or_else(|| Status::resource_exhausted(format!("{} jobs are running", self.jobs.len())))?;
+            self.step(now, Event::ForgetRequested { job: oldest });
+            self.jobs.remove(&oldest);
         }
         let id = JobId(self.next_job);
         self.jobs.insert(id, Job { origin: Origin { plan, traced }, watchers: Watchers::default() });
         let actions = self.step(now, Event::Submitted { job: id, spec });
-        if let Err(status) = agreed(&actions, Status::invalid_argument) {
+        if let Err(status) = declined(&actions, Status::invalid_argument) {
             self.jobs.remove(&id);
             return Err(Status::invalid_argument(format!("plan {plan}: {}", status.message())));
         }
@@ -193,7 +192,7 @@ impl Jobs {
         Ok(id.0)
     }
 
-    /// `seen` is the highest epoch that the worker knows of.
+    /// Answers a worker's lease request; `seen` is the highest epoch that it knows.
     pub(crate) fn lease(&mut self, now: u64, name: &str, offer: Offer, seen: u64) -> Result<Reply, Status> {
         self.check_epoch(seen)?;
         let worker = self.worker(name)?;
@@ -213,7 +212,7 @@ impl Jobs {
                 _ => {}
             }
         }
-        Err(Status::internal("the scheduler has no answer to a worker that asks"))
+        Err(Status::internal("the scheduler did not answer a lease request"))
     }
 
     pub(crate) fn report(&mut self, now: u64, of: proto::Attempt, reports: Vec<proto::Report>) -> Result<bool, Status> {
@@ -224,14 +223,14 @@ impl Jobs {
         if accepted && let Some(job) = self.jobs.get_mut(&attempt.job) {
             for report in reports {
                 let report = proto::TaskReported { task: of.task, attempt: of.number, report: Some(report) };
-                job.watchers.tell(News::Reported(report));
+                job.watchers.send(Update::Reported(report));
             }
         }
         Ok(accepted)
     }
 
     pub(crate) fn complete(&mut self, now: u64, of: proto::Attempt, artefact: ArtefactId) -> Result<bool, Status> {
-        // Plans are whole when they are submitted: the wire has no tasks that follow from a result.
+        // A submitted plan has all its tasks: the protocol has no tasks that follow from a result.
         let event = Event::Completed { attempt: self.attempt(of)?, artefact, follow_ups: Vec::new() };
         Ok(accepted(&self.step(now, event)))
     }
@@ -240,7 +239,7 @@ impl Jobs {
         let attempt = self.attempt(of)?;
         let (kind, message) = (failure.kind, &failure.message);
         if self.scheduler.holds(attempt) {
-            self.log.trouble(now, attempt, format!("ended without a result, {kind:?}: {message}"));
+            self.log.failure(now, attempt, format!("ended without a result, {kind:?}: {message}"));
         }
         Ok(accepted(&self.step(now, Event::Failed { attempt, failure })))
     }
@@ -248,11 +247,11 @@ impl Jobs {
     pub(crate) fn cancel(&mut self, now: u64, id: u64) -> Result<(), Status> {
         let job = JobId(id);
         self.job(job)?;
-        self.log.job(now, job, "asked: cancel");
-        agreed(&self.step(now, Event::CancelRequested { job }), Status::failed_precondition)
+        self.log.job(now, job, "requested: cancel");
+        declined(&self.step(now, Event::CancelRequested { job }), Status::failed_precondition)
     }
 
-    /// A worker goes; one that was never seen has nothing to give back.
+    /// A worker shuts down. An unknown one has no lease.
     pub(crate) fn leave(&mut self, now: u64, name: &str) {
         if let Some(worker) = self.workers.get(name).copied() {
             tracing::info!(worker = name, "left");
@@ -263,8 +262,8 @@ impl Jobs {
     pub(crate) fn control(&mut self, now: u64, id: u64, what: What) -> Result<(), Status> {
         let job = JobId(id);
         self.job(job)?;
-        self.check_collecting()?;
-        self.log.job(now, job, format!("asked: {}", words_of(&what)));
+        self.check_no_collection()?;
+        self.log.job(now, job, format!("requested: {}", request_text(&what)));
         let event = match what {
             What::Pause(_) => Event::PauseRequested { job },
             What::Resume(_) => Event::ResumeRequested { job },
@@ -276,141 +275,29 @@ impl Jobs {
                 Event::ReprioritiseRequested { job, priority, weight }
             }
         };
-        agreed(&self.step(now, event), Status::failed_precondition)
+        declined(&self.step(now, event), Status::failed_precondition)
     }
 
-    /// What a job that is over leaves in the store, to be deleted before it is forgotten. No other may run: what a task builds on
-    /// is known here only once it is done.
-    pub(crate) fn collect(&mut self, id: u64) -> Result<Leftovers, Status> {
-        let of = JobId(id);
-        let plan = self.job(of)?.origin.plan;
-        if let Some(other) = self.jobs.keys().find(|other| self.scheduler.finished(**other).is_none()) {
-            return Err(Status::failed_precondition(format!("job {} runs; forget job {id} when none does", other.0)));
-        }
-        self.check_collecting()?;
-        let mut left = Leftovers { artefacts: self.results(of).chain([plan]).collect(), ..Leftovers::default() };
-        for (task, _) in self.scheduler.records(of) {
-            let inputs = self.scheduler.inputs(of, task).into_iter().map(|(task, id)| (task.0, id)).collect();
-            left.keys.insert(proto::result_key(plan, task.0, &inputs));
-        }
-        for (other, job) in self.jobs.iter().filter(|(other, _)| **other != of) {
-            for id in self.results(*other).chain([job.origin.plan]) {
-                left.artefacts.remove(&id);
-            }
-        }
-        self.collecting = Some(of);
-        Ok(left)
-    }
-
-    /// No task may begin while leftovers are being deleted: it might find what is about to go.
-    fn check_collecting(&self) -> Result<(), Status> {
+    /// Refuses to start tasks during garbage collection: they could find objects that are about to be deleted.
+    fn check_no_collection(&self) -> Result<(), Status> {
         match self.collecting {
             Some(JobId(job)) => {
-                Err(Status::unavailable(format!("what job {job} left is being deleted; ask again in a while")))
+                Err(Status::unavailable(format!("the objects of job {job} are being deleted; retry later")))
             }
             None => Ok(()),
         }
-    }
-
-    /// What it left is deleted, or could not be: then it is still there, and may be forgotten another time.
-    pub(crate) fn collected(&mut self, now: u64, id: u64, deleted: bool) -> Result<(), Status> {
-        self.collecting = None;
-        if deleted {
-            self.control(now, id, What::Forget(proto::Forget {}))?;
-            self.jobs.remove(&JobId(id));
-        }
-        Ok(())
-    }
-
-    fn results(&self, job: JobId) -> impl Iterator<Item = ArtefactId> + '_ {
-        self.scheduler.records(job).filter_map(|(_, record)| match record.state {
-            TaskState::Done { artefact, .. } => Some(artefact),
-            _ => None,
-        })
-    }
-
-    pub(crate) fn watch(&mut self, id: u64) -> Result<Watched, Status> {
-        let id = JobId(id);
-        let job = self.jobs.get_mut(&id).ok_or_else(|| no_job(id))?;
-        let event = |news| WatchEvent { event: Some(news) };
-        let records = self.scheduler.records(id);
-        let mut snapshot: Vec<_> =
-            records.map(|(task, record)| event(News::Changed(changed(task, &record.state, &self.names)))).collect();
-        let rest = if let Some(outcome) = self.scheduler.finished(id) {
-            snapshot.push(event(finished(outcome)));
-            None
-        } else {
-            Some(job.watchers.add()?)
-        };
-        Ok(Watched { snapshot, rest })
-    }
-
-    pub(crate) fn status(&self, id: u64) -> Result<proto::StatusReply, Status> {
-        let id = JobId(id);
-        let job = self.job(id)?;
-        let outcome = self.scheduler.finished(id).map(|outcome| to_wire(outcome).into());
-        let mut reply =
-            proto::StatusReply { job: id.0, plan: job.origin.plan.0.to_vec(), outcome, ..Default::default() };
-        if let Some(header) = self.scheduler.header(id) {
-            (reply.paused, reply.priority, reply.weight) = (header.paused, header.priority.into(), header.weight);
-        }
-        for (task, record) in self.scheduler.records(id) {
-            match &record.state {
-                TaskState::Waiting { .. } => reply.waiting += 1,
-                TaskState::Ready { .. } | TaskState::Delayed { .. } => reply.ready += 1,
-                TaskState::Leased { .. } => reply.leased += 1,
-                TaskState::Done { .. } => reply.done += 1,
-                TaskState::Failed { .. } => reply.failed += 1,
-                TaskState::Quarantined { .. } => reply.quarantined += 1,
-            }
-            let failed = matches!(record.state, TaskState::Failed { .. } | TaskState::Quarantined { .. });
-            if failed && reply.failures.len() < TASKS_LISTED {
-                reply.failures.push(changed(task, &record.state, &self.names));
-            }
-            if matches!(record.state, TaskState::Leased { .. }) && reply.running.len() < TASKS_LISTED {
-                reply.running.push(changed(task, &record.state, &self.names));
-            }
-        }
-        Ok(reply)
-    }
-
-    /// Every job's status, without its tasks.
-    pub(crate) fn list(&self) -> proto::JobsReply {
-        let brief = |status| proto::StatusReply { failures: Vec::new(), running: Vec::new(), ..status };
-        let jobs = self.jobs.keys().filter_map(|id| self.status(id.0).ok());
-        proto::JobsReply { jobs: jobs.map(brief).collect() }
-    }
-
-    /// The plan of a job.
-    pub(crate) fn plan(&self, id: u64) -> Result<ArtefactId, Status> {
-        self.job(JobId(id)).map(|job| job.origin.plan)
-    }
-
-    /// What happened in a job after a line.
-    pub(crate) fn logs(&self, now: u64, id: u64, after: u64) -> Result<proto::LogsReply, Status> {
-        self.job(JobId(id))?;
-        Ok(proto::LogsReply { lines: self.log.page(now, JobId(id), after, &self.names) })
-    }
-
-    /// How many of the workers that are there compute with what.
-    pub(crate) fn backends(&self) -> Vec<proto::BackendCount> {
-        let count = |(backend, workers): (&str, usize)| proto::BackendCount {
-            backend: backend.into(),
-            workers: workers as u32,
-        };
-        self.scheduler.backends().map(count).collect()
     }
 
     pub(crate) fn tick(&mut self, now: u64) {
         self.step(now, Event::Ticked);
     }
 
-    /// Steps the scheduler; what changed gathers, for the durable state and for watchers.
+    /// Steps the scheduler and collects the changes for the durable state and for watchers.
     fn step(&mut self, now: u64, event: Event) -> Vec<Action> {
         let small = cfg!(debug_assertions) && self.scheduler.total() <= CHECKED_TASKS;
         let before = small.then(|| self.scheduler.clone());
         let actions = self.scheduler.step(now, event.clone());
-        self.write(|| Line::Step { now_millis: now, event: event.clone(), answer: digest(&actions) });
+        self.write_journal(|| Line::Step { now_millis: now, event: event.clone(), answer: digest(&actions) });
         if let Some(before) = before {
             let held = cluster::check(&self.scheduler);
             let held = held.and_then(|()| cluster::check_step(&before, &self.scheduler, &event, &actions));
@@ -421,22 +308,22 @@ impl Jobs {
             match action {
                 Action::Changed { job, task } => {
                     if let Some(record) = self.scheduler.record(*job, *task) {
-                        let news = News::Changed(changed(*task, &record.state, &self.names));
-                        self.due.push(Due::News(*job, news));
+                        let update = Update::Changed(changed(*task, &record.state, &self.names));
+                        self.due.push(Pending::Update(*job, update));
                     }
                 }
-                Action::JobFinished { job, outcome } => self.due.push(Due::Over(*job, *outcome)),
+                Action::JobFinished { job, outcome } => self.due.push(Pending::Finished(*job, *outcome)),
                 _ => {}
             }
         }
         if self.options.durable.is_some() {
-            self.gather(&event, &actions);
+            self.add_to_batch(&event, &actions);
         }
         actions
     }
 
-    /// Adds what a step changed to what is to be made durable.
-    fn gather(&mut self, event: &Event, actions: &[Action]) {
+    /// Adds a step's changes to the batch.
+    fn add_to_batch(&mut self, event: &Event, actions: &[Action]) {
         let changes = Changes::of(&self.scheduler, event, actions);
         for id in changes.headers.keys() {
             if let Some(job) = self.jobs.get(id) {
@@ -446,12 +333,12 @@ impl Jobs {
         self.batch.changes.absorb(changes);
     }
 
-    /// Hands a line to whoever keeps the journal. A journal with a gap is worthless, so one that lags behind ends.
-    fn write(&mut self, line: impl FnOnce() -> Line) {
+    /// Sends a line to the journal. A journal with a gap cannot be replayed, so it ends if its reader lags behind.
+    fn write_journal(&mut self, line: impl FnOnce() -> Line) {
         if let Some(journal) = &self.journal
             && journal.try_send(to_text(&line())).is_err()
         {
-            tracing::warn!("the journal of the scheduler ends here: whoever writes it lags behind or is gone");
+            tracing::warn!("the scheduler's journal ends here: its writer lags behind or has ended");
             self.journal = None;
         }
     }
@@ -493,11 +380,11 @@ impl Jobs {
         self.jobs.get(&id).ok_or_else(|| no_job(id))
     }
 
-    /// Whoever knows of a higher epoch talks to a coordinator that no longer leads, and is not to believe what it says.
+    /// Refuses a caller that has seen a higher epoch: this coordinator no longer leads.
     fn check_epoch(&self, seen: u64) -> Result<(), Status> {
         let epoch = self.scheduler.epoch();
         if seen > epoch {
-            let line = format!("this coordinator leads no more: it is of epoch {epoch}, there is one of epoch {seen}");
+            let line = format!("this coordinator no longer leads: its epoch is {epoch}, there is one of epoch {seen}");
             return Err(Status::unavailable(line));
         }
         Ok(())
@@ -515,8 +402,8 @@ fn accepted(actions: &[Action]) -> bool {
     actions.iter().any(|action| matches!(action, Action::Accepted { .. }))
 }
 
-/// The answer to a person.
-fn agreed(actions: &[Action], refuse: impl Fn(String) -> Status) -> Result<(), Status> {
+/// The scheduler's refusal of a request, if it refused.
+fn declined(actions: &[Action], refuse: impl Fn(String) -> Status) -> Result<(), Status> {
     let reason = actions.iter().find_map(|action| match action {
         Action::Declined { reason, .. } => Some(reason.clone()),
         _ => None,
@@ -524,8 +411,8 @@ fn agreed(actions: &[Action], refuse: impl Fn(String) -> Status) -> Result<(), S
     reason.map_or(Ok(()), |reason| Err(refuse(reason)))
 }
 
-/// What a person asked for, for the log.
-fn words_of(what: &What) -> String {
+/// A request, for the log.
+fn request_text(what: &What) -> String {
     match what {
         What::Pause(_) => "pause".into(),
         What::Resume(_) => "resume".into(),

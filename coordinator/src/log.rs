@@ -1,15 +1,15 @@
-//! What happened lately: a bounded list of lines for people, which nothing depends on, and an event for the program's own log each.
+//! The job log: a bounded list of lines for people. Each line is also an event of the process's log. Nothing depends on it.
 
 use std::collections::VecDeque;
 
 use cluster::{Action, AttemptId, JobId, Scheduler, TaskIndex, TaskState, WorkerId};
 use proto::LogLine;
 
-/// Lines of all jobs that are kept, the newest.
+/// Lines of all jobs that are kept; the oldest are dropped.
 const LINES_LIMIT: usize = 100_000;
-/// Bytes of a message that are kept.
+/// Bytes of a message; longer ones are truncated.
 const MESSAGE_LIMIT: usize = 500;
-/// Lines of one answer.
+/// Lines of one reply.
 const PAGE: usize = 1000;
 
 /// The lines of all jobs.
@@ -25,30 +25,30 @@ struct Line {
     now: u64,
     job: JobId,
     task: Option<TaskIndex>,
-    /// 0 where it is about none.
+    /// 0 if the line is about no attempt.
     attempt: u32,
-    /// Of the worker, by its number.
+    /// The worker's number.
     worker: Option<u32>,
-    what: String,
+    message: String,
 }
 
 impl Log {
-    /// Something that concerns a whole job.
-    pub(crate) fn job(&mut self, now: u64, job: JobId, what: impl Into<String>) {
-        let what = what.into();
-        tracing::info!(job = job.0, "{what}");
-        self.keep(Line { number: 0, now, job, task: None, attempt: 0, worker: None, what });
+    /// Adds a line about a whole job.
+    pub(crate) fn job(&mut self, now: u64, job: JobId, message: impl Into<String>) {
+        let message = message.into();
+        tracing::info!(job = job.0, "{message}");
+        self.keep(Line { number: 0, now, job, task: None, attempt: 0, worker: None, message });
     }
 
-    /// What went wrong with an attempt.
-    pub(crate) fn trouble(&mut self, now: u64, of: AttemptId, what: impl Into<String>) {
+    /// Adds a line about a failed attempt.
+    pub(crate) fn failure(&mut self, now: u64, of: AttemptId, message: impl Into<String>) {
         let AttemptId { job, task, fence } = of;
-        let (attempt, what) = (fence.number, what.into());
-        tracing::warn!(job = job.0, task = task.0, attempt, "{what}");
-        self.keep(Line { number: 0, now, job, task: Some(task), attempt, worker: None, what });
+        let (attempt, message) = (fence.number, message.into());
+        tracing::warn!(job = job.0, task = task.0, attempt, "{message}");
+        self.keep(Line { number: 0, now, job, task: Some(task), attempt, worker: None, message });
     }
 
-    /// What a step came to; the scheduler is as it is after it, and `names` are those of the workers.
+    /// Adds the lines about a step. `scheduler` is in the state after the step; `names` are the workers' names by number.
     pub(crate) fn step(&mut self, now: u64, scheduler: &Scheduler, actions: &[Action], names: &[String]) {
         for action in actions {
             match action {
@@ -58,15 +58,15 @@ impl Log {
                 }
                 Action::Stop { worker, attempt } => {
                     let name = names.get(worker.0 as usize);
-                    self.of_worker(now, *attempt, *worker, name, "is told to stop: not needed any more".into());
+                    self.of_worker(now, *attempt, *worker, name, "stopped: no longer needed".into());
                 }
                 Action::Changed { job, task } => {
                     let Some(record) = scheduler.record(*job, *task) else { continue };
-                    let (attempt, what) = match &record.state {
+                    let (attempt, message) = match &record.state {
                         TaskState::Done { fence, artefact } => (fence.number, format!("done: {artefact}")),
                         TaskState::Failed { fence, message } => (fence.number, format!("failed for good: {message}")),
                         TaskState::Quarantined { fence, message } => (fence.number, format!("quarantined: {message}")),
-                        TaskState::Delayed { .. } => (record.attempts, "pauses before its next attempt".into()),
+                        TaskState::Delayed { .. } => (record.attempts, "waits before its next attempt".into()),
                         TaskState::Ready { .. } if record.attempts > 0 => {
                             (record.attempts, "waits for a worker again".into())
                         }
@@ -74,13 +74,13 @@ impl Log {
                     };
                     match record.state {
                         TaskState::Failed { .. } | TaskState::Quarantined { .. } => {
-                            tracing::error!(job = job.0, task = task.0, attempt, "{what}");
+                            tracing::error!(job = job.0, task = task.0, attempt, "{message}");
                         }
-                        _ => tracing::info!(job = job.0, task = task.0, attempt, "{what}"),
+                        _ => tracing::info!(job = job.0, task = task.0, attempt, "{message}"),
                     }
-                    self.keep(Line { number: 0, now, job: *job, task: Some(*task), attempt, worker: None, what });
+                    self.keep(Line { number: 0, now, job: *job, task: Some(*task), attempt, worker: None, message });
                 }
-                Action::JobFinished { job, outcome } => self.job(now, *job, format!("over: {outcome:?}")),
+                Action::JobFinished { job, outcome } => self.job(now, *job, format!("finished: {outcome:?}")),
                 _ => {}
             }
         }
@@ -97,22 +97,22 @@ impl Log {
             task: line.task.map(|task| task.0),
             attempt: line.attempt,
             worker: worker(line).unwrap_or_default(),
-            what: line.what.clone(),
+            what: line.message.clone(),
         };
         lines.map(to_wire).collect()
     }
 
-    fn of_worker(&mut self, now: u64, of: AttemptId, worker: WorkerId, name: Option<&String>, what: String) {
+    fn of_worker(&mut self, now: u64, of: AttemptId, worker: WorkerId, name: Option<&String>, message: String) {
         let AttemptId { job, task, fence } = of;
         let attempt = fence.number;
-        tracing::info!(job = job.0, task = task.0, attempt, worker = name, "{what}");
-        self.keep(Line { number: 0, now, job, task: Some(task), attempt, worker: Some(worker.0), what });
+        tracing::info!(job = job.0, task = task.0, attempt, worker = name, "{message}");
+        self.keep(Line { number: 0, now, job, task: Some(task), attempt, worker: Some(worker.0), message });
     }
 
     fn keep(&mut self, mut line: Line) {
-        if line.what.len() > MESSAGE_LIMIT {
-            let end = (0..=MESSAGE_LIMIT).rev().find(|&end| line.what.is_char_boundary(end));
-            line.what.truncate(end.unwrap_or(0));
+        if line.message.len() > MESSAGE_LIMIT {
+            let end = (0..=MESSAGE_LIMIT).rev().find(|&end| line.message.is_char_boundary(end));
+            line.message.truncate(end.unwrap_or(0));
         }
         if self.lines.len() >= LINES_LIMIT {
             self.lines.pop_front();
@@ -128,7 +128,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_newest_lines_are_kept_and_read_page_by_page() {
+    fn the_newest_lines_are_kept_and_paged() {
         let mut log = Log::default();
         for i in 0..LINES_LIMIT as u64 + 10 {
             log.job(i, JobId(i % 2), "é".repeat(400));

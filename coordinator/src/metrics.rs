@@ -1,5 +1,5 @@
-//! What a coordinator tells Prometheus: `docs/src/metrics.md` lists it. The owner of the jobs writes, once a second; a scrape reads
-//! atomics and never waits for the scheduler, nor the scheduler for it.
+//! The coordinator's Prometheus metrics, which `docs/src/metrics.md` lists. The actor updates them once a second. A scrape reads atomics, so
+//! neither waits for the other.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Mutex, PoisonError};
@@ -12,28 +12,28 @@ use prometheus_client::metrics::gauge::Gauge;
 use prometheus_client::metrics::histogram::Histogram;
 use prometheus_client::registry::Registry;
 
-/// Backends that have a label of their own; workers of all further ones count as `other`.
+/// Backends with a label of their own; workers of further ones count as `other`.
 const BACKENDS_LIMIT: usize = 16;
-/// Characters of a label that workers chose.
+/// Characters of a label whose text comes from a worker.
 const LABEL_LIMIT: usize = 64;
-/// Upper bounds of what a durable write takes, seconds.
+/// Histogram buckets of the duration of a durable write, seconds.
 const WRITE_SECONDS: [f64; 12] = [0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0];
-/// How a job can stand.
+/// Values of the label `state` of jobs.
 const JOB_STATES: [&str; 5] = ["running", "paused", "done", "incomplete", "cancelled"];
-/// Where a task can stand, with a line for a person.
+/// States of a task, with the metrics' help texts.
 const TASK_STATES: [(&str, &str); 7] = [
     ("waiting", "Tasks whose parent or context is not done"),
-    ("ready", "Tasks that a worker could begin"),
-    ("delayed", "Tasks in a pause before their next attempt"),
-    ("leased", "Tasks that workers are at"),
+    ("ready", "Tasks that wait for a worker"),
+    ("delayed", "Tasks that wait before their next attempt"),
+    ("leased", "Tasks that a worker executes"),
     ("done", "Tasks with a result"),
-    ("failed", "Tasks whose input is wrong"),
-    ("quarantined", "Tasks that reached a limit of attempts"),
+    ("failed", "Tasks with wrong input"),
+    ("quarantined", "Tasks that reached their limit of attempts"),
 ];
 
 type Label<V> = [(&'static str, V); 1];
 
-/// A coordinator's metrics. What they say of jobs, tasks and workers is 0 while it stands by.
+/// A coordinator's metrics. Those of jobs, tasks and workers are 0 while it stands by.
 #[derive(Debug)]
 pub struct Metrics {
     leader: Gauge,
@@ -42,7 +42,7 @@ pub struct Metrics {
     /// In the order of [`TASK_STATES`].
     tasks: [Gauge; 7],
     workers: Family<Label<String>, Gauge>,
-    /// What labels workers have had.
+    /// All labels of `workers` so far.
     backends: Mutex<BTreeSet<String>>,
     steps: Counter,
     grants: Counter,
@@ -70,7 +70,7 @@ impl Default for Metrics {
             failures: Family::default(),
             durable_writes: Histogram::new(WRITE_SECONDS),
         };
-        // Whatever may come is there from the beginning, as 0: a rate over what appears later misses its first.
+        // All series are present from the start as 0: a rate over one that appears later misses its first increment.
         for state in JOB_STATES {
             metrics.jobs.get_or_create(&[("state", state)]).set(0);
         }
@@ -82,36 +82,36 @@ impl Default for Metrics {
 }
 
 impl Metrics {
-    /// Has them told.
+    /// Registers them under `plat_`.
     pub fn register(&self, registry: &mut Registry) {
         let plat = registry.sub_registry_with_prefix("plat");
         plat.register("leader", "1 while this coordinator leads, 0 while it stands by", self.leader.clone());
         plat.register("epoch", "Epoch under which this coordinator leads or last led", self.epoch.clone());
-        plat.register("jobs", "Jobs that are remembered, by where they stand", self.jobs.clone());
+        plat.register("jobs", "Known jobs by state", self.jobs.clone());
         for ((state, help), tasks) in TASK_STATES.into_iter().zip(&self.tasks) {
             plat.register(format!("tasks_{state}"), help, tasks.clone());
         }
-        plat.register("workers", "Workers that are there, by what they compute with", self.workers.clone());
-        plat.register("scheduler_steps", "Events that the scheduler took in", self.steps.clone());
+        plat.register("workers", "Connected workers by backend", self.workers.clone());
+        plat.register("scheduler_steps", "Events that the scheduler processed", self.steps.clone());
         plat.register("grants", "Attempts granted to workers", self.grants.clone());
-        plat.register("duplicates", "Second attempts granted where the first was late", self.duplicates.clone());
-        plat.register("completions", "Results taken in", self.completions.clone());
-        plat.register("refusals", "News of attempts that held no lease any more, refused", self.refusals.clone());
-        plat.register("failures", "Attempts that ended without a result, by why", self.failures.clone());
-        let help = "What it takes until a batch of changes lies in the store";
+        plat.register("duplicates", "Speculative second attempts at late tasks", self.duplicates.clone());
+        plat.register("completions", "Results accepted", self.completions.clone());
+        plat.register("refusals", "Refused calls of attempts that no longer held their lease", self.refusals.clone());
+        plat.register("failures", "Attempts that ended without a result, by failure kind", self.failures.clone());
+        let help = "Duration of making a batch of changes durable";
         plat.register("durable_write_seconds", help, self.durable_writes.clone());
     }
 
-    /// It leads from now on, until the answer is dropped.
-    pub(crate) fn leads(&self, epoch: u64) -> Leads<'_> {
+    /// Marks the coordinator as leader until the returned value is dropped.
+    pub(crate) fn start_leading(&self, epoch: u64) -> LeaderMetrics<'_> {
         self.epoch.set(as_gauge(epoch));
         self.leader.set(1);
-        Leads { metrics: self, seen: Tally::default() }
+        LeaderMetrics { metrics: self, seen: Tally::default() }
     }
 
-    /// A batch was made durable.
-    pub(crate) fn wrote(&self, took: Duration) {
-        self.durable_writes.observe(took.as_secs_f64());
+    /// Records the duration of a durable write.
+    pub(crate) fn observe_write(&self, duration: Duration) {
+        self.durable_writes.observe(duration.as_secs_f64());
     }
 
     fn count_jobs(&self, scheduler: &Scheduler) {
@@ -128,10 +128,10 @@ impl Metrics {
             let counts = [waiting, ready, delayed, leased, done, failed, quarantined];
             tasks.iter_mut().zip(counts).for_each(|(sum, count)| *sum += u64::from(count));
         }
-        self.show_jobs(jobs, tasks);
+        self.set_jobs(jobs, tasks);
     }
 
-    fn show_jobs(&self, jobs: [u64; JOB_STATES.len()], tasks: [u64; TASK_STATES.len()]) {
+    fn set_jobs(&self, jobs: [u64; JOB_STATES.len()], tasks: [u64; TASK_STATES.len()]) {
         for (state, count) in JOB_STATES.into_iter().zip(jobs) {
             self.jobs.get_or_create(&[("state", state)]).set(as_gauge(count));
         }
@@ -140,11 +140,11 @@ impl Metrics {
         }
     }
 
-    fn count_workers<'a>(&self, there: impl Iterator<Item = (&'a str, usize)>) {
+    fn count_workers<'a>(&self, backends: impl Iterator<Item = (&'a str, usize)>) {
         let mut known = self.backends.lock().unwrap_or_else(PoisonError::into_inner);
-        // Of a backend that nobody has any more it is told that there are none.
+        // A backend whose workers have all left is exported as 0.
         let mut counts: BTreeMap<String, u64> = known.iter().map(|backend| (backend.clone(), 0)).collect();
-        for (backend, workers) in there {
+        for (backend, workers) in backends {
             let mut label = label_of(backend);
             if !known.contains(&label) && known.len() >= BACKENDS_LIMIT {
                 label = "other".into();
@@ -158,21 +158,21 @@ impl Metrics {
     }
 }
 
-/// A coordinator that leads, as its metrics see it.
-pub(crate) struct Leads<'a> {
+/// The metrics of a coordinator while it leads.
+pub(crate) struct LeaderMetrics<'a> {
     metrics: &'a Metrics,
-    /// What was told of this scheduler already.
+    /// The scheduler's counters at the last update.
     seen: Tally,
 }
 
-impl<'a> Leads<'a> {
-    /// Those of the coordinator.
+impl<'a> LeaderMetrics<'a> {
+    /// The coordinator's metrics.
     pub(crate) fn metrics(&self) -> &'a Metrics {
         self.metrics
     }
 
-    /// Takes in how things stand. What it takes goes by the number of jobs and backends.
-    pub(crate) fn measure(&mut self, scheduler: &Scheduler) {
+    /// Updates the metrics from the scheduler. Takes time proportional to the number of jobs and backends.
+    pub(crate) fn update(&mut self, scheduler: &Scheduler) {
         let (now, seen, metrics) = (scheduler.tally(), self.seen, self.metrics);
         metrics.steps.inc_by(now.steps - seen.steps);
         metrics.grants.inc_by(now.grants - seen.grants);
@@ -188,10 +188,10 @@ impl<'a> Leads<'a> {
     }
 }
 
-impl Drop for Leads<'_> {
+impl Drop for LeaderMetrics<'_> {
     fn drop(&mut self) {
         self.metrics.leader.set(0);
-        self.metrics.show_jobs(Default::default(), Default::default());
+        self.metrics.set_jobs(Default::default(), Default::default());
         self.metrics.count_workers(std::iter::empty());
     }
 }
@@ -200,7 +200,7 @@ fn as_gauge(count: u64) -> i64 {
     i64::try_from(count).unwrap_or(i64::MAX)
 }
 
-/// A worker's word as a label: short, and of characters that need no escape.
+/// A worker's text as a label: truncated, with characters that need escaping replaced.
 fn label_of(text: &str) -> String {
     let plain = |character: char| {
         let fine = character.is_ascii_alphanumeric() || ".-_+:/()".contains(character);
@@ -216,7 +216,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn labels_are_bounded_whatever_workers_say() {
+    fn labels_from_workers_are_bounded() {
         let metrics = Metrics::default();
         let names: Vec<String> = (0..100).map(|i| format!("gpu\"{i}\\{}", "x".repeat(100))).collect();
         metrics.count_workers(names.iter().map(|name| (name.as_str(), 3)));
@@ -230,23 +230,23 @@ mod tests {
     }
 
     #[test]
-    fn a_coordinator_that_leads_no_more_keeps_its_counters_alone() {
+    fn a_former_leader_keeps_only_its_counters() {
         let metrics = Metrics::default();
         let mut registry = Registry::default();
         metrics.register(&mut registry);
         let has = |line: &str| telemetry::metrics::text(&registry).unwrap().lines().any(|other| other == line);
         for epoch in [3, 5] {
             let mut scheduler = Scheduler::new(Settings::default(), epoch);
-            let mut leads = metrics.leads(epoch);
+            let mut leading = metrics.start_leading(epoch);
             let spec = JobSpec { backend: "b".into(), tasks: vec![TaskNode::default(); 4], ..JobSpec::default() };
             scheduler.step(1, Event::Submitted { job: JobId(1), spec });
             let offer = Offer { backend: "b".into(), ..Offer::default() };
             scheduler.step(1, Event::Joined { worker: WorkerId(0), offer });
-            leads.measure(&scheduler);
-            // The second grant shows that the first was lost.
+            leading.update(&scheduler);
+            // The second request reveals that the first grant was lost.
             scheduler.step(2, Event::LeaseRequested { worker: WorkerId(0) });
             scheduler.step(2, Event::LeaseRequested { worker: WorkerId(0) });
-            leads.measure(&scheduler);
+            leading.update(&scheduler);
             assert!(has("plat_leader 1") && has(&format!("plat_epoch {epoch}")));
             assert!(has("plat_tasks_ready 3") && has("plat_tasks_leased 1") && has("plat_workers{backend=\"b\"} 1"));
             assert!(has("plat_jobs{state=\"running\"} 1") && has("plat_jobs{state=\"paused\"} 0"));

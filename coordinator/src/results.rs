@@ -1,4 +1,4 @@
-//! What becomes of a job, as those who watch it see it.
+//! The results of a job, gathered from its watch stream.
 
 use proto::TaskState;
 use scene::ArtefactId;
@@ -13,30 +13,31 @@ pub enum LocalError {
     /// The work failed.
     #[error("{0}")]
     Failed(String),
-    /// It was stopped.
+    /// The job was cancelled.
     #[error("the job was cancelled")]
     Cancelled,
 }
 
-/// The last known state of each task of a job, as its news tell.
+/// The last known state of each task of a job.
 #[derive(Debug)]
 pub struct Results {
     tasks: Vec<proto::TaskChanged>,
 }
 
 impl Results {
-    /// Of a job of so many tasks, of which nothing is known yet.
+    /// A job of this many tasks, all waiting.
     pub fn new(tasks: u32) -> Self {
         Self { tasks: (0..tasks).map(|task| proto::TaskChanged { task, ..Default::default() }).collect() }
     }
 
-    /// Takes in a task's news.
+    /// Applies a task's update.
     ///
     /// # Errors
-    /// News of a task that the job does not have.
-    pub fn note(&mut self, changed: proto::TaskChanged) -> Result<(), LocalError> {
+    /// An update of a task that the job does not have.
+    pub fn update(&mut self, changed: proto::TaskChanged) -> Result<(), LocalError> {
         let task = changed.task;
-        let unknown = || LocalError::Failed(format!("news of task {task}, which the plan does not have"));
+        let unknown =
+            || LocalError::Failed(format!("the coordinator reports task {task}, which the plan does not have"));
         *self.tasks.get_mut(task as usize).ok_or_else(unknown)? = changed;
         Ok(())
     }
@@ -54,7 +55,7 @@ impl Results {
         self.tasks.iter().map(|task| proto::artefact_id(&task.artefact).map_err(of_status)).collect()
     }
 
-    /// The first task that failed, why, and how many others were not run because of it.
+    /// The first task that failed, its error, and how many others were not run because of it.
     pub fn failure(&self) -> LocalError {
         let count = |wanted: TaskState| self.tasks.iter().filter(|task| task.state() == wanted).count();
         let first = self.tasks.iter().find(|task| matches!(task.state(), TaskState::Failed | TaskState::Quarantined));
@@ -68,13 +69,13 @@ impl Results {
             line += &format!("; {others} more failed");
         }
         if blocked > 0 {
-            line += &format!("; {blocked} that depend on such were not started");
+            line += &format!("; {blocked} dependent tasks were not started");
         }
         if first.state() == TaskState::Failed { LocalError::Input(line) } else { LocalError::Failed(line) }
     }
 }
 
-/// A refusal is the input's fault, anything else the cluster's.
+/// Classifies an error: a refused call is the input's fault, anything else the cluster's.
 pub fn of_status(status: Status) -> LocalError {
     let line = proto::explain(&status);
     match status.code() {

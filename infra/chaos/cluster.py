@@ -1,5 +1,5 @@
-"""The cluster of docker-compose.yml as infra/chaos/run.py breaks it: starts it on a store of its own for each case, submits, looks,
-and reaches below the store. Takes root, as only the host can kill -9 what docker is to start again."""
+"""Controls the cluster of docker-compose.yml for infra/chaos/run.py: starts it on a new store for each case, submits jobs, reads their
+status, and changes objects below the store's API. Requires root: only a kill -9 from the host makes docker restart a container."""
 
 import json
 import os
@@ -10,23 +10,23 @@ from pathlib import Path
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 PROJECT = "plat-chaos"
-# Where Ceph's S3 gateway keeps the bytes of objects.
+# The pool in which Ceph's S3 gateway stores objects.
 POOL = "default.rgw.buckets.data"
 USER = 10001
 
 
-class Trouble(Exception):
-    """A step of the rehearsal itself failed, not what is rehearsed."""
+class StepFailed(Exception):
+    """A step of the test itself failed, not the behaviour under test."""
 
 
 def run(*words, check=True, env=None, data=None, timeout=180):
-    """A command's standard output, as bytes."""
+    """Runs a command and returns its standard output as bytes."""
     try:
         done = subprocess.run(words, input=data, capture_output=True, env=env, timeout=timeout)
     except subprocess.TimeoutExpired:
-        raise Trouble(f"{' '.join(words)}: no end after {timeout} s") from None
+        raise StepFailed(f"{' '.join(words)}: timed out after {timeout} s") from None
     if check and done.returncode != 0:
-        raise Trouble(f"{' '.join(words)}: {done.returncode}: {done.stderr.decode(errors='replace')[-2000:]}")
+        raise StepFailed(f"{' '.join(words)}: {done.returncode}: {done.stderr.decode(errors='replace')[-2000:]}")
     return done.stdout
 
 
@@ -35,7 +35,7 @@ def docker(*words, **options):
 
 
 class Cluster:
-    """One at a time: it has one name."""
+    """The cluster. Only one can run at a time, as its name is fixed."""
 
     def __init__(self, capture, scratch, workers, lease_seconds, checkpoint_seconds):
         self.models = scratch / "models"
@@ -53,7 +53,7 @@ class Cluster:
         return run(*words, env=self.env, **options)
 
     def start(self, store):
-        """Everything anew on this store, but for the server of objects, which may run on."""
+        """Restarts everything on this store, except the object server if it already runs."""
         self.env["PLAT_STORE"] = store
         self.compose("rm", "--stop", "--force", "worker", "coordinator", "standby", "certificates")
         self.compose("up", "--detach", "--no-build", "--wait", "coordinator", "standby", "worker")
@@ -65,7 +65,7 @@ class Cluster:
         return self.compose("ps", "--quiet", "--status", "running", service).decode().split()
 
     def client(self, *words):
-        """A client's process, under way."""
+        """Starts a client process."""
         files = ["-f", str(REPOSITORY / "docker-compose.yml"), "-f", str(REPOSITORY / "infra/chaos/chaos.yml")]
         words = ["docker", "compose", "--project-name", PROJECT, *files, "run", "--rm", "--no-TTY", "--no-deps", "--quiet-pull", *words]
         return subprocess.Popen(words, env=self.env, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
@@ -74,12 +74,12 @@ class Cluster:
         return self.client("client", "submit", "/capture", "--wait", "--out", f"/out/{out}", "--json", *plan)
 
     def model(self, out):
-        """The merged model's bytes, or nothing."""
+        """The merged model's bytes; None if there is none."""
         path = self.models / out / "merged.ply"
         return path.read_bytes() if path.is_file() else None
 
     def ask(self, *words, within=30):
-        """A client's answer, asked from beside a coordinator until there is one."""
+        """Runs a client command in a coordinator's container until it succeeds; returns its answer."""
         until = time.monotonic() + within
         while True:
             for service in ("coordinator", "standby"):
@@ -87,10 +87,10 @@ class Cluster:
                     words_there = ["exec", container, "plat", "--config", "/cluster/plat.toml", *words, "--json", "--quiet"]
                     try:
                         return json.loads(docker(*words_there, timeout=20))
-                    except (Trouble, ValueError) as error:
+                    except (StepFailed, ValueError) as error:
                         last = error
             if time.monotonic() > until:
-                raise Trouble(f"no answer to plat {' '.join(words)}: {last}")
+                raise StepFailed(f"no answer to plat {' '.join(words)}: {last}")
             time.sleep(0.1)
 
     def leads(self, container):
@@ -103,7 +103,7 @@ class Cluster:
             return False
 
     def coordinators(self, within=30):
-        """The one that leads, and the other."""
+        """The containers of the leader and of the standby."""
         until = time.monotonic() + within
         while time.monotonic() < until:
             both = self.containers("coordinator") + self.containers("standby")
@@ -111,10 +111,10 @@ class Cluster:
                 if self.leads(container) and len(both) == 2:
                     return container, next(other for other in both if other != container)
             time.sleep(0.2)
-        raise Trouble("no coordinator leads, or one of the two is away")
+        raise StepFailed("no coordinator leads, or one of the two is not running")
 
     def worker_of(self, task):
-        """The container of the worker that has a task: a worker is called by its host's name, which is the container's."""
+        """The container of a task's worker. A worker's name starts with its host name, which is the container's id."""
         found = [of for of in self.containers("worker") if task["worker"].startswith(of[:12])]
         return found[0] if found else None
 
@@ -127,22 +127,22 @@ class Cluster:
         return docker("exec", "--interactive", store, "rados", "--pool", POOL, *words, **options)
 
     def objects(self, folder):
-        """Objects of the store's folder, as they are called below it."""
+        """The RADOS names of the objects in a folder of the store."""
         prefix = self.env["PLAT_STORE"].split("/", 3)[3]
         return [name for name in self.rados("ls").decode().split("\n") if f"_{prefix}/{folder}" in name]
 
 
 def kill(container):
-    """kill -9, after which docker starts it again as its policy says."""
+    """kill -9, after which docker restarts the container by its policy."""
     os.kill(int(docker("inspect", "--format", "{{.State.Pid}}", container)), signal.SIGKILL)
 
 
-def cut(container):
-    """Off the cluster's network."""
+def disconnect(container):
+    """Disconnects a container from the cluster's network."""
     docker("network", "disconnect", f"{PROJECT}_cluster", container)
 
 
-def mend(container):
-    """Back on it, under the name it had."""
+def reconnect(container):
+    """Reconnects a container under its former name."""
     name = docker("inspect", "--format", "{{.Config.Hostname}}", container).decode().strip()
     docker("network", "connect", "--alias", name, f"{PROJECT}_cluster", container)

@@ -1,11 +1,10 @@
 #!/usr/bin/env python3
-"""Breaks a cluster in every way that clusters break while it works, and holds its model to the bytes that one undisturbed process makes
-of the same plan.
+"""Injects faults into a running cluster and compares its model with the bytes that a single undisturbed process makes of the same plan.
 
     infra/chaos/run.py --capture FOLDER [--seeds 0..20] [--cases kill-worker,corrupt] [--out LINES.jsonl]
 
-The images must be there (.ci/chaos.sh makes them). When a case strikes, whom, and for how long follows from its seed. One line a case;
-exit code 1 if a model differs, or does not come to be.
+The images must exist (.ci/chaos.sh builds them). A case's seed determines when it strikes, its target and its duration. Prints one line
+per case; exit code 1 if a model differs or a job fails.
 """
 
 import argparse
@@ -19,69 +18,69 @@ import time
 from datetime import datetime
 from pathlib import Path
 
-from cluster import PROJECT, USER, Cluster, Trouble, cut, docker, kill, mend
+from cluster import PROJECT, USER, Cluster, StepFailed, disconnect, docker, kill, reconnect
 
 PLAN = ["--blocks", "tree", "--levels", "1", "--steps", "900", "--downscale", "4", "--backend", "cpu"]
 LEASE_SECONDS = 2
 CHECKPOINT_SECONDS = 1
-# A job that takes longer than this hangs.
-PATIENCE = 180
+# A job that takes longer than this counts as hung, seconds.
+JOB_TIMEOUT = 180
 
 
 def calm(cluster, job, chance, about):
-    """Nothing happens."""
+    """No fault."""
 
 
 def kill_worker(cluster, job, chance, about):
-    worker = at_work(cluster, chance)
+    worker = busy_worker(cluster, chance)
     kill(worker)
-    about["lost_seconds_at_most"] = unsaved(cluster, time.time())
+    about["lost_seconds_at_most"] = unsaved_seconds(cluster, time.time())
 
 
 def kill_leader(cluster, job, chance, about):
     leader, other = cluster.coordinators()
     kill(leader)
-    about["takeover_seconds"] = until_led(cluster, [other, leader])
+    about["takeover_seconds"] = takeover_seconds(cluster, [other, leader])
 
 
 def cut_worker(cluster, job, chance, about):
-    worker = at_work(cluster, chance)
-    cut(worker)
-    time.sleep(away(chance))
-    mend(worker)
+    worker = busy_worker(cluster, chance)
+    disconnect(worker)
+    time.sleep(outage_seconds(chance))
+    reconnect(worker)
 
 
 def cut_leader(cluster, job, chance, about):
     leader, other = cluster.coordinators()
-    cut(leader)
-    about["takeover_seconds"] = until_led(cluster, [other])
-    mend(leader)
+    disconnect(leader)
+    about["takeover_seconds"] = takeover_seconds(cluster, [other])
+    reconnect(leader)
 
 
 def pause_worker(cluster, job, chance, about):
-    worker = at_work(cluster, chance)
+    worker = busy_worker(cluster, chance)
     docker("pause", worker)
-    time.sleep(away(chance))
+    time.sleep(outage_seconds(chance))
     docker("unpause", worker)
 
 
 def pause_leader(cluster, job, chance, about):
     leader, other = cluster.coordinators()
     docker("pause", leader)
-    about["takeover_seconds"] = until_led(cluster, [other])
+    about["takeover_seconds"] = takeover_seconds(cluster, [other])
     docker("unpause", leader)
 
 
 def fill_disk(cluster, job, chance, about):
-    """The store's disk is full for a while."""
-    filled = f"cat /dev/zero > /shared/filler; sleep {away(chance):.1f}; rm /shared/filler"
+    """Fills the store's disk for a while."""
+    filled = f"cat /dev/zero > /shared/filler; sleep {outage_seconds(chance):.1f}; rm /shared/filler"
     image = cluster.env.get("PLAT_IMAGE", "plat:latest")
     volume = f"{PROJECT}_shared:/shared"
     docker("run", "--rm", "--network", "none", "--user", str(USER), "--volume", volume, "--entrypoint", "sh", image, "-c", filled)
 
 
 def corrupt(cluster, job, chance, about):
-    """One byte of a result that all later tasks start from, on the store's disk, while the job is paused."""
+    """Flips a bit of the root's result on the store's disk while the job is paused. All later tasks start from that result."""
     record = cluster.objects("names/results/")[0]
     artefact = cluster.rados("get", record, "-").hex()
     [damaged] = cluster.objects(f"artefacts/{artefact[:2]}/{artefact}")
@@ -105,34 +104,34 @@ CASES = {
 }
 
 
-def away(chance):
-    """Seconds, longer than a lease."""
+def outage_seconds(chance):
+    """Duration of an outage: longer than a lease."""
     return LEASE_SECONDS + chance.uniform(0.5, 4)
 
 
-def at_work(cluster, chance):
-    """A worker that has a task in hand."""
+def busy_worker(cluster, chance):
+    """A worker that executes a task."""
     until = time.monotonic() + 20
     while time.monotonic() < until:
         tasks = cluster.ask("status", "1")["running"]
         workers = [worker for worker in map(cluster.worker_of, tasks) if worker]
         if workers:
             return chance.choice(workers)
-    raise Trouble("no worker has a task")
+    raise StepFailed("no worker has a task")
 
 
-def until_led(cluster, candidates):
-    """Seconds until one of these leads."""
+def takeover_seconds(cluster, candidates):
+    """Waits until one of these leads; returns the seconds that took."""
     began = time.monotonic()
     while time.monotonic() - began < 60:
         if any(cluster.leads(container) for container in candidates):
             return round(time.monotonic() - began, 2)
         time.sleep(0.1)
-    raise Trouble("nobody took over within a minute")
+    raise StepFailed("no coordinator took over within a minute")
 
 
-def unsaved(cluster, now):
-    """Seconds of work that a checkpoint does not hold: of the tasks under way, the one that was saved the longest ago."""
+def unsaved_seconds(cluster, now):
+    """Age of the oldest checkpoint of the running tasks, seconds."""
     ages = [0.0]
     for name in cluster.objects("names/checkpoints/"):
         said = cluster.rados("stat", name, check=False).decode()
@@ -142,32 +141,32 @@ def unsaved(cluster, now):
 
 
 def wait_for(cluster, job, done):
-    """Until so many tasks are done, and the job is not."""
+    """Waits until this many tasks are done and the job still runs; returns the status."""
     while True:
         if job.poll() is not None:
-            raise Trouble(f"the job was over before it was struck: {job.stderr.read().decode()[-500:]}")
+            raise StepFailed(f"the job ended before the fault: {job.stderr.read().decode()[-500:]}")
         try:
             status = cluster.ask("status", "1", within=1)
-        except Trouble:
+        except StepFailed:
             continue
         if status["done"] >= done and (status["running"] or status["state"] == "paused"):
             return status
 
 
 def finish(job, about):
-    """Its exit code, and what it said last if that is not 0."""
+    """Waits for a client; returns its exit code, and records its last line of stderr if that is not 0."""
     try:
-        _, said = job.communicate(timeout=PATIENCE)
+        _, stderr = job.communicate(timeout=JOB_TIMEOUT)
     except subprocess.TimeoutExpired:
         job.terminate()
-        said = b"it hangs"
+        stderr = b"timed out"
     if job.returncode != 0:
-        about["said"] = said.decode(errors="replace").strip().split("\n")[-1]
+        about["said"] = stderr.decode(errors="replace").strip().split("\n")[-1]
     return job.returncode
 
 
-def rehearse(cluster, case, seed, wanted):
-    """One case: a line of results."""
+def run_case(cluster, case, seed, wanted):
+    """Runs one case; returns its line of results."""
     chance = random.Random(f"{case} {seed}")
     about = {"case": case, "seed": seed}
     out = f"{case}-{seed}"
@@ -194,7 +193,7 @@ def rehearse(cluster, case, seed, wanted):
 
 
 def recover(cluster, out, about):
-    """What it takes until the job succeeds: the same job again, or the damaged object deleted before."""
+    """The remedy after which the job succeeds: submitting it again, or deleting the damaged object first; None if neither helps."""
     for remedy in ("submitted again", "object deleted, submitted again"):
         if remedy.startswith("object"):
             cluster.rados("rm", about["damaged"])
@@ -205,8 +204,8 @@ def recover(cluster, out, about):
 
 def arguments():
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
-    parser.add_argument("--seeds", default="0..1", help="from..to, the last not among them")
-    parser.add_argument("--cases", default=",".join(CASES), help="some of " + ", ".join(CASES))
+    parser.add_argument("--seeds", default="0..1", help="from..to, without the last one")
+    parser.add_argument("--cases", default=",".join(CASES), help="a subset of " + ", ".join(CASES))
     parser.add_argument("--capture", type=Path, required=True, help="a folder of photos, as plat train takes it")
     parser.add_argument("--out", type=Path, help="append a line of JSON for each case")
     parser.add_argument("--workers", type=int, default=2)
@@ -218,11 +217,11 @@ def arguments():
     try:
         chosen.seeds = range(*map(int, chosen.seeds.split("..")))
     except (ValueError, TypeError):
-        parser.error("--seeds: give them as 0..20")
+        parser.error("--seeds: give a range as 0..20")
     return chosen
 
 
-def note(line, out):
+def report(line, out):
     text = ", ".join(f"{name} {value}" for name, value in line.items() if name not in ("case", "seed", "identical"))
     verdict = {True: "identical", False: "DIFFERENT", None: ""}[line.get("identical")]
     print(f"{line['case']:<13} seed {line['seed']:<3} {verdict}  {text}", flush=True)
@@ -244,26 +243,26 @@ def main():
             cluster.end()
             began = time.monotonic()
             cluster.start("s3://plat/start")
-            note(about | {"seconds": round(time.monotonic() - began, 1)}, None)
+            report(about | {"seconds": round(time.monotonic() - began, 1)}, None)
             about = {"case": "one process", "seed": "-"}
             began = time.monotonic()
             if not alone("train", "/capture", "--out", "/out/alone", "--workers", "1", "--threads", "2", *PLAN):
-                raise Trouble(about["said"])
-            note(about | {"seconds": round(time.monotonic() - began, 1)}, None)
+                raise StepFailed(about["said"])
+            report(about | {"seconds": round(time.monotonic() - began, 1)}, None)
             wanted = hashlib.sha256(cluster.model("alone")).digest()
             for seed in chosen.seeds:
                 for case in chosen.cases:
                     try:
-                        line = rehearse(cluster, case, seed, wanted)
-                    except Trouble as trouble:
-                        line = {"case": case, "seed": seed, "identical": False, "said": str(trouble)}
-                    note(line, chosen.out)
+                        line = run_case(cluster, case, seed, wanted)
+                    except StepFailed as error:
+                        line = {"case": case, "seed": seed, "identical": False, "said": str(error)}
+                    report(line, chosen.out)
                     if not line["identical"]:
                         failures += 1
                         print(cluster.logs(), file=sys.stderr)
-        except Trouble as trouble:
+        except StepFailed as error:
             print(cluster.logs(), file=sys.stderr)
-            print(f"{about['case']}: {trouble}", file=sys.stderr)
+            print(f"{about['case']}: {error}", file=sys.stderr)
             failures += 1
         finally:
             if not chosen.keep:

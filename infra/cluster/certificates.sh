@@ -1,10 +1,10 @@
 #!/bin/sh
-# What a cluster's parts prove themselves by, made once and then left alone until a month before it ends:
-#     certificates.sh NAME...      the names under which coordinators are reached
-# $SECRETS/coordinator.pem, .key   the coordinators' certificate (for them alone)
-# $SHARED/ca.pem, token            what workers and clients trust and show
-# $SHARED/plat.toml                the options of whoever asks for something: plat --config $SHARED/plat.toml jobs
-# The authority's key is thrown away once it has signed: there is nothing to steal, and a new certificate is a new authority.
+# Creates a cluster's certificates and token once, and renews them a month before they expire:
+#     certificates.sh NAME...      the host names of the coordinators
+# $SECRETS/coordinator.pem, .key   the coordinators' certificate and key (for them only)
+# $SHARED/ca.pem, token            the authority that workers and clients trust, and their token
+# $SHARED/plat.toml                the clients' options: plat --config $SHARED/plat.toml jobs
+# The authority's key is deleted after signing, so that it cannot be stolen. A new certificate therefore has a new authority.
 set -eu
 umask 077
 : "${SECRETS:=/secrets}" "${SHARED:=/cluster}" "${PLAT_STORE:?the URL of the store, under which all find who leads}"

@@ -5,9 +5,9 @@
 #     plat --config FOLDER/plat.toml submit CAPTURE --wait --out MODEL
 #     scancel --name plat-worker,plat-coordinator --user "$USER"
 #
-# FOLDER is the cluster's: on a file system that all nodes have, readable by you alone. It holds what the parts prove themselves by and,
-# without --store, all photos, results and state. Options after -- are the workers' (--partition gpu --gres gpu:1 --array-limit ...).
-# Where workers run, and when they are preempted and started again, is Slurm's business.
+# FOLDER is on a file system that all nodes share, readable by you alone. It holds certificates and token and, without --store, all
+# photos, results and state. Options after -- apply to the workers (--partition gpu --gres gpu:1 --array-limit ...). Slurm places the
+# workers, preempts them and restarts them.
 set -euo pipefail
 here=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)
 usage() { sed -n '2,/^set/{/^set/d;s/^# \{0,1\}//p}' "${BASH_SOURCE[0]}" >&2; exit 2; }
@@ -31,10 +31,10 @@ home=$(cd "$home" && pwd)
 
 plat=$(readlink -f "$plat")
 export PLAT_HOME="$home" PLAT_STORE="${store:-file://$home/store}" PLAT_PROGRAM="$plat"
-# The coordinator may come to any node, and again to another one.
+# The coordinator may run on any node, and move to another one.
 sinfo --noheader --Node --format %N | sort -u | SECRETS="$home/secrets" SHARED="$home" xargs "$here/../cluster/certificates.sh"
 coordinator=$(sbatch --parsable --output "$home/coordinator-%j.log" "$here/coordinator.sbatch")
-# A worker waits for its coordinator, whenever that comes; it must not come before, as it would only hold its node.
+# A worker would wait for its coordinator, but starting it earlier would only occupy its node.
 array=$(sbatch --parsable --output "$home/worker-%A-%a.log" --dependency "after:$coordinator" --array "1-$workers" "$@" "$here/worker.sbatch")
 echo "coordinator $coordinator, workers $array"
 echo "plat --config $home/plat.toml jobs"

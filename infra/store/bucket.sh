@@ -1,8 +1,8 @@
 #!/bin/bash
-# Makes the bucket, if it is not there:    bucket.sh NAME        at AWS_ENDPOINT_URL with AWS_ACCESS_KEY_ID and its secret.
+# Creates a bucket if it does not exist:    bucket.sh NAME        at AWS_ENDPOINT_URL with AWS_ACCESS_KEY_ID and its secret.
 set -euo pipefail
 path="/${1:?the name of a bucket}"
-# The older of S3's signatures, which a shell can make.
+# S3's signature version 2, which a shell script can compute.
 date=$(LC_ALL=C date --utc --rfc-email)
 signature=$(printf 'PUT\n\n\n%s\n%s' "$date" "$path" | openssl dgst -sha1 -hmac "$AWS_SECRET_ACCESS_KEY" -binary | base64)
 code=$(curl --silent --show-error --retry 5 --retry-connrefused --output /tmp/said --write-out '%{http_code}' --request PUT \

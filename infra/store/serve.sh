@@ -1,7 +1,7 @@
 #!/bin/bash
-# Serves S3 on port 7480 until one of its three parts ends; then the container ends, and whoever started it starts it anew.
+# Serves S3 on port 7480. If one of its three processes ends, the container ends and is restarted by its policy.
 #     STORE_KEY, STORE_SECRET   the one user's keys
-# The first start makes the disk. One that was cut short makes it again.
+# The first start creates the disk. After an interrupted first start it is created again.
 set -euo pipefail
 : "${STORE_KEY:?an access key, three characters or more}" "${STORE_SECRET:?its secret, eight characters or more}"
 home=/var/lib/store
@@ -19,7 +19,7 @@ make_disk() {
     local fsid
     fsid=$(awk '$1 == "fsid" { print $3 }' /etc/ceph/ceph.conf)
     monmaptool --create --clobber --fsid "$fsid" --addv a '[v2:127.0.0.1:3300,v1:127.0.0.1:6789]' /tmp/monmap >&2
-    # With the OSD in the first map nobody has to ask for its number, which would take Python.
+    # With the OSD in the initial map no id has to be allocated for it, which would require Python.
     osdmaptool --clobber --createsimple 1 /tmp/osdmap >&2
     ceph-mon --mkfs --id a --fsid "$fsid" --monmap /tmp/monmap --osdmap /tmp/osdmap --keyring "$home/keyring"
     ceph-osd --mkfs --id 0 --fsid "$fsid" --monmap /tmp/monmap --osd-uuid 00000000-0000-4000-8000-000000000001
@@ -38,9 +38,9 @@ ready() {
 }
 ready &
 ready=$!
-# A part that ends is not waited for, nor what waits for it.
+# Ends without waiting for the other processes.
 wait -n -p ended || true
 [[ $ended == "$ready" ]] || { echo "serve.sh: a part of the store ended; what it said is above" >&2; exit 1; }
 radosgw --foreground --name client.admin &
-# A signal ends the wait, too, and the trap does the rest.
+# A signal also ends the wait; the trap then stops the processes.
 wait -n

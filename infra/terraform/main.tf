@@ -1,4 +1,4 @@
-# A bucket for clusters of plat, and one role for each kind of process: what it may do there is what it does (module policies).
+# A bucket for clusters of plat, and one role per kind of process with the permissions that it needs (module policies).
 #
 #     module "plat" {
 #       source            = ".../infra/terraform"
@@ -43,7 +43,7 @@ resource "aws_s3_bucket_server_side_encryption_configuration" "this" {
   }
 }
 
-# Artefacts never expire by age: a job may need what an old one made. `plat forget` deletes what nothing needs.
+# Artefacts never expire by age, as a job may use an older job's results. `plat forget` deletes unreferenced ones.
 resource "aws_s3_bucket_lifecycle_configuration" "this" {
   bucket = aws_s3_bucket.this.id
   rule {

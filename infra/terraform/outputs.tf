@@ -1,5 +1,5 @@
 output "store" {
-  description = "What --store and --coordinator take."
+  description = "Value of --store and --coordinator."
   value       = "s3://${aws_s3_bucket.this.id}/${var.prefix}"
 }
 

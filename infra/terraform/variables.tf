@@ -1,27 +1,27 @@
 variable "bucket" {
-  description = "Name of the bucket that clusters keep photos, results and their state in."
+  description = "Name of the bucket of the clusters' photos, results and state."
   type        = string
 }
 
 variable "prefix" {
-  description = "Where one cluster keeps its objects in the bucket: its store is s3://bucket/prefix."
+  description = "Prefix of one cluster's objects in the bucket: its store is s3://bucket/prefix."
   type        = string
   default     = "cluster"
 }
 
 variable "oidc_provider_arn" {
-  description = "IAM's name of the Kubernetes cluster's OpenID Connect provider, by which service accounts become roles."
+  description = "IAM's name of the Kubernetes cluster's OpenID Connect provider, by which service accounts assume roles."
   type        = string
 }
 
 variable "namespace" {
-  description = "Kubernetes namespace of the cluster's service accounts, which are called as the roles."
+  description = "Kubernetes namespace of the cluster's service accounts, which have the roles' names."
   type        = string
   default     = "plat"
 }
 
 variable "tags" {
-  description = "Put on everything."
+  description = "Tags of all resources."
   type        = map(string)
   default     = {}
 }

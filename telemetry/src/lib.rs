@@ -1,4 +1,4 @@
-//! What happens, for people and their tools: lines of a log, one trace from a submitted job to its artefacts, metrics.
+//! Logs, traces (one from a submitted job to its artefacts) and Prometheus metrics.
 //!
 //! ```text
 //! events ──filter (RUST_LOG)──▶ lines on stderr, as text or JSON
@@ -6,8 +6,8 @@
 //! atomics ◀──GET /metrics── Prometheus                              only where --metrics names an address
 //! ```
 //!
-//! Architecture invariant: whoever is watched never waits for whoever watches. A queue that is full loses spans, a collector that is
-//! away costs one line, a scrape reads atomics. No result depends on anything here.
+//! Architecture invariant: the work never waits for telemetry. A full queue drops spans, an unreachable collector costs one log line, a
+//! scrape reads atomics. No result depends on telemetry.
 
 mod lines;
 pub mod metrics;
@@ -24,41 +24,41 @@ use tracing_subscriber::{EnvFilter, Registry, fmt};
 
 pub use trace::{HEADER, TraceParent, traced};
 
-/// Whose spans are exported.
+/// The crates whose spans are exported.
 const TRACED: [&str; 4] = ["plat", "coordinator", "store", "worker"];
 
-/// What a line of the log looks like.
+/// The format of log lines.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Format {
-    /// For people.
+    /// Plain text, for people.
     #[default]
     Text,
-    /// An object a line, for tools: `timestamp`, `level`, `target`, `message`, and the fields of the event and of the spans around it.
+    /// One JSON object per line, for tools: `timestamp`, `level`, `target`, `message`, and the fields of the event and of the spans around it.
     Json,
 }
 
-/// What a program writes to stderr.
+/// What a process logs to stderr.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Logs {
-    /// What a line looks like.
+    /// The format of the lines.
     pub format: Format,
-    /// What is written where `RUST_LOG` does not say.
+    /// The filter if `RUST_LOG` is not set.
     pub filter: &'static str,
 }
 
-/// What was started, until [`finish`](Telemetry::finish).
-#[must_use = "what is not finished loses its last spans"]
+/// Running telemetry, until [`finish`](Telemetry::finish).
+#[must_use = "without `finish` the last spans are lost"]
 pub struct Telemetry {
     traces: Option<otlp::Traces>,
 }
 
-/// Begins to write logs, and to export the spans of `service` where the environment asks for it. Once in a process.
+/// Starts logging, and exports the spans of `service` if the environment names a collector. Called once per process.
 ///
 /// # Errors
-/// Variables of the environment that make no sense.
+/// Invalid environment variables.
 pub fn start(service: &str, logs: Option<Logs>) -> Result<Telemetry, BadInput> {
     let traces = otlp::Traces::from_environment(service)?;
-    // That traces go nowhere is said in any case.
+    // Failing exports are logged even if nothing else is.
     let logs = logs.or(traces.is_some().then_some(Logs { format: Format::Text, filter: "off,telemetry=warn" }));
     let lines = logs.map(|logs| {
         let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(logs.filter));
@@ -76,14 +76,14 @@ pub fn start(service: &str, logs: Option<Logs>) -> Result<Telemetry, BadInput> {
         traces.layer().with_filter(ours)
     });
     if lines.is_some() || spans.is_some() {
-        // Another one is there only in tests, which see theirs.
+        // Only tests have a subscriber already, and keep it.
         let _ = tracing_subscriber::registry().with(lines).with(spans).try_init();
     }
     Ok(Telemetry { traces })
 }
 
 impl Telemetry {
-    /// Exports what waits for it, for as long as that takes a collector that is there.
+    /// Exports the queued spans, within a time limit.
     pub fn finish(self) {
         if let Some(traces) = self.traces {
             traces.finish();

@@ -1,5 +1,5 @@
-//! Lines of JSON, flat: a line's own fields beside those of the spans around it, so that `job`, `task` and `attempt` are
-//! always found in the same place.
+//! Writes events as flat JSON lines: an event's own fields beside those of its spans, so that `job`, `task` and `attempt` are always at the
+//! same place.
 
 use std::fmt;
 use std::io::Write;
@@ -14,7 +14,7 @@ use tracing_subscriber::fmt::time::{FormatTime, SystemTime};
 use tracing_subscriber::layer::{Context, Layer};
 use tracing_subscriber::registry::LookupSpan;
 
-/// Writes each event as a line.
+/// A layer that writes each event as a JSON line.
 pub(crate) struct JsonLines<W> {
     writer: W,
 }
@@ -58,22 +58,22 @@ where
             }
         }
         event.record(&mut line);
-        // Last, so that no field goes by their names.
+        // Added last, so that no field overrides them.
         let mut timestamp = String::new();
         let _ = SystemTime.format_time(&mut Writer::new(&mut timestamp));
         let about = event.metadata();
         let own = [("timestamp", timestamp), ("level", about.level().to_string()), ("target", about.target().into())];
         line.0.extend(own.map(|(name, value)| (name.into(), value.into())));
-        // Keys are strings, so there is nothing that could fail.
+        // Cannot fail, as all keys are strings.
         let text = Value::Object(line.0).to_string() + "\n";
-        // A log that cannot be written is no reason to stop.
+        // A failing log does not stop the program.
         let _ = self.writer.make_writer_for(about).write_all(text.as_bytes());
     }
 }
 
 impl Fields {
     fn put(&mut self, field: &Field, value: impl Into<Value>) {
-        // What is meant for the exporter of spans alone.
+        // Fields of the span exporter only.
         if !field.name().starts_with("otel.") {
             self.0.insert(field.name().into(), value.into());
         }
@@ -115,9 +115,9 @@ mod tests {
     use super::*;
 
     #[derive(Clone, Default)]
-    struct Kept(Arc<Mutex<Vec<u8>>>);
+    struct Buffer(Arc<Mutex<Vec<u8>>>);
 
-    impl Write for Kept {
+    impl Write for Buffer {
         fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
             self.0.lock().unwrap().write(bytes)
         }
@@ -128,9 +128,9 @@ mod tests {
     }
 
     #[test]
-    fn a_line_carries_the_fields_of_its_spans() {
-        let kept = Kept::default();
-        let writer = kept.clone();
+    fn a_line_has_the_fields_of_its_spans() {
+        let buffer = Buffer::default();
+        let writer = buffer.clone();
         let subscriber = tracing_subscriber::registry().with(JsonLines::new(move || writer.clone()));
         tracing::subscriber::with_default(subscriber, || {
             let task = tracing::info_span!("task", job = 3, task = 7, outcome = tracing::field::Empty, otel.kind = "x");
@@ -142,7 +142,7 @@ mod tests {
             task.in_scope(|| tracing::info!(level = "high", share = 0.5, "over"));
             tracing::info!("outside");
         });
-        let text = String::from_utf8(kept.0.lock().unwrap().clone()).unwrap();
+        let text = String::from_utf8(buffer.0.lock().unwrap().clone()).unwrap();
         let lines: Vec<Value> = text.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
         let [warned, over, outside] = &lines[..] else { panic!("{text}") };
         assert_eq!((&warned["job"], &warned["task"], &warned["steps"]), (&3.into(), &7.into(), &4.into()));

@@ -1,5 +1,5 @@
-//! Metrics for Prometheus, at `GET /metrics` of an address of their own. They hold numbers, and labels that come from lists in this
-//! program, so that whoever may reach the address may read them.
+//! Serves Prometheus metrics at `GET /metrics` on an address of its own, without authentication: metrics contain only numbers and labels
+//! from bounded sets, no secrets.
 
 use std::convert::Infallible;
 use std::net::SocketAddr;
@@ -20,27 +20,27 @@ use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::Semaphore;
 use tokio_util::sync::CancellationToken;
 
-/// What is answered at once; further ones wait at the door.
+/// Concurrent connections; further ones wait to be accepted.
 const CONNECTIONS_LIMIT: usize = 16;
-/// Whoever has not asked by then is sent away.
+/// Time limit of receiving a request's headers.
 const HEADER_TIMEOUT: Duration = Duration::from_secs(5);
-/// Nor is anyone waited for longer than this.
+/// Time limit of a connection.
 const CONNECTION_TIMEOUT: Duration = Duration::from_secs(20);
-/// As OpenMetrics names its text.
+/// The content type of OpenMetrics text.
 const OPEN_METRICS: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
 
-/// A place to be asked at.
+/// Binds the metrics address.
 ///
 /// # Errors
-/// An address that cannot be had.
+/// The address cannot be bound.
 pub async fn listen(address: SocketAddr) -> Result<TcpListener, BadInput> {
     TcpListener::bind(address).await.map_err(|error| {
-        let advice = "choose another address, or stop what has it";
+        let advice = "choose another address, or stop the process that uses it";
         BadInput::new(format!("--metrics {address}"), format!("cannot be listened on ({error})"), advice)
     })
 }
 
-/// Answers until it is stopped.
+/// Serves scrapes until `stop` is cancelled.
 pub async fn serve(listener: TcpListener, registry: Registry, stop: CancellationToken) {
     let registry = Arc::new(registry);
     let slots = Arc::new(Semaphore::new(CONNECTIONS_LIMIT));
@@ -53,13 +53,13 @@ pub async fn serve(listener: TcpListener, registry: Registry, stop: Cancellation
             } => accepted,
         };
         let (slot, Ok((stream, _))) = accepted else {
-            // No file is left to have: that passes.
+            // Out of file descriptors, which is transient.
             tokio::time::sleep(Duration::from_millis(100)).await;
             continue;
         };
         let registry = registry.clone();
         tokio::spawn(async move {
-            // Who hangs up early is no concern of ours.
+            // An early disconnect is not an error here.
             let _ = tokio::time::timeout(CONNECTION_TIMEOUT, answer_one(stream, registry)).await;
             drop(slot);
         });
@@ -93,10 +93,10 @@ fn answer(request: &Request<Incoming>, registry: &Registry) -> Response<Full<Byt
     response
 }
 
-/// The metrics as Prometheus reads them.
+/// The metrics as OpenMetrics text.
 ///
 /// # Errors
-/// A metric that cannot be written as text.
+/// A metric cannot be encoded.
 pub fn text(registry: &Registry) -> Result<String, std::fmt::Error> {
     let mut text = String::new();
     encode(&mut text, registry)?;
@@ -111,38 +111,38 @@ mod tests {
     use super::*;
 
     #[tokio::test]
-    async fn metrics_are_read_and_nothing_else_is() {
+    async fn only_the_metrics_are_served() {
         let listener = listen("127.0.0.1:0".parse().unwrap()).await.unwrap();
         let address = listener.local_addr().unwrap();
         assert!(listen(address).await.unwrap_err().to_string().starts_with("--metrics 127.0.0.1:"));
         let mut registry = Registry::default();
-        let asked = Counter::<u64>::default();
-        registry.register("plat_asked", "How often", asked.clone());
-        asked.inc_by(41);
+        let requests = Counter::<u64>::default();
+        registry.register("plat_asked", "How often", requests.clone());
+        requests.inc_by(41);
         let stop = CancellationToken::new();
         let serving = tokio::spawn(serve(listener, registry, stop.clone()));
         let ask = async |words: &str| {
             let mut stream = TcpStream::connect(address).await.unwrap();
             stream.write_all(words.as_bytes()).await.unwrap();
-            let mut said = String::new();
-            stream.read_to_string(&mut said).await.unwrap();
-            said
+            let mut answer = String::new();
+            stream.read_to_string(&mut answer).await.unwrap();
+            answer
         };
-        // More that say nothing than are answered at once, less one.
+        // Idle connections up to the limit, less one.
         let mut silent = Vec::new();
         for _ in 1..CONNECTIONS_LIMIT {
             silent.push(TcpStream::connect(address).await.unwrap());
         }
-        let said = ask("GET /metrics HTTP/1.1\r\nHost: a\r\n\r\n").await;
-        assert!(said.starts_with("HTTP/1.1 200 ") && said.contains("openmetrics-text"), "{said}");
-        assert!(said.contains("plat_asked_total 41\n") && said.ends_with("# EOF\n"), "{said}");
+        let answer = ask("GET /metrics HTTP/1.1\r\nHost: a\r\n\r\n").await;
+        assert!(answer.starts_with("HTTP/1.1 200 ") && answer.contains("openmetrics-text"), "{answer}");
+        assert!(answer.contains("plat_asked_total 41\n") && answer.ends_with("# EOF\n"), "{answer}");
         for (words, status) in [
             ("POST /metrics HTTP/1.1\r\nHost: a\r\nContent-Length: 0\r\n\r\n", "HTTP/1.1 405 "),
             ("GET /secrets HTTP/1.1\r\nHost: a\r\n\r\n", "HTTP/1.1 404 "),
             ("GET  nonsense\r\n\r\n", "HTTP/1.1 400 "),
         ] {
-            let said = ask(words).await;
-            assert!(said.starts_with(status), "{words}: {said}");
+            let answer = ask(words).await;
+            assert!(answer.starts_with(status), "{words}: {answer}");
         }
         stop.cancel();
         serving.await.unwrap();

@@ -1,6 +1,6 @@
-//! Spans to a collector: OpenTelemetry's protocol over gRPC, as the standard variables of the environment say.
+//! Exports spans to a collector by OTLP over gRPC, configured by OpenTelemetry's standard environment variables.
 //!
-//! A bounded queue (`OTEL_BSP_MAX_QUEUE_SIZE`) and two threads stand between the work and the collector; what does not fit is lost.
+//! A bounded queue (`OTEL_BSP_MAX_QUEUE_SIZE`) and two threads decouple the work from the collector; spans that do not fit are dropped.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
@@ -18,33 +18,33 @@ use tracing::Subscriber;
 use tracing_opentelemetry::OpenTelemetryLayer;
 use tracing_subscriber::registry::LookupSpan;
 
-/// Where the collector is; the first that is set counts.
+/// Variables with the collector's endpoint; the first one that is set counts.
 const ENDPOINTS: [&str; 2] = ["OTEL_EXPORTER_OTLP_TRACES_ENDPOINT", "OTEL_EXPORTER_OTLP_ENDPOINT"];
 const PROTOCOLS: [&str; 2] = ["OTEL_EXPORTER_OTLP_TRACES_PROTOCOL", "OTEL_EXPORTER_OTLP_PROTOCOL"];
 const CERTIFICATES: [&str; 2] = ["OTEL_EXPORTER_OTLP_TRACES_CERTIFICATE", "OTEL_EXPORTER_OTLP_CERTIFICATE"];
-/// The last spans have this long to reach the collector.
-const GOODBYE: Duration = Duration::from_secs(2);
+/// Time limit of exporting the last spans.
+const SHUTDOWN_TIMEOUT: Duration = Duration::from_secs(2);
 
-/// The way of spans to a collector.
+/// The exporter of spans to a collector.
 pub(crate) struct Traces {
     provider: SdkTracerProvider,
-    /// Of the exporter's connection.
+    /// Runs the exporter's connection.
     runtime: Runtime,
 }
 
 impl Traces {
-    /// `None` where the environment names no collector.
+    /// `None` if the environment names no collector.
     pub(crate) fn from_environment(service: &str) -> Result<Option<Self>, BadInput> {
         let Some((variable, endpoint)) = variable(ENDPOINTS) else { return Ok(None) };
         if std::env::var("OTEL_SDK_DISABLED").is_ok_and(|value| value.eq_ignore_ascii_case("true")) {
             return Ok(None);
         }
         if let Some((name, protocol)) = variable_not(PROTOCOLS, "grpc") {
-            let problem = format!("'{protocol}' is not spoken here");
+            let problem = format!("'{protocol}' is not supported");
             return Err(BadInput::new(
                 name,
                 problem,
-                "set it to grpc, and the endpoint to the collector's port for that (4317)",
+                "set it to grpc, and the endpoint to the collector's gRPC port (4317)",
             ));
         }
         let bad = |problem: String| {
@@ -55,37 +55,37 @@ impl Traces {
         }
         let threads =
             tokio::runtime::Builder::new_multi_thread().worker_threads(1).thread_name("otlp").enable_all().build();
-        let runtime = threads.map_err(|error| bad(format!("cannot be served: {error}")))?;
-        // The connection is made, and kept, in there.
+        let runtime = threads.map_err(|error| bad(format!("cannot be exported to: {error}")))?;
+        // The connection is created on this runtime.
         let entered = runtime.enter();
-        let mut builder = SpanExporter::builder().with_tonic().with_retry_policy(persistence());
+        let mut builder = SpanExporter::builder().with_tonic().with_retry_policy(retry_policy());
         if endpoint.starts_with("https://") {
-            builder = builder.with_tls_config(trust()?);
+            builder = builder.with_tls_config(tls_config()?);
         }
         let exporter = builder.build().map_err(|error| bad(format!("cannot be used ({error})")))?;
         drop(entered);
-        let exporter = Patient { exporter, endpoint: endpoint.clone(), is_away: AtomicBool::new(false) };
+        let exporter = LoggingExporter { exporter, endpoint: endpoint.clone(), is_away: AtomicBool::new(false) };
         let provider =
             SdkTracerProvider::builder().with_resource(resource(service)).with_batch_exporter(exporter).build();
         Ok(Some(Self { provider, runtime }))
     }
 
-    /// What hands spans over.
+    /// The layer that passes spans to the exporter.
     pub(crate) fn layer<S: Subscriber + for<'a> LookupSpan<'a>>(&self) -> OpenTelemetryLayer<S, SdkTracer> {
         let layer = tracing_opentelemetry::layer().with_tracer(self.provider.tracer("plat"));
         layer.with_location(false).with_threads(false).with_tracked_inactivity(false)
     }
 
-    /// Exports what waits.
+    /// Exports the queued spans, within [`SHUTDOWN_TIMEOUT`].
     pub(crate) fn finish(self) {
-        // What went wrong was said when it did.
-        let _ = self.provider.shutdown_with_timeout(GOODBYE);
+        // Errors were logged when they occurred.
+        let _ = self.provider.shutdown_with_timeout(SHUTDOWN_TIMEOUT);
         self.runtime.shutdown_background();
     }
 }
 
-/// Two tries more within half a second: whoever waits for the last spans is not to wait for long.
-fn persistence() -> RetryPolicy {
+/// Two retries within half a second, so that the export of the last spans does not delay the process's end.
+fn retry_policy() -> RetryPolicy {
     let first = Duration::from_millis(100);
     RetryPolicy::default()
         .with_max_retries(2)
@@ -103,11 +103,11 @@ fn variable_not<const N: usize>(names: [&'static str; N], wanted: &str) -> Optio
     variable(names).filter(|(_, value)| value != wanted)
 }
 
-/// Whom to trust where the way is encrypted.
-fn trust() -> Result<ClientTlsConfig, BadInput> {
+/// The root certificate of a collector with TLS.
+fn tls_config() -> Result<ClientTlsConfig, BadInput> {
     let (name, path) = variable(CERTIFICATES).ok_or_else(|| {
         let advice = "set it to the file of the certificate that signed the collector's, PEM";
-        BadInput::new(CERTIFICATES[1], "is not set, and the collector's way is encrypted", advice)
+        BadInput::new(CERTIFICATES[1], "is not set, and the collector's endpoint uses TLS", advice)
     })?;
     let pem = std::fs::read(&path).map_err(|error| {
         BadInput::new(name, format!("'{path}' cannot be read ({error})"), "give a file with a certificate, PEM")
@@ -115,7 +115,7 @@ fn trust() -> Result<ClientTlsConfig, BadInput> {
     Ok(ClientTlsConfig::new().ca_certificate(Certificate::from_pem(pem)))
 }
 
-/// Who exports: the environment's word, and `service` where it has none.
+/// The exporting service: named by the environment, else `service`.
 fn resource(service: &str) -> Resource {
     let named = std::env::var("OTEL_SERVICE_NAME").is_ok_and(|name| !name.is_empty())
         || std::env::var("OTEL_RESOURCE_ATTRIBUTES").is_ok_and(|all| all.contains("service.name="));
@@ -123,15 +123,15 @@ fn resource(service: &str) -> Resource {
     if named { resource.build() } else { resource.with_service_name(service.to_owned()).build() }
 }
 
-/// An exporter whose troubles are told once, and once more when they are over.
+/// An exporter that logs the first failed export, and the first one that succeeds after it.
 #[derive(Debug)]
-struct Patient<E> {
+struct LoggingExporter<E> {
     exporter: E,
     endpoint: String,
     is_away: AtomicBool,
 }
 
-impl<E: Export> Export for Patient<E> {
+impl<E: Export> Export for LoggingExporter<E> {
     async fn export(&self, batch: Vec<SpanData>) -> OTelSdkResult {
         match self.exporter.export(batch).await {
             Ok(()) => {

@@ -1,4 +1,4 @@
-//! Where a span stands in its trace, as other processes are told: W3C Trace Context, level 1, without `tracestate`.
+//! Passes a span's position in its trace between processes: W3C Trace Context, level 1, without `tracestate`.
 
 use opentelemetry::Context;
 use opentelemetry::trace::{SpanContext, SpanId, TraceContextExt, TraceFlags, TraceId, TraceState};
@@ -8,7 +8,7 @@ use tonic::metadata::MetadataMap;
 use tracing::Span;
 use tracing_opentelemetry::OpenTelemetrySpanExt;
 
-/// The header of a call in which a [`TraceParent`] goes.
+/// The gRPC header of a [`TraceParent`].
 pub const HEADER: &str = "traceparent";
 
 /// A span of this or another process: `00-<trace, 32 hex>-<span, 16 hex>-<flags, 2 hex>`.
@@ -17,17 +17,17 @@ pub const HEADER: &str = "traceparent";
 pub struct TraceParent(String);
 
 impl TraceParent {
-    /// What others say; `None` where it is none, which is to be taken as silence.
+    /// Parses another process's value; `None` if it is invalid, which counts as absent.
     pub fn parse(text: &str) -> Option<Self> {
         Self::context(text).map(|_| Self(text.into()))
     }
 
-    /// Of a call.
+    /// The value in a call's headers.
     pub fn of_header(header: &MetadataMap) -> Option<Self> {
         Self::parse(header.get(HEADER)?.to_str().ok()?)
     }
 
-    /// Of a span here; `None` where no spans are exported.
+    /// The value of a span of this process; `None` if no spans are exported.
     pub fn of(span: &Span) -> Option<Self> {
         let context = span.context();
         let of = context.span().span_context().clone();
@@ -38,12 +38,12 @@ impl TraceParent {
     /// Makes a span that has not been entered a child of this one.
     pub fn adopt(&self, span: &Span) {
         if let Some(parent) = Self::context(&self.0) {
-            // It fails where no spans are exported.
+            // Fails if no spans are exported.
             let _ = span.set_parent(Context::new().with_remote_span_context(parent));
         }
     }
 
-    /// As it goes over the wire.
+    /// The header's text.
     pub fn as_str(&self) -> &str {
         &self.0
     }
@@ -77,7 +77,7 @@ impl From<TraceParent> for String {
     }
 }
 
-/// A call that says which span it is made in.
+/// A request with the current span in its header.
 pub fn traced<T>(message: T) -> Request<T> {
     let mut request = Request::new(message);
     if let Some(value) = TraceParent::of(&Span::current()).and_then(|parent| parent.0.parse().ok()) {
@@ -100,9 +100,9 @@ mod tests {
     const PARENT: &str = "00-0af7651916cd43dd8448eb211c80319c-b7ad6b7169203331-01";
 
     #[derive(Debug, Clone, Default)]
-    struct Kept(Arc<Mutex<Vec<SpanData>>>);
+    struct Exported(Arc<Mutex<Vec<SpanData>>>);
 
-    impl SpanExporter for Kept {
+    impl SpanExporter for Exported {
         async fn export(&self, batch: Vec<SpanData>) -> OTelSdkResult {
             self.0.lock().unwrap().extend(batch);
             Ok(())
@@ -110,7 +110,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_traceparent_counts_as_silence() {
+    fn an_invalid_traceparent_counts_as_absent() {
         assert_eq!(TraceParent::parse(PARENT).unwrap().as_str(), PARENT);
         for bad in [
             "",
@@ -134,24 +134,24 @@ mod tests {
     }
 
     #[test]
-    fn a_span_is_adopted_and_tells_its_own_place() {
-        assert_eq!(TraceParent::of(&tracing::info_span!("nobody looks")), None);
+    fn a_span_is_adopted_and_passed_on() {
+        assert_eq!(TraceParent::of(&tracing::info_span!("not exported")), None);
         assert!(traced(()).metadata().get(HEADER).is_none());
-        let kept = Kept::default();
-        let provider = SdkTracerProvider::builder().with_simple_exporter(kept.clone()).build();
+        let exported = Exported::default();
+        let provider = SdkTracerProvider::builder().with_simple_exporter(exported.clone()).build();
         let layer = tracing_opentelemetry::layer().with_tracer(provider.tracer("test"));
         tracing::subscriber::with_default(tracing_subscriber::registry().with(layer), || {
             let task = tracing::info_span!("task");
             TraceParent::parse(PARENT).unwrap().adopt(&task);
             let call = task.in_scope(|| tracing::info_span!("call").in_scope(|| traced(())));
-            let told = TraceParent::of_header(call.metadata()).unwrap();
-            assert!(told.as_str().starts_with(&PARENT[..36]) && told.as_str() != PARENT, "{told:?}");
+            let passed = TraceParent::of_header(call.metadata()).unwrap();
+            assert!(passed.as_str().starts_with(&PARENT[..36]) && passed.as_str() != PARENT, "{passed:?}");
             drop(task);
-            let spans = kept.0.lock().unwrap();
+            let spans = exported.0.lock().unwrap();
             let [call, task] = &spans[..] else { panic!("{spans:?}") };
             assert_eq!(task.parent_span_id, SpanId::from_hex(&PARENT[36..52]).unwrap());
             assert_eq!((call.parent_span_id, &call.name[..]), (task.span_context.span_id(), "call"));
-            assert_eq!(told.as_str()[36..52], call.span_context.span_id().to_string());
+            assert_eq!(passed.as_str()[36..52], call.span_context.span_id().to_string());
         });
     }
 }

@@ -1,28 +1,30 @@
-//! Coordinators that are killed, followed and fenced, over real gRPC on the loopback and one shared store. A kill is a future
-//! that is dropped: nothing is flushed, nothing said.
+//! Tests coordinators that are killed, replaced and fenced, over real gRPC on the loopback and one shared store. A kill drops the future of
+//! the coordinator: nothing is flushed, and no reply is sent.
+
+mod common;
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
-use blocks::{Ground, Plan, PlanSettings, Task};
+use blocks::{Plan, Task};
 use cluster::Settings;
 use coordinator::{Durable, Options, ServeError, serve};
-use glam::{DQuat, DVec2};
 use proto::leader::Leader;
 use proto::lease_reply::Reply;
 use proto::{Access, Client, Outcome, StatusReply};
-use scene::{ArtefactId, BlockId};
+use scene::ArtefactId;
 use store::Store;
 use tokio::net::TcpListener;
 use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
 use tonic::Code;
-use worker::{Execute, ExecuteError, Flow, Report, TaskOrder};
+use worker::{Flow, Report, TaskOrder};
 
-const BACKEND: &str = "cpu-none";
-/// Between two looks at the lease.
+use common::{BACKEND, fake, plan_of, result_of, task, worker_options};
+
+/// Interval at which the lease is read.
 const QUICK: Duration = Duration::from_millis(10);
 /// Longer than any test.
 const LONG: Duration = Duration::from_secs(3600);
@@ -32,41 +34,9 @@ fn plan() -> Plan {
     let names = ["0/0/0", "1/0/0", "1/1/0", "1/0/1", "1/1/1"].map(str::to_owned);
     let grandchildren = [(0, 0), (1, 0), (0, 1), (1, 1), (2, 2), (3, 2), (2, 3), (3, 3)];
     let names = names.into_iter().chain(grandchildren.map(|(x, y)| format!("2/{x}/{y}")));
-    let task = |block: String| {
-        let block: BlockId = block.parse().unwrap();
-        Task {
-            block,
-            parent: block.parent(),
-            context: Vec::new(),
-            views: Vec::new(),
-            test_views: Vec::new(),
-            points: 0,
-            budget: 1,
-            steps: 1,
-            rho_metres: 1.0,
-            visible_splats: 0,
-            visible_context_splats: 0,
-            memory_bytes: 0,
-        }
-    };
-    let mut tasks: Vec<Task> = names.map(task).collect();
+    let mut tasks: Vec<Task> = names.map(|block| task(&block, &[])).collect();
     tasks.sort_by_key(|task| (task.block.level, blocks::sweep_of(task.block), task.block.y, task.block.x));
-    Plan {
-        version: blocks::plan::VERSION,
-        capture: ArtefactId([1; 32]),
-        settings: PlanSettings::default(),
-        backend: BACKEND.into(),
-        ground: Ground {
-            ground_from_world: DQuat::IDENTITY,
-            min: DVec2::ZERO,
-            edge_metres: 100.0,
-            height_metres: 0.0,
-            near_metres: 1e300,
-        },
-        levels: 2,
-        rho_metres: vec![4.0, 2.0, 1.0],
-        tasks,
-    }
+    plan_of(2, tasks)
 }
 
 /// A coordinator of these tests.
@@ -91,7 +61,7 @@ impl Host {
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
         let address = format!("http://{}", listener.local_addr().unwrap());
         let durable = Durable { beat, patience, ..Durable::new(&address).unwrap() };
-        // No second attempts: here each task is to be worked on once.
+        // No speculative attempts: each task is to be executed once.
         let settings = Settings { speculation: false, ..Settings::default() };
         let options =
             Options { settings, wait_millis: 5, durable: Some(durable), journal, ..Options::new(store.clone()) };
@@ -101,7 +71,7 @@ impl Host {
         Self { client, address, stop, serving }
     }
 
-    /// As kill -9 does.
+    /// Drops the coordinator, as kill -9 would.
     async fn kill(self) {
         self.serving.abort();
         assert!(self.serving.await.unwrap_err().is_cancelled());
@@ -124,14 +94,7 @@ impl Host {
     }
 
     async fn lease(&mut self, worker: &str) -> proto::Attempt {
-        loop {
-            let request = proto::LeaseRequest { worker: worker.into(), backend: BACKEND.into(), ..Default::default() };
-            match self.client.lease(request).await.unwrap().into_inner().reply.unwrap() {
-                Reply::Grant(grant) => return grant.attempt.unwrap(),
-                Reply::WaitMillis(millis) => tokio::time::sleep(Duration::from_millis(millis.into())).await,
-                Reply::Drained(_) => panic!("drained"),
-            }
-        }
+        common::lease(&mut self.client, worker).await
     }
 
     async fn complete(&mut self, attempt: proto::Attempt, result: &[u8]) -> Result<bool, tonic::Status> {
@@ -145,32 +108,8 @@ impl Host {
     }
 }
 
-type Work =
-    dyn Fn(&TaskOrder, &mut (dyn FnMut(Report) -> Flow + Send)) -> Result<ArtefactId, ExecuteError> + Send + Sync;
-
-/// Does what the test says, and remembers what it was asked.
-struct Fake {
-    work: Box<Work>,
-    orders: Mutex<Vec<TaskOrder>>,
-}
-
-impl Execute for Fake {
-    fn execute(
-        &self,
-        order: &TaskOrder,
-        report: &mut (dyn FnMut(Report) -> Flow + Send),
-    ) -> Result<ArtefactId, ExecuteError> {
-        self.orders.lock().unwrap().push(order.clone());
-        (self.work)(order, report)
-    }
-}
-
-fn result_of(order: &TaskOrder) -> ArtefactId {
-    ArtefactId::of(format!("{} {} {:?}", order.plan, order.task, order.inputs).as_bytes())
-}
-
 #[tokio::test(flavor = "multi_thread")]
-async fn what_was_answered_outlives_a_kill_and_the_epoch_rises() {
+async fn acknowledged_changes_survive_a_kill_and_the_epoch_rises() {
     let store = Store::open("memory://").unwrap();
     let mut first = Host::start(&store, LONG, LONG).await.leads().await;
     let job = first.submit(&store).await;
@@ -184,7 +123,7 @@ async fn what_was_answered_outlives_a_kill_and_the_epoch_rises() {
     let mut second = Host::start_with(&store, QUICK, Duration::from_millis(50), Some(journal)).await.leads().await;
     let status = second.status(job).await;
     assert_eq!((status.done, status.leased, status.ready, status.waiting), (1, 2, 2, 8));
-    // Attempts under way go on, under the fence that they were granted with.
+    // Running attempts go on under the fencing token of their grant.
     assert!(
         !second
             .client
@@ -195,13 +134,13 @@ async fn what_was_answered_outlives_a_kill_and_the_epoch_rises() {
             .cancelled
     );
     assert!(second.complete(one, b"one").await.unwrap());
-    // What was committed stays so: the same again is agreed to, another result is not.
+    // A committed result is final. Completing it again is idempotent.
     assert!(second.complete(root, b"root").await.unwrap());
-    // Workers mean themselves still: w2 asks anew, and what it held is lost.
+    // Worker names are durable: w2 requests a task, and its old lease is revoked.
     let next = second.lease("w2").await;
     assert_eq!(next.epoch, 2);
     assert!(!second.complete(two, b"two").await.unwrap(), "a zombie's commit is refused");
-    // Numbers of attempts go on, and those of jobs.
+    // The numbers of attempts and jobs continue.
     let mut granted = vec![next];
     while granted.iter().all(|attempt| attempt.task != two.task) {
         granted.push(second.lease(&format!("new-{}", granted.len())).await);
@@ -237,18 +176,18 @@ async fn a_result_and_the_next_task_take_one_call() {
     assert_ne!(child.task, root.task);
     let status = host.status(job).await;
     assert_eq!((status.done, status.leased, status.ready), (1, 1, 3));
-    // The answer was lost and the call comes again: the result counts still, and the grant that nobody heard of is void.
+    // The reply was lost and the call is repeated: the result still counts, and the first grant is void.
     let again = host.client.complete(complete(root, Some(ask))).await.unwrap().into_inner();
     assert!(again.accepted && matches!(again.next.unwrap().reply, Some(Reply::Grant(_))));
     assert_eq!(host.status(job).await.leased, 1);
     assert!(!host.complete(child, b"child").await.unwrap());
-    // What is asked for must make sense, else nothing is done; and who does not ask gets nothing.
+    // A malformed lease request fails the whole call. Without one, no task is granted.
     let other = host.lease("w2").await;
     let wrong = proto::LeaseRequest { worker: "no name".into(), ..Default::default() };
     let refused = host.client.complete(complete(other, Some(wrong))).await.unwrap_err();
     assert_eq!((refused.code(), host.status(job).await.done), (Code::InvalidArgument, 1));
     assert_eq!(host.client.complete(complete(other, None)).await.unwrap().into_inner().next, None);
-    // What was granted so is durable before it is said, as any grant is.
+    // Such a grant is durable before the reply, as any grant is.
     host.kill().await;
     let mut second = Host::start(&store, QUICK, Duration::from_millis(50)).await.leads().await;
     let status = second.status(job).await;
@@ -256,16 +195,16 @@ async fn a_result_and_the_next_task_take_one_call() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_job_stays_in_its_trace_whoever_leads() {
+async fn a_job_stays_in_its_trace_under_a_new_leader() {
     const PARENT: &str = "00-0af7651916cd43dd8448eb211c80319c-b7ad6b7169203331-01";
     let store = Store::open("memory://").unwrap();
     let mut host = Host::start(&store, LONG, LONG).await.leads().await;
     let plan = store.put(plan().to_frame().into()).await.unwrap().0.to_vec();
-    for said in [Some(PARENT), Some("00-nonsense"), None] {
+    for header in [Some(PARENT), Some("00-nonsense"), None] {
         let request = proto::SubmitRequest { plan: plan.clone(), store_url: store.url().into() };
         let mut request = tonic::Request::new(request);
-        if let Some(said) = said {
-            request.metadata_mut().insert("traceparent", said.parse().unwrap());
+        if let Some(header) = header {
+            request.metadata_mut().insert("traceparent", header.parse().unwrap());
         }
         host.client.submit(request).await.unwrap();
     }
@@ -280,7 +219,7 @@ async fn a_job_stays_in_its_trace_whoever_leads() {
             let attempt = grant.attempt.unwrap();
             assert_eq!(attempt.epoch, epoch);
             granted.insert(attempt.job, grant.traceparent);
-            // The next leader has a root of each job to give, too.
+            // Given back, so that the next leader can grant the root of each job as well.
             let given_back = proto::FailRequest {
                 attempt: Some(attempt),
                 message: String::new(),
@@ -306,7 +245,7 @@ async fn a_job_stays_in_its_trace_whoever_leads() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_standby_says_who_leads_and_follows_a_leader_that_leaves() {
+async fn a_standby_names_the_leader_and_follows_one_that_shuts_down() {
     let store = Store::open("memory://").unwrap();
     let mut first = Host::start(&store, QUICK, LONG).await.leads().await;
     let job = first.submit(&store).await;
@@ -316,7 +255,7 @@ async fn a_standby_says_who_leads_and_follows_a_leader_that_leaves() {
     assert!(refused.message().contains(&first.address), "{refused}");
     first.stop.cancel();
     first.serving.await.unwrap().unwrap();
-    // It was told: an hour's patience is not needed.
+    // The lease was released, so the standby does not wait for its patience of an hour.
     let mut standby = standby.leads().await;
     assert_eq!(standby.status(job).await.ready, 1);
     let (epoch, lease) = store.newest_record("leader").await.unwrap().unwrap();
@@ -326,14 +265,14 @@ async fn a_standby_says_who_leads_and_follows_a_leader_that_leaves() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_leader_that_is_thought_dead_is_fenced() {
+async fn a_leader_with_a_stale_lease_is_fenced() {
     let store = Store::open("memory://").unwrap();
-    // Its heart beats once an hour: it lives, and nobody can see it.
+    // It renews its lease once an hour, so it seems dead.
     let mut old = Host::start(&store, LONG, LONG).await.leads().await;
     let job = old.submit(&store).await;
     let held = old.lease("w1").await;
     let mut new = Host::start(&store, QUICK, Duration::from_millis(60)).await.leads().await;
-    // The old one still thinks that it leads. What it says must be durable first, and that fails.
+    // The old leader still accepts calls, but its reply needs a durable write, which fails.
     let refused = old.complete(held, b"to the old one").await.unwrap_err();
     assert_eq!(refused.code(), Code::Unavailable, "{refused}");
     assert_eq!(new.status(job).await.done, 0);
@@ -352,7 +291,7 @@ async fn a_leader_that_is_thought_dead_is_fenced() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn who_knows_of_a_higher_epoch_is_not_told_that_its_work_is_void() {
+async fn a_caller_of_a_higher_epoch_is_not_told_that_its_attempt_is_void() {
     let store = Store::open("memory://").unwrap();
     let mut host = Host::start(&store, LONG, LONG).await.leads().await;
     let job = host.submit(&store).await;
@@ -367,7 +306,7 @@ async fn who_knows_of_a_higher_epoch_is_not_told_that_its_work_is_void() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn workers_find_each_new_leader_and_no_work_is_done_twice() {
+async fn workers_find_each_new_leader_and_no_task_runs_twice() {
     let folder = tempfile::tempdir().unwrap();
     let url = format!("file://{}", folder.path().display());
     let store = Store::open(&url).unwrap();
@@ -375,31 +314,22 @@ async fn workers_find_each_new_leader_and_no_work_is_done_twice() {
     let mut host = Host::start(&store, QUICK, patience).await.leads().await;
     let job = host.submit(&store).await;
 
-    // The root takes until the first kill is over, the others a moment.
+    // The root runs until the first kill is over, the others briefly.
     let killed = Arc::new(AtomicBool::new(false));
     let wait = killed.clone();
-    let fake = Arc::new(Fake {
-        work: Box::new(move |order, report| {
-            while order.task == 0 && !wait.load(Ordering::Relaxed) {
-                assert_eq!(report(Report { steps: 2, step: 1, ..Report::default() }), Flow::Continue);
-                std::thread::sleep(Duration::from_millis(5));
-            }
-            std::thread::sleep(Duration::from_millis(60));
-            Ok(result_of(order))
-        }),
-        orders: Mutex::default(),
+    let fake = fake(move |order, report| {
+        while order.task == 0 && !wait.load(Ordering::Relaxed) {
+            assert_eq!(report(Report { steps: 2, step: 1, ..Report::default() }), Flow::Continue);
+            std::thread::sleep(Duration::from_millis(5));
+        }
+        std::thread::sleep(Duration::from_millis(60));
+        Ok(result_of(order))
     });
-    let home = CancellationToken::new();
-    let crew: Vec<_> = (0..3)
+    let shutdown = CancellationToken::new();
+    let workers: Vec<_> = (0..3)
         .map(|number| {
-            let options = worker::Options {
-                coordinator_url: url.clone(),
-                access: Access::default(),
-                worker_id: format!("w{number}"),
-                backend: BACKEND.into(),
-                memory_bytes: 0,
-            };
-            tokio::spawn(worker::run(options, fake.clone(), home.clone()))
+            let options = worker_options(url.clone(), &format!("w{number}"));
+            tokio::spawn(worker::run(options, fake.clone(), shutdown.clone()))
         })
         .collect();
     while fake.orders.lock().unwrap().is_empty() {
@@ -412,7 +342,7 @@ async fn workers_find_each_new_leader_and_no_work_is_done_twice() {
         host = Host::start(&store, QUICK, patience).await.leads().await;
         killed.store(true, Ordering::Relaxed);
         let before = host.status(job).await.done;
-        // Each leader sees some of the job done, then dies.
+        // Each leader commits some tasks, then is killed.
         let status = loop {
             let status = host.status(job).await;
             if status.outcome.is_some() || status.done > before + 2 {
@@ -426,11 +356,11 @@ async fn workers_find_each_new_leader_and_no_work_is_done_twice() {
         }
     }
     assert!(kills >= 2, "{kills} kills");
-    home.cancel();
-    for worker in crew {
+    shutdown.cancel();
+    for worker in workers {
         worker.await.unwrap().unwrap();
     }
-    // Nothing was lost and nothing done twice: every task once, each from its parent's one result.
+    // Every task ran exactly once, with its parent's only result as input.
     let orders = fake.orders.lock().unwrap().clone();
     let by_task: BTreeMap<u32, &TaskOrder> = orders.iter().map(|order| (order.task, order)).collect();
     assert_eq!((orders.len(), by_task.len()), (13, 13));
@@ -445,7 +375,7 @@ async fn workers_find_each_new_leader_and_no_work_is_done_twice() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_job_that_is_over_is_forgotten_with_what_only_it_refers_to() {
+async fn a_finished_job_is_forgotten_with_the_objects_that_only_it_refers_to() {
     use proto::control_request::What;
     let store = Store::open("memory://").unwrap();
     let mut host = Host::start(&store, LONG, LONG).await.leads().await;
@@ -462,7 +392,7 @@ async fn a_job_that_is_over_is_forgotten_with_what_only_it_refers_to() {
     let gone = |status: tonic::Status| assert_eq!(status.code(), Code::NotFound);
     gone(host.client.status(proto::StatusRequest { job }).await.unwrap_err());
     host.kill().await;
-    // Also for whoever comes after, and its number is not used again.
+    // Also under the next leader, and its number is not reused.
     let mut next = Host::start(&store, QUICK, Duration::from_millis(50)).await.leads().await;
     gone(next.client.status(proto::StatusRequest { job }).await.unwrap_err());
     assert_eq!(next.submit(&store).await, job + 1);

@@ -1,20 +1,20 @@
-//! A live coordinator under seeded hostile traffic: damaged frames, oversize messages, wrong tokens, replayed and stale attempts,
-//! damaged messages. All of it is refused, nothing of it changes a job, and the coordinator serves on.
+//! Tests a live coordinator under seeded hostile traffic: damaged frames, oversize messages, wrong tokens, replayed and stale attempts,
+//! damaged messages. It refuses all of them, no job changes, and it goes on serving.
 //!
-//! `PLAT_FUZZ_CASES` says how many cases; a few thousand without.
+//! `PLAT_FUZZ_CASES` sets the number of cases; the default is a few thousand.
+
+mod common;
 
 use std::collections::BTreeSet;
 use std::net::SocketAddr;
 use std::time::Duration;
 
-use blocks::{Ground, Plan, PlanSettings, Task};
+use blocks::Plan;
 use cluster::Settings;
 use coordinator::{Options, Security, serve};
-use glam::{DQuat, DVec2};
 use prost::Message;
-use proto::lease_reply::Reply;
 use proto::{Access, Attempt, Client, Token};
-use scene::{ArtefactId, BlockId};
+use scene::ArtefactId;
 use store::Store;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
@@ -24,9 +24,10 @@ use tonic::codegen::http::uri::PathAndQuery;
 use tonic::transport::{Channel, Endpoint};
 use tonic::{Code, Request, Status};
 
-const BACKEND: &str = "cpu-none";
+use common::{BACKEND, lease, plan_of, task};
+
 const TOKEN: &str = "a-token-of-enough-characters";
-/// Callers at the same time.
+/// Concurrent callers.
 const CALLERS: u64 = 8;
 
 fn cases() -> u64 {
@@ -35,39 +36,7 @@ fn cases() -> u64 {
 
 /// A root and its four children.
 fn plan() -> Plan {
-    let task = |block: &str| {
-        let block: BlockId = block.parse().unwrap();
-        Task {
-            block,
-            parent: block.parent(),
-            context: Vec::new(),
-            views: Vec::new(),
-            test_views: Vec::new(),
-            points: 0,
-            budget: 1,
-            steps: 1,
-            rho_metres: 1.0,
-            visible_splats: 0,
-            visible_context_splats: 0,
-            memory_bytes: 0,
-        }
-    };
-    Plan {
-        version: blocks::plan::VERSION,
-        capture: ArtefactId([1; 32]),
-        settings: PlanSettings::default(),
-        backend: BACKEND.into(),
-        ground: Ground {
-            ground_from_world: DQuat::IDENTITY,
-            min: DVec2::ZERO,
-            edge_metres: 100.0,
-            height_metres: 0.0,
-            near_metres: 1e300,
-        },
-        levels: 1,
-        rho_metres: vec![2.0, 1.0],
-        tasks: ["0/0/0", "1/0/0", "1/1/1", "1/1/0", "1/0/1"].map(task).to_vec(),
-    }
+    plan_of(1, ["0/0/0", "1/0/0", "1/1/1", "1/1/0", "1/0/1"].map(|block| task(block, &[])).to_vec())
 }
 
 /// Splitmix64.
@@ -89,7 +58,7 @@ impl Random {
         &list[self.below(list.len() as u64) as usize]
     }
 
-    /// Changes, repeats, cuts or adds some bytes.
+    /// Changes, removes or inserts some bytes.
     fn damage(&mut self, bytes: &mut Vec<u8>) {
         for _ in 0..=self.below(6) {
             let at = self.below(bytes.len() as u64) as usize;
@@ -103,7 +72,7 @@ impl Random {
     }
 }
 
-/// Messages as bytes, whatever they are.
+/// A codec of raw message bytes.
 #[derive(Clone, Copy, Default)]
 struct Bytes;
 
@@ -143,14 +112,14 @@ impl Decoder for Bytes {
     }
 }
 
-/// What the attackers know: all but the token.
+/// What the attackers know: everything but the token.
 #[derive(Clone)]
 struct Target {
     address: SocketAddr,
     channel: Channel,
     job: u64,
     plan: ArtefactId,
-    /// What would count.
+    /// The attempts that hold a lease: job, task, number, epoch.
     held: BTreeSet<(u64, u32, u32, u64)>,
     /// The attempt that ended the root, and its result.
     ended: (Attempt, ArtefactId),
@@ -195,13 +164,13 @@ impl Target {
         }
     }
 
-    /// A call that must be refused whoever makes it, unless `is_stranger`: then it would count with the token.
-    fn message(&self, random: &mut Random, is_stranger: bool) -> (&'static str, Vec<u8>) {
+    /// A call that must be refused from any caller; with `is_unauthenticated`, one that would be accepted with the token.
+    fn message(&self, random: &mut Random, is_unauthenticated: bool) -> (&'static str, Vec<u8>) {
         let held = self.held.iter().next().map(|&(job, task, number, epoch)| Attempt { job, task, number, epoch });
-        let attempt = if is_stranger { held } else { Some(self.stale(random)) };
+        let attempt = if is_unauthenticated { held } else { Some(self.stale(random)) };
         let artefact = ArtefactId([random.next() as u8; 32]).0.to_vec();
-        let job = if is_stranger { self.job } else { *random.of(&[0, self.job + 1, u64::MAX]) };
-        match random.below(if is_stranger { 8 } else { 6 }) {
+        let job = if is_unauthenticated { self.job } else { *random.of(&[0, self.job + 1, u64::MAX]) };
+        match random.below(if is_unauthenticated { 8 } else { 6 }) {
             0 => ("Complete", proto::CompleteRequest { attempt, artefact, then: None }.encode_to_vec()),
             1 => ("Fail", proto::FailRequest { attempt, message: "x".into(), kind: 1 }.encode_to_vec()),
             2 => ("Report", proto::ReportRequest { attempt, reports: vec![] }.encode_to_vec()),
@@ -211,7 +180,7 @@ impl Target {
                 ("Control", proto::ControlRequest { job, what }.encode_to_vec())
             }
             5 => {
-                let plan = if is_stranger { self.plan.0.to_vec() } else { artefact };
+                let plan = if is_unauthenticated { self.plan.0.to_vec() } else { artefact };
                 ("Submit", proto::SubmitRequest { plan, store_url: "memory://".into() }.encode_to_vec())
             }
             6 => ("Leave", proto::LeaveRequest { worker: "w1".into() }.encode_to_vec()),
@@ -222,8 +191,8 @@ impl Target {
         }
     }
 
-    /// Whether a damaged message happens to be one that a holder of the token may send.
-    fn would_count(&self, method: &str, bytes: &[u8]) -> bool {
+    /// Whether a damaged message happens to be acceptable with the token.
+    fn is_acceptable(&self, method: &str, bytes: &[u8]) -> bool {
         let of = |attempt: Option<Attempt>| attempt.is_some_and(|of| self.is_held(&of) || of == self.ended.0);
         match method {
             "Complete" => proto::CompleteRequest::decode(bytes).is_ok_and(|request| of(request.attempt)),
@@ -236,7 +205,7 @@ impl Target {
         }
     }
 
-    /// The bytes of a whole connection that asks for a status, with the token.
+    /// The bytes of a connection that requests a status, with the token.
     fn connection(&self, random: &mut Random) -> Vec<u8> {
         let mut block = vec![0x83, 0x86]; // :method POST, :scheme http
         let literal = |block: &mut Vec<u8>, name: &str, value: &str| {
@@ -268,7 +237,7 @@ impl Target {
         bytes.extend(frame(1, 4, 1, &block));
         bytes.extend(frame(0, 1, 1, &data));
         for _ in 0..random.below(3) {
-            // Pings, resets, windows and what there is no name for.
+            // Pings, resets, window updates and unknown frames.
             let (kind, stream) = (random.below(12) as u8, random.below(4) as u32);
             bytes.extend(frame(kind, random.next() as u8, stream, &random.next().to_le_bytes()));
         }
@@ -276,119 +245,120 @@ impl Target {
     }
 }
 
-fn own_headers() -> Vec<(&'static str, String)> {
+fn valid_headers() -> Vec<(&'static str, String)> {
     vec![(proto::VERSION_HEADER, proto::VERSION.to_string()), ("authorization", format!("Bearer {TOKEN}"))]
 }
 
-/// One case. The error is what was not refused.
+/// Runs one case. The error describes a call that was not refused.
 async fn attack(target: &Target, random: &mut Random) -> Result<(), String> {
     match random.below(100) {
-        0..20 => {
-            let mut bytes = target.connection(random);
-            if random.below(8) > 0 {
-                random.damage(&mut bytes);
-            }
-            let mut stream = TcpStream::connect(target.address).await.map_err(|error| error.to_string())?;
-            // It may hang up before all is said.
-            let _ = stream.write_all(&bytes).await;
-            if random.below(4) == 0 {
-                let _ = tokio::time::timeout(Duration::from_millis(2), stream.read(&mut [0; 256])).await;
-            }
-            Ok(())
+        0..20 => damaged_connection(target, random).await,
+        20..40 => unauthenticated_call(target, random).await,
+        40..70 => stale_call(target, random).await,
+        70..72 => repeated_completion(target, random).await,
+        72..99 => damaged_call(target, random).await,
+        _ => oversize_call(target, random).await,
+    }
+}
+
+/// Writes the bytes of a connection, mostly damaged, and hangs up.
+async fn damaged_connection(target: &Target, random: &mut Random) -> Result<(), String> {
+    let mut bytes = target.connection(random);
+    if random.below(8) > 0 {
+        random.damage(&mut bytes);
+    }
+    let mut stream = TcpStream::connect(target.address).await.map_err(|error| error.to_string())?;
+    // The coordinator may close the connection before all is written.
+    let _ = stream.write_all(&bytes).await;
+    if random.below(4) == 0 {
+        let _ = tokio::time::timeout(Duration::from_millis(2), stream.read(&mut [0; 256])).await;
+    }
+    Ok(())
+}
+
+/// A call without the token, with a wrong one, or of an unsupported version.
+async fn unauthenticated_call(target: &Target, random: &mut Random) -> Result<(), String> {
+    let (method, message) = target.message(random, true);
+    let mut token = TOKEN.to_string();
+    let at = random.below(token.len() as u64) as usize;
+    let headers = match random.below(5) {
+        0 => vec![(proto::VERSION_HEADER, proto::VERSION.to_string())],
+        1 => {
+            token.truncate(at);
+            vec![valid_headers()[0].clone(), ("authorization", format!("Bearer {token}"))]
         }
-        20..40 => {
-            let (method, message) = target.message(random, true);
-            let mut token = TOKEN.to_string();
-            let at = random.below(token.len() as u64) as usize;
-            let headers = match random.below(5) {
-                0 => vec![(proto::VERSION_HEADER, proto::VERSION.to_string())],
-                1 => {
-                    token.truncate(at);
-                    vec![own_headers()[0].clone(), ("authorization", format!("Bearer {token}"))]
-                }
-                2 => {
-                    token.replace_range(at..=at, "~");
-                    vec![own_headers()[0].clone(), ("authorization", format!("Bearer {token}"))]
-                }
-                3 => vec![own_headers()[0].clone(), ("authorization", TOKEN.into())],
-                _ => vec![
-                    own_headers()[1].clone(),
-                    (proto::VERSION_HEADER, random.of(&["0", "1", "x", "99"]).to_string()),
-                ],
-            };
-            match target.call(method, &headers, message).await {
-                Err(status) if matches!(status.code(), Code::Unauthenticated | Code::FailedPrecondition) => Ok(()),
-                other => Err(format!("{method} of a stranger: {other:?}")),
-            }
+        2 => {
+            token.replace_range(at..=at, "~");
+            vec![valid_headers()[0].clone(), ("authorization", format!("Bearer {token}"))]
         }
-        40..70 => {
-            let (method, message) = target.message(random, false);
-            match target.call(method, &own_headers(), message).await {
-                // `accepted` is false, or the attempt is told to stop.
-                Ok(bytes) if method == "Report" && proto::ReportReply::decode(&*bytes).is_ok_and(|r| r.cancelled) => {
-                    Ok(())
-                }
-                Ok(bytes) if method != "Report" && bytes.is_empty() => Ok(()),
-                Err(_) => Ok(()),
-                other => Err(format!("a stale {method}: {other:?}")),
-            }
-        }
-        70..72 => {
-            // What ended the root, said again: agreed to if it is the same, and nothing comes of it.
-            let (attempt, result) = target.ended;
-            let same = random.below(2) == 0;
-            let artefact = if same { result } else { ArtefactId([random.next() as u8; 32]) };
-            let request = proto::CompleteRequest { attempt: Some(attempt), artefact: artefact.0.to_vec(), then: None };
-            let reply = target.call("Complete", &own_headers(), request.encode_to_vec()).await;
-            let accepted = reply.ok().and_then(|bytes| proto::AttemptReply::decode(&*bytes).ok()).map(|r| r.accepted);
-            if accepted == Some(same) {
-                Ok(())
-            } else {
-                Err(format!("a result said again: {accepted:?}, same: {same}"))
-            }
-        }
-        72..99 => {
-            let (mut method, mut message) = target.message(random, false);
-            random.damage(&mut message);
-            if target.would_count(method, &message) {
-                return Ok(());
-            }
-            if random.below(20) == 0 {
-                method = "NoSuchCall";
-            }
-            match target.call(method, &own_headers(), message).await {
-                Ok(bytes) if method == "Report" && proto::ReportReply::decode(&*bytes).is_ok_and(|r| r.cancelled) => {
-                    Ok(())
-                }
-                Ok(bytes) if method != "Report" && bytes.is_empty() => Ok(()),
-                Err(_) => Ok(()),
-                other => Err(format!("a damaged {method}: {other:?}")),
-            }
-        }
+        3 => vec![valid_headers()[0].clone(), ("authorization", TOKEN.into())],
         _ => {
-            // Most are refused by their length alone.
-            let bytes = proto::MESSAGE_BYTES_LIMIT + 1 + random.below(1 << 16) as usize;
-            match target.call("Submit", &own_headers(), vec![random.next() as u8; bytes]).await {
-                Err(status) if matches!(status.code(), Code::OutOfRange | Code::Unknown | Code::Internal) => Ok(()),
-                other => Err(format!("an oversize message: {other:?}")),
-            }
+            let version = random.of(&["0", "1", "x", "99"]).to_string();
+            vec![valid_headers()[1].clone(), (proto::VERSION_HEADER, version)]
         }
+    };
+    match target.call(method, &headers, message).await {
+        Err(status) if matches!(status.code(), Code::Unauthenticated | Code::FailedPrecondition) => Ok(()),
+        other => Err(format!("an unauthenticated {method}: {other:?}")),
     }
 }
 
-async fn lease(client: &mut Client, worker: &str) -> Attempt {
-    loop {
-        let request = proto::LeaseRequest { worker: worker.into(), backend: BACKEND.into(), ..Default::default() };
-        match client.lease(request).await.unwrap().into_inner().reply.unwrap() {
-            Reply::Grant(grant) => return grant.attempt.unwrap(),
-            Reply::WaitMillis(millis) => tokio::time::sleep(Duration::from_millis(millis.into())).await,
-            Reply::Drained(_) => panic!("drained"),
-        }
+/// A call about an attempt without a lease.
+async fn stale_call(target: &Target, random: &mut Random) -> Result<(), String> {
+    let (method, message) = target.message(random, false);
+    is_refused(method, target.call(method, &valid_headers(), message).await).map_err(|reply| format!("a stale {reply}"))
+}
+
+/// The completion of the root again: accepted with the same result, refused with another one.
+async fn repeated_completion(target: &Target, random: &mut Random) -> Result<(), String> {
+    let (attempt, result) = target.ended;
+    let is_same = random.below(2) == 0;
+    let artefact = if is_same { result } else { ArtefactId([random.next() as u8; 32]) };
+    let request = proto::CompleteRequest { attempt: Some(attempt), artefact: artefact.0.to_vec(), then: None };
+    let reply = target.call("Complete", &valid_headers(), request.encode_to_vec()).await;
+    let accepted = reply.ok().and_then(|bytes| proto::AttemptReply::decode(&*bytes).ok()).map(|r| r.accepted);
+    if accepted == Some(is_same) {
+        Ok(())
+    } else {
+        Err(format!("a repeated completion: {accepted:?}, same result: {is_same}"))
     }
 }
 
-/// All that can be seen of the jobs.
-async fn seen(client: &mut Client, job: u64) -> String {
+/// A call with a damaged message.
+async fn damaged_call(target: &Target, random: &mut Random) -> Result<(), String> {
+    let (mut method, mut message) = target.message(random, false);
+    random.damage(&mut message);
+    if target.is_acceptable(method, &message) {
+        return Ok(());
+    }
+    if random.below(20) == 0 {
+        method = "NoSuchCall";
+    }
+    is_refused(method, target.call(method, &valid_headers(), message).await)
+        .map_err(|reply| format!("a damaged {reply}"))
+}
+
+/// A message above the size limit. Most are refused by their length alone.
+async fn oversize_call(target: &Target, random: &mut Random) -> Result<(), String> {
+    let bytes = proto::MESSAGE_BYTES_LIMIT + 1 + random.below(1 << 16) as usize;
+    match target.call("Submit", &valid_headers(), vec![random.next() as u8; bytes]).await {
+        Err(status) if matches!(status.code(), Code::OutOfRange | Code::Unknown | Code::Internal) => Ok(()),
+        other => Err(format!("an oversize message: {other:?}")),
+    }
+}
+
+/// Whether a reply refuses the call: by an error, by `accepted` = false, or by `cancelled` for a report. The error names the call.
+fn is_refused(method: &str, reply: Result<Vec<u8>, Status>) -> Result<(), String> {
+    match reply {
+        Ok(bytes) if method == "Report" && proto::ReportReply::decode(&*bytes).is_ok_and(|r| r.cancelled) => Ok(()),
+        Ok(bytes) if method != "Report" && bytes.is_empty() => Ok(()),
+        Err(_) => Ok(()),
+        other => Err(format!("{method}: {other:?}")),
+    }
+}
+
+/// All visible state of the jobs, as text.
+async fn visible_state(client: &mut Client, job: u64) -> String {
     let status = client.status(proto::StatusRequest { job }).await.unwrap().into_inner();
     let jobs = client.jobs(proto::JobsRequest {}).await.unwrap().into_inner();
     let about = client.about(proto::AboutRequest {}).await.unwrap().into_inner();
@@ -405,7 +375,7 @@ async fn hostile_traffic_changes_nothing() {
     let store = Store::open("memory://").unwrap();
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let address = listener.local_addr().unwrap();
-    // Leases outlive the test: what changes is a caller's doing.
+    // Leases outlive the test, so only a call can change a job.
     let hour = 3_600_000;
     let settings = Settings {
         lease_millis: hour,
@@ -425,7 +395,7 @@ async fn hostile_traffic_changes_nothing() {
     let plan = store.put(plan().to_frame().into()).await.unwrap();
     let request = proto::SubmitRequest { plan: plan.0.to_vec(), store_url: store.url().into() };
     let job = client.submit(request).await.unwrap().into_inner().job;
-    // The first attempt at the root is lost, the second ends it, and two children are under way.
+    // The first attempt at the root is lost, the second completes it, and two children are running.
     lease(&mut client, "w1").await;
     let root = lease(&mut client, "w1").await;
     assert_eq!((root.task, root.number), (0, 2));
@@ -442,15 +412,15 @@ async fn hostile_traffic_changes_nothing() {
         held: held.iter().map(|of| (of.job, of.task, of.number, of.epoch)).collect(),
         ended: (root, result),
     };
-    let before = seen(&mut client, job).await;
+    let before = visible_state(&mut client, job).await;
     let total = cases();
     let attackers: Vec<_> = (0..CALLERS)
         .map(|caller| {
             let target = target.clone();
             tokio::spawn(async move {
                 for case in (caller..total).step_by(CALLERS as usize) {
-                    if let Err(what) = attack(&target, &mut Random(case)).await {
-                        return Err(format!("case {case}: {what}"));
+                    if let Err(problem) = attack(&target, &mut Random(case)).await {
+                        return Err(format!("case {case}: {problem}"));
                     }
                 }
                 Ok(())
@@ -458,10 +428,10 @@ async fn hostile_traffic_changes_nothing() {
         })
         .collect();
     for attacker in attackers {
-        attacker.await.unwrap().unwrap_or_else(|what| panic!("{what}"));
+        attacker.await.unwrap().unwrap_or_else(|problem| panic!("{problem}"));
     }
-    assert_eq!(seen(&mut client, job).await, before);
-    // Who holds a lease goes on as if nothing had been.
+    assert_eq!(visible_state(&mut client, job).await, before);
+    // The holders of the leases can still complete their tasks.
     for of in held {
         let request = proto::CompleteRequest { attempt: Some(of), artefact: vec![3; 32], then: None };
         assert!(client.complete(request).await.unwrap().into_inner().accepted);

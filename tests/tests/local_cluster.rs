@@ -1,58 +1,30 @@
-//! Coordinator and workers in one process, over real gRPC on the loopback, with an executor that trains nothing.
+//! Tests coordinator and workers in one process, over real gRPC on the loopback, with an executor that trains nothing.
+
+mod common;
 
 use std::collections::BTreeMap;
-use std::sync::{Arc, Mutex};
+use std::sync::Arc;
 use std::time::Duration;
 
-use blocks::{Ground, Plan, PlanSettings, Task};
+use blocks::Plan;
 use coordinator::{LocalError, Options, ServeError, run_local, serve};
-use glam::{DQuat, DVec2};
 use proto::lease_reply::Reply;
-use proto::watch_event::Event as News;
+use proto::watch_event::Event as Update;
 use proto::{Access, Client};
 use scene::{ArtefactId, BlockId};
 use store::Store;
 use tokio::net::TcpListener;
 use tokio_util::sync::CancellationToken;
 use tonic::Code;
-use worker::{Execute, ExecuteError, FailureKind, Flow, Report, TaskOrder};
+use worker::{ExecuteError, FailureKind, Flow, Report, TaskOrder};
 
-const BACKEND: &str = "cpu-none";
+use common::{BACKEND, FakeExecutor, fake, lease, plan_of, result_of, task, worker_options};
 
 /// Seven blocks: the root, its four children, and two grandchildren with their neighbours as context.
 fn plan() -> Plan {
-    let task = |block: &str, context: &[&str]| {
-        let block: BlockId = block.parse().unwrap();
-        Task {
-            block,
-            parent: block.parent(),
-            context: context.iter().map(|block| block.parse().unwrap()).collect(),
-            views: Vec::new(),
-            test_views: Vec::new(),
-            points: 0,
-            budget: 1,
-            steps: 1,
-            rho_metres: 1.0,
-            visible_splats: 0,
-            visible_context_splats: 0,
-            memory_bytes: 0,
-        }
-    };
-    Plan {
-        version: blocks::plan::VERSION,
-        capture: ArtefactId([1; 32]),
-        settings: PlanSettings::default(),
-        backend: BACKEND.into(),
-        ground: Ground {
-            ground_from_world: DQuat::IDENTITY,
-            min: DVec2::ZERO,
-            edge_metres: 100.0,
-            height_metres: 0.0,
-            near_metres: 1e300,
-        },
-        levels: 2,
-        rho_metres: vec![4.0, 2.0, 1.0],
-        tasks: vec![
+    plan_of(
+        2,
+        vec![
             task("0/0/0", &[]),
             task("1/0/0", &[]),
             task("1/1/1", &[]),
@@ -61,7 +33,7 @@ fn plan() -> Plan {
             task("2/0/0", &["1/1/0", "1/0/1"]),
             task("2/3/3", &["1/1/0"]),
         ],
-    }
+    )
 }
 
 async fn stored_plan() -> (Store, ArtefactId) {
@@ -70,69 +42,29 @@ async fn stored_plan() -> (Store, ArtefactId) {
     (store, plan)
 }
 
-type Work =
-    dyn Fn(&TaskOrder, &mut (dyn FnMut(Report) -> Flow + Send)) -> Result<ArtefactId, ExecuteError> + Send + Sync;
-
-/// Does what the test says and remembers what it was asked.
-struct Fake {
-    work: Box<Work>,
-    orders: Mutex<Vec<TaskOrder>>,
-}
-
-impl Execute for Fake {
-    fn execute(
-        &self,
-        order: &TaskOrder,
-        report: &mut (dyn FnMut(Report) -> Flow + Send),
-    ) -> Result<ArtefactId, ExecuteError> {
-        self.orders.lock().unwrap().push(order.clone());
-        (self.work)(order, report)
-    }
-}
-
-fn fake(
-    work: impl Fn(&TaskOrder, &mut (dyn FnMut(Report) -> Flow + Send)) -> Result<ArtefactId, ExecuteError>
-    + Send
-    + Sync
-    + 'static,
-) -> Arc<Fake> {
-    Arc::new(Fake { work: Box::new(work), orders: Mutex::default() })
-}
-
-/// What a task's result is: a function of the plan and its inputs alone, as in training.
-fn result_of(order: &TaskOrder) -> ArtefactId {
-    ArtefactId::of(format!("{} {} {:?}", order.plan, order.task, order.inputs).as_bytes())
-}
-
-fn broken(message: &str, kind: FailureKind) -> ExecuteError {
+fn failure(message: &str, kind: FailureKind) -> ExecuteError {
     ExecuteError { message: message.into(), kind }
 }
 
-/// A worker of this name.
-fn hand(coordinator_url: String, name: &str) -> worker::Options {
-    let (worker_id, backend) = (name.into(), BACKEND.into());
-    worker::Options { coordinator_url, access: Access::default(), worker_id, backend, memory_bytes: 0 }
-}
-
-/// Runs the plan on workers of this fake; quick retries, a patient lease.
+/// Runs the plan on workers of this executor, with short waits and long leases.
 async fn run(
     workers: usize,
-    fake: &Arc<Fake>,
+    fake: &Arc<FakeExecutor>,
     stop: CancellationToken,
-) -> (Result<Vec<ArtefactId>, LocalError>, Vec<News>) {
+) -> (Result<Vec<ArtefactId>, LocalError>, Vec<Update>) {
     let (store, plan) = stored_plan().await;
     let options = Options { wait_millis: 5, ..Options::new(store) };
-    let mut news = Vec::new();
+    let mut updates = Vec::new();
     let start = |coordinator_url, number, shutdown| {
         let worker_id = format!("local-{number}");
-        worker::run(hand(coordinator_url, &worker_id), fake.clone(), shutdown)
+        worker::run(worker_options(coordinator_url, &worker_id), fake.clone(), shutdown)
     };
-    let result = run_local(options, plan, workers, start, |event| news.push(event.clone()), stop).await;
-    (result, news)
+    let result = run_local(options, plan, workers, start, |event| updates.push(event.clone()), stop).await;
+    (result, updates)
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn two_workers_train_the_tree_in_the_order_of_its_dependencies() {
+async fn two_workers_execute_the_tree_in_dependency_order() {
     let fake = fake(|order, report| {
         for step in 1..=3 {
             let psnr = (step == 3).then_some(20.0 + f64::from(order.task));
@@ -141,7 +73,7 @@ async fn two_workers_train_the_tree_in_the_order_of_its_dependencies() {
         }
         Ok(result_of(order))
     });
-    let (result, news) = run(2, &fake, CancellationToken::new()).await;
+    let (result, updates) = run(2, &fake, CancellationToken::new()).await;
     let results = result.unwrap();
     let (_, plan_id) = stored_plan().await;
     let plan = plan();
@@ -164,42 +96,42 @@ async fn two_workers_train_the_tree_in_the_order_of_its_dependencies() {
     assert_eq!(tasks[0], 0);
     tasks.sort_unstable();
     assert_eq!(tasks, [0, 1, 2, 3, 4, 5, 6], "each task is carried out once");
-    // Every report arrives, in order, before its task is done; a loss that is no number is left out.
+    // Every report arrives, in order, before its task is done. A loss that is not finite is left out.
     for task in 0..7 {
-        let line = |event: &News| match event {
-            News::Reported(reported) if reported.task == task => Some(reported.report.unwrap()),
+        let line = |event: &Update| match event {
+            Update::Reported(reported) if reported.task == task => Some(reported.report.unwrap()),
             _ => None,
         };
-        let lines: Vec<proto::Report> = news.iter().filter_map(line).collect();
+        let lines: Vec<proto::Report> = updates.iter().filter_map(line).collect();
         assert_eq!(lines.iter().map(|line| line.step).collect::<Vec<_>>(), [1, 2, 3]);
         assert!(lines.iter().all(|line| line.loss.is_none()));
         assert_eq!(lines[2].psnr, Some(20.0 + f64::from(task)));
     }
-    assert!(matches!(news.last(), Some(News::Finished(_))));
+    assert!(matches!(updates.last(), Some(Update::Finished(_))));
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_panicking_task_is_retried_then_quarantined_and_the_rest_goes_on() {
+async fn a_panicking_task_is_retried_then_quarantined_and_the_others_go_on() {
     let fake = fake(|order, _| match (order.task, order.attempt) {
         (4, attempt) => panic!("block 4 broke, attempt {attempt}"),
-        (3, 1) => Err(broken("out of luck", FailureKind::Work)),
+        (3, 1) => Err(failure("out of luck", FailureKind::Work)),
         _ => Ok(result_of(order)),
     });
     let (result, _) = run(2, &fake, CancellationToken::new()).await;
-    let line = "task 4 failed in attempt 3: panicked: block 4 broke, attempt 3; 1 that depend on such were not started";
+    let line = "task 4 failed in attempt 3: panicked: block 4 broke, attempt 3; 1 dependent tasks were not started";
     assert_eq!(result, Err(LocalError::Failed(line.into())));
     let count = |task| fake.orders.lock().unwrap().iter().filter(|order| order.task == task).count();
     assert_eq!([0, 1, 2, 3, 4, 5, 6].map(count), [1, 1, 1, 2, 3, 0, 1]);
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_diverged_is_trained_once_more_at_half_the_rate() {
+async fn a_diverged_task_is_retried_once_at_half_the_rate() {
     let fake = fake(|order, _| match (order.task, order.rate_permille) {
-        (3, 1000) | (4, _) => Err(broken("no numbers", FailureKind::Numeric)),
+        (3, 1000) | (4, _) => Err(failure("no numbers", FailureKind::Numeric)),
         _ => Ok(result_of(order)),
     });
     let (result, _) = run(1, &fake, CancellationToken::new()).await;
-    let line = "task 4 failed in attempt 2: no numbers; 1 that depend on such were not started";
+    let line = "task 4 failed in attempt 2: no numbers; 1 dependent tasks were not started";
     assert_eq!(result, Err(LocalError::Failed(line.into())));
     let rates = |task| -> Vec<u32> {
         let orders = fake.orders.lock().unwrap();
@@ -210,15 +142,15 @@ async fn what_diverged_is_trained_once_more_at_half_the_rate() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn wrong_input_fails_the_job_at_once() {
-    let fake = fake(|_, _| Err(broken("photo 7 is no photo", FailureKind::Input)));
+    let fake = fake(|_, _| Err(failure("photo 7 is no photo", FailureKind::Input)));
     let (result, _) = run(1, &fake, CancellationToken::new()).await;
-    let line = "task 0 failed in attempt 1: photo 7 is no photo; 6 that depend on such were not started";
+    let line = "task 0 failed in attempt 1: photo 7 is no photo; 6 dependent tasks were not started";
     assert_eq!(result, Err(LocalError::Input(line.into())));
     assert_eq!(fake.orders.lock().unwrap().len(), 1);
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_cancelled_job_stops_the_work_in_hand() {
+async fn a_cancelled_job_stops_its_running_task() {
     let stop = CancellationToken::new();
     let cancel = stop.clone();
     let fake = fake(move |_, report| {
@@ -226,7 +158,7 @@ async fn a_cancelled_job_stops_the_work_in_hand() {
         while report(Report::default()) == Flow::Continue {
             std::thread::sleep(Duration::from_millis(1));
         }
-        Err(broken("stopped", FailureKind::Work))
+        Err(failure("stopped", FailureKind::Work))
     });
     let (result, _) = run(1, &fake, stop).await;
     assert_eq!(result, Err(LocalError::Cancelled));
@@ -241,7 +173,7 @@ async fn a_job_whose_workers_all_fail_to_start_ends() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_is_not_a_plan_is_refused() {
+async fn an_artefact_that_is_no_plan_is_refused() {
     let store = Store::open("memory://").unwrap();
     let note = store.put(b"not a plan".to_vec().into()).await.unwrap();
     for (plan, why) in [(note, "not a plat 'plan' frame"), (ArtefactId([9; 32]), "is not in the store")] {
@@ -251,7 +183,7 @@ async fn what_is_not_a_plan_is_refused() {
     }
 }
 
-/// A coordinator with one job, and a client; they end with the token.
+/// A coordinator with one job, and a client. They end when the returned token is cancelled.
 async fn host(lease_millis: u64) -> (Client, String, u64, CancellationToken) {
     let (store, plan) = stored_plan().await;
     let mut options = Options { wait_millis: 5, ..Options::new(store.clone()) };
@@ -267,25 +199,12 @@ async fn host(lease_millis: u64) -> (Client, String, u64, CancellationToken) {
     (client, url, job.job, stop)
 }
 
-/// Asks until there is a grant, though not for ever.
-async fn lease(client: &mut Client, worker: &str) -> proto::Attempt {
-    for _ in 0..10_000 {
-        let request = proto::LeaseRequest { worker: worker.into(), backend: BACKEND.into(), ..Default::default() };
-        match client.lease(request).await.unwrap().into_inner().reply.unwrap() {
-            Reply::Grant(grant) => return grant.attempt.unwrap(),
-            Reply::WaitMillis(millis) => tokio::time::sleep(Duration::from_millis(millis.into())).await,
-            Reply::Drained(_) => panic!("drained"),
-        }
-    }
-    panic!("no grant came");
-}
-
 #[tokio::test(flavor = "multi_thread")]
 async fn a_stale_attempt_is_refused() {
     let (mut client, _, job, stop) = host(50).await;
     let zombie = lease(&mut client, "zombie").await;
-    // The zombie is silent, its lease runs out, and the root is granted anew. (On a slow machine it may run out more
-    // than once, so nothing is assumed of the attempt's number.)
+    // The zombie sends no heartbeat, its lease expires, and the root is granted again. (On a slow machine leases may expire more than
+    // once, so the attempt's exact number is not checked.)
     let heir = lease(&mut client, "heir").await;
     assert_eq!((zombie.task, zombie.number, heir.task), (0, 1, 0));
     assert!(heir.number > zombie.number);
@@ -302,7 +221,7 @@ async fn a_stale_attempt_is_refused() {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_leaving_worker_gives_its_task_back() {
     let (mut client, url, job, stop) = host(3_600_000).await;
-    // More often than failures would be forgiven.
+    // More often than the limit of failed attempts.
     for _ in 0..4 {
         let leave = CancellationToken::new();
         let go = leave.clone();
@@ -311,12 +230,12 @@ async fn a_leaving_worker_gives_its_task_back() {
             while report(Report::default()) == Flow::Continue {
                 std::thread::sleep(Duration::from_millis(1));
             }
-            Err(broken("stopped", FailureKind::Work))
+            Err(failure("stopped", FailureKind::Work))
         });
         let coordinator_url = url.clone();
-        worker::run(hand(coordinator_url, "leaving"), slow, leave).await.unwrap();
+        worker::run(worker_options(coordinator_url, "leaving"), slow, leave).await.unwrap();
     }
-    // The leases were for an hour, and the next worker need not wait for their end.
+    // The leases were for an hour, but the next worker gets the task at once.
     let next = lease(&mut client, "next").await;
     assert_eq!((next.task, next.number), (0, 5));
     let status = client.status(proto::StatusRequest { job }).await.unwrap().into_inner();
@@ -333,10 +252,10 @@ async fn a_quiet_executor_keeps_its_lease() {
         }
         Ok(result_of(order))
     });
-    let run = tokio::spawn(worker::run(hand(url, "quiet"), quiet.clone(), stop.clone()));
-    let mut news = client.watch(proto::WatchRequest { job }).await.unwrap().into_inner();
-    while let Some(event) = news.message().await.unwrap() {
-        if let Some(News::Finished(finished)) = event.event {
+    let run = tokio::spawn(worker::run(worker_options(url, "quiet"), quiet.clone(), stop.clone()));
+    let mut updates = client.watch(proto::WatchRequest { job }).await.unwrap().into_inner();
+    while let Some(event) = updates.message().await.unwrap() {
+        if let Some(Update::Finished(finished)) = event.event {
             assert_eq!(finished.outcome(), proto::Outcome::Done);
         }
     }
@@ -396,7 +315,7 @@ async fn a_job_is_paused_resumed_and_retried_and_its_journal_replays() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_comes_off_the_wire_is_checked() {
+async fn requests_are_validated() {
     let (mut client, _, job, stop) = host(3_600_000).await;
     let code = |result: Result<(), tonic::Status>| result.unwrap_err().code();
 
@@ -419,7 +338,7 @@ async fn what_comes_off_the_wire_is_checked() {
     let huge = proto::SubmitRequest { plan: vec![0; 2 * proto::MESSAGE_BYTES_LIMIT], store_url: String::new() };
     assert!(client.submit(huge).await.is_err());
 
-    // None of this did any harm.
+    // None of this had an effect.
     let complete = proto::CompleteRequest { attempt, artefact: vec![0; 32], then: None };
     assert!(client.complete(complete).await.unwrap().into_inner().accepted);
     client.cancel(proto::CancelRequest { job }).await.unwrap();
@@ -429,7 +348,7 @@ async fn what_comes_off_the_wire_is_checked() {
 }
 
 #[tokio::test]
-async fn an_address_beyond_this_machine_is_refused() {
+async fn an_address_beyond_the_loopback_is_refused() {
     let (store, _) = stored_plan().await;
     let listener = TcpListener::bind("0.0.0.0:0").await.unwrap();
     let result = serve(listener, Options::new(store), std::future::pending()).await;

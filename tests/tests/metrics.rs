@@ -1,10 +1,10 @@
-//! The list of metrics in docs/src/metrics.md against what coordinator and worker export.
+//! Compares the metrics that docs/src/metrics.md lists with those that coordinator and worker export.
 
 use std::collections::BTreeSet;
 
 use prometheus_client::registry::Registry;
 
-/// Of each metric `name type labels`, as the document says it.
+/// The documented metrics, each as `name type label`.
 fn documented(section: &str) -> BTreeSet<String> {
     let text = include_str!("../../docs/src/metrics.md");
     let text = text.split("\n## ").find(|part| part.starts_with(section)).expect("the section is there");
@@ -13,13 +13,13 @@ fn documented(section: &str) -> BTreeSet<String> {
         let cells: Vec<&str> = row.split('|').map(str::trim).collect();
         let name = cells[1].trim_matches('`');
         let label = cells[3].split('`').nth(1).unwrap_or_default();
-        assert!(!cells[4].is_empty(), "{name} says nothing");
+        assert!(!cells[4].is_empty(), "{name} has no description");
         format!("{name} {} {label}", cells[2])
     })
     .collect()
 }
 
-/// As Prometheus reads it.
+/// The exported metrics, in the same form.
 fn exported(registry: &Registry) -> BTreeSet<String> {
     let text = telemetry::metrics::text(registry).unwrap();
     let kinds = text.lines().filter_map(|line| line.strip_prefix("# TYPE ")).map(|line| {
@@ -39,7 +39,7 @@ fn exported(registry: &Registry) -> BTreeSet<String> {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_coordinator_exports_what_is_documented() {
+async fn the_coordinators_metrics_are_documented() {
     let options = coordinator::Options::new(store::Store::open("memory://").unwrap());
     let metrics = options.metrics.clone();
     let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
@@ -52,8 +52,8 @@ async fn a_coordinator_exports_what_is_documented() {
     let request = proto::LeaseRequest { worker: "w".into(), backend: "cpu-none".into(), ..Default::default() };
     client.lease(request).await.unwrap();
     let line = "plat_workers{backend=\"cpu-none\"} 1";
-    let is_told = || telemetry::metrics::text(&registry).unwrap().lines().any(|other| other == line);
-    while !is_told() {
+    let is_exported = || telemetry::metrics::text(&registry).unwrap().lines().any(|other| other == line);
+    while !is_exported() {
         assert!(!serving.is_finished());
         tokio::time::sleep(std::time::Duration::from_millis(20)).await;
     }
@@ -63,7 +63,7 @@ async fn a_coordinator_exports_what_is_documented() {
 }
 
 #[test]
-fn a_worker_exports_what_is_documented() {
+fn the_workers_metrics_are_documented() {
     let mut registry = Registry::default();
     worker::Shared::default().metrics.register(&mut registry);
     assert_eq!(exported(&registry), documented("Worker"));

@@ -1,19 +1,18 @@
-# Who may do what in the bucket, as plain values: this module needs no provider, so that what it says can be tested anywhere.
+# Permissions in the bucket by role, as plain values. This module needs no provider, so that its tests run anywhere.
 #
 #                 artefacts/   names/leader/   names/results/, names/checkpoints/   names/ingest/   state/
 #   coordinator   all          all             all                                  all             all       (plat forget deletes)
 #   worker        read, add    read            read, write                          read            -
 #   client        read, add    read            -                                    read, write     -
 #
-# So a worker that was broken into can waste work, which the hashes of artefacts show; it can touch neither the jobs' state nor the
-# lease that says who leads.
+# So a compromised worker can waste work, which the artefacts' hashes reveal, but cannot change the jobs' state or the leader's lease.
 
 locals {
   partition = split(":", var.oidc_provider_arn)[1]
   issuer    = split(":oidc-provider/", var.oidc_provider_arn)[1]
   arn       = "arn:${local.partition}:s3:::${var.bucket}"
 
-  # By role: folders that it reads, writes and empties.
+  # By role: folders that it reads, writes and deletes from.
   access = {
     coordinator = { reads = ["*"], writes = ["*"], deletes = ["*"] }
     worker = {
@@ -37,7 +36,7 @@ locals {
           Resource                         = [for folder in folders : "${local.arn}/${var.prefix}/${folder}"]
         } if length(folders) > 0
       ],
-      # Without this an object that is not there looks like one that may not be read.
+      # Without this permission a missing object is reported as a forbidden one.
       [{
         Effect    = "Allow"
         Action    = ["s3:ListBucket"]
@@ -49,7 +48,7 @@ locals {
 }
 
 output "bucket" {
-  description = "The bucket's policy (JSON): nothing without encryption on the way."
+  description = "The bucket's policy (JSON): refuses requests without TLS."
   value = jsonencode({
     Version = "2012-10-17"
     Statement = [{
@@ -64,7 +63,7 @@ output "bucket" {
 }
 
 output "roles" {
-  description = "By role: who may take it (trust) and what it may do (access), both JSON."
+  description = "By role: who may assume it (trust) and its permissions (access), both JSON."
   value = {
     for role, statements in local.statements : role => {
       access = jsonencode({ Version = "2012-10-17", Statement = statements })

@@ -8,7 +8,7 @@ variable "bucket" {
 }
 
 variable "prefix" {
-  description = "Where one cluster keeps its objects in the bucket."
+  description = "Prefix of one cluster's objects in the bucket."
   type        = string
   validation {
     condition     = can(regex("^[A-Za-z0-9_-][A-Za-z0-9._-]*(/[A-Za-z0-9_-][A-Za-z0-9._-]*)*$", var.prefix))

@@ -52,7 +52,7 @@ run "a_role_is_for_its_service_account_alone" {
         "oidc.eks.eu-north-1.amazonaws.com/id/ABC:sub" = "system:serviceaccount:plat:${name}"
       }
     ])
-    error_message = "a role can be taken by another service account"
+    error_message = "another service account can assume a role"
   }
   assert {
     condition     = toset(keys(output.roles)) == toset(["client", "coordinator", "worker"])
@@ -64,7 +64,7 @@ run "plain_http_is_refused" {
   command = apply
   assert {
     condition     = jsondecode(output.bucket).Statement[0].Effect == "Deny" && jsondecode(output.bucket).Statement[0].Condition.Bool["aws:SecureTransport"] == "false"
-    error_message = "the bucket answers without encryption"
+    error_message = "the bucket accepts requests without TLS"
   }
 }
 

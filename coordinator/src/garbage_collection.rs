@@ -1,33 +1,33 @@
-//! What a job leaves in the store, deleted once the job is not wanted any more: its plan, its tasks' results, and the records by
-//! which workers would find them again. What another job or any other record refers to stays.
+//! Deletes the objects of a forgotten job from the store: its plan, its tasks' results, and the records by which workers find them. Objects
+//! that another job or any other record refers to are kept.
 //!
-//! Photos stay, as the record of their ingest refers to them. What a result itself refers to (exposures) stays, too: nothing
-//! here knows what the bytes of an artefact mean.
+//! Photos are kept, as the record of their ingest refers to them. Objects that a result itself refers to (exposures) are kept as well,
+//! because the contents of artefacts are not parsed here.
 
 use std::collections::BTreeSet;
 
 use scene::ArtefactId;
 use store::{Store, StoreError};
 
-/// Checkpoints hold what they need, and leases name nobody's artefact.
+/// Checkpoints contain their data, and leases name no artefact.
 const FOLDERS_WITHOUT_REFERENCES: [&str; 2] = ["checkpoints", proto::leader::FOLDER];
 
-/// What a job that is over leaves, as the coordinator knows it.
+/// The objects of a finished job that may be deleted.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub(crate) struct Leftovers {
+pub(crate) struct Garbage {
     /// Its artefacts, without those of other jobs.
     pub(crate) artefacts: BTreeSet<ArtefactId>,
-    /// Of each task the key under which workers remember it.
+    /// The key of each task's result and checkpoint records.
     pub(crate) keys: BTreeSet<ArtefactId>,
 }
 
-impl Leftovers {
-    /// Deletes them, and says how many artefacts that were.
+impl Garbage {
+    /// Deletes them; returns the number of artefacts that were deleted.
     ///
     /// # Errors
-    /// The store fails; doing it again goes on.
+    /// The store fails; the deletion can be repeated.
     pub(crate) async fn delete(mut self, store: &Store) -> Result<u32, StoreError> {
-        // First nobody finds them, then they go.
+        // The records are removed first, so that no worker finds a result that is about to be deleted.
         for key in &self.keys {
             for folder in ["results", "checkpoints"] {
                 store.remove_record(&format!("{folder}/{key}")).await?;
@@ -37,7 +37,7 @@ impl Leftovers {
             if FOLDERS_WITHOUT_REFERENCES.iter().any(|folder| name.split('/').next() == Some(folder)) {
                 continue;
             }
-            // Whatever the record means: 32 bytes that are an artefact's name refer to it.
+            // Any 32 bytes of a record that equal an artefact's name count as a reference.
             for part in store.get_record(&name).await?.unwrap_or_default().windows(32) {
                 if let Ok(id) = part.try_into() {
                     self.artefacts.remove(&ArtefactId(id));
@@ -56,7 +56,7 @@ mod tests {
     use super::*;
 
     #[tokio::test]
-    async fn what_others_refer_to_stays() {
+    async fn referenced_objects_are_kept() {
         let store = Store::open("memory://").unwrap();
         let mut ids = Vec::new();
         for text in ["plan", "result", "shared result", "ingested", "checkpointed"] {
@@ -70,15 +70,15 @@ mod tests {
         let memo = [b"some bytes before ".as_slice(), &ingested.0, b" and after"].concat();
         store.put_record("ingest/photos", memo.into()).await.unwrap();
         store.put_record(&format!("checkpoints/{other}"), checkpointed.0.to_vec().into()).await.unwrap();
-        let left = Leftovers { artefacts: ids.iter().copied().collect(), keys: BTreeSet::from([own]) };
-        assert_eq!(left.clone().delete(&store).await.unwrap(), 3);
+        let garbage = Garbage { artefacts: ids.iter().copied().collect(), keys: BTreeSet::from([own]) };
+        assert_eq!(garbage.clone().delete(&store).await.unwrap(), 3);
         for (id, stays) in [(plan, false), (result, false), (shared, true), (ingested, true), (checkpointed, false)] {
             assert_eq!(store.exists(id).await.unwrap(), stays, "{id}");
         }
         let names = store.record_names("").await.unwrap();
         assert_eq!(names, [format!("checkpoints/{other}"), "ingest/photos".into(), format!("results/{other}")]);
-        // Once more finds nothing that the first left: those that stay are still referred to.
-        assert_eq!(left.delete(&store).await.unwrap(), 3);
+        // A second run deletes nothing more: the rest is still referred to.
+        assert_eq!(garbage.delete(&store).await.unwrap(), 3);
         assert!(store.exists(shared).await.unwrap());
     }
 }

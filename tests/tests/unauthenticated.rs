@@ -1,4 +1,4 @@
-//! Who may call a coordinator and who may not: certificates, tokens, versions, sizes, and bytes that are no calls at all.
+//! Tests which clients a coordinator admits: certificates, tokens, protocol versions, message sizes, and bytes that are not gRPC.
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -22,7 +22,7 @@ use worker::{Execute, ExecuteError, Flow, Report, TaskOrder, WorkerError};
 
 const TOKEN: &str = "a-token-of-enough-characters";
 
-/// Signs certificates.
+/// A certificate authority.
 struct Authority {
     certificate: Vec<u8>,
     issuer: Issuer<'static, rcgen::KeyPair>,
@@ -45,7 +45,7 @@ impl Authority {
     }
 }
 
-/// A coordinator; it ends with the token.
+/// A coordinator. It ends when the returned token is cancelled.
 async fn host(listen: &str, security: Security) -> (SocketAddr, CancellationToken) {
     let listener = TcpListener::bind(listen).await.unwrap();
     let address = SocketAddr::from(([127, 0, 0, 1], listener.local_addr().unwrap().port()));
@@ -55,56 +55,58 @@ async fn host(listen: &str, security: Security) -> (SocketAddr, CancellationToke
     (address, stop)
 }
 
-/// What comes of the simplest call.
+/// The result of the simplest call.
 async fn call(url: &str, access: &Access) -> Result<(), Status> {
     let mut client = proto::connect(url, access).unwrap();
     client.about(proto::AboutRequest {}).await.map(|_| ())
 }
 
-/// Never has anything to do.
+/// An executor that gets no task.
 struct Idle;
 
 impl Execute for Idle {
     fn execute(&self, _: &TaskOrder, _: &mut (dyn FnMut(Report) -> Flow + Send)) -> Result<ArtefactId, ExecuteError> {
-        unreachable!("nobody submits anything")
+        unreachable!("no job is submitted")
     }
 }
 
-/// How a worker ends that is not to find work.
+/// The result of a worker that is to be refused.
 async fn work(coordinator_url: String, access: Access) -> Result<(), WorkerError> {
-    let (worker_id, backend) = ("stranger".into(), "cpu-none".into());
+    let (worker_id, backend) = ("refused".into(), "cpu-none".into());
     let options = worker::Options { coordinator_url, access, worker_id, backend, memory_bytes: 0 };
     tokio::time::timeout(Duration::from_secs(60), worker::run(options, Arc::new(Idle), CancellationToken::new()))
         .await
-        .expect("a worker that is refused does not wait")
+        .expect("a refused worker does not retry")
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn beyond_this_machine_callers_need_trust_and_the_token() {
+async fn beyond_the_loopback_clients_need_the_authority_and_the_token() {
     let (authority, other) = (Authority::new(), Authority::new());
     let token = Token::new(TOKEN).ok();
     let security = Security { identity: Some(authority.pair()), client_authority: None, token: token.clone() };
     let (address, stop) = host("0.0.0.0:0", security).await;
     let url = format!("https://{address}");
-    let friend = Access { authority: Some(authority.certificate.clone()), identity: None, token };
-    call(&url, &friend).await.unwrap();
+    let valid = Access { authority: Some(authority.certificate.clone()), identity: None, token };
+    call(&url, &valid).await.unwrap();
 
-    let nobody = Access { token: None, ..friend.clone() };
-    let stranger = Access { token: Token::new("another-token-of-enough-characters").ok(), ..friend.clone() };
-    for (access, wanted) in [(&nobody, "asks for a token"), (&stranger, "not this coordinator's")] {
+    let no_token = Access { token: None, ..valid.clone() };
+    let wrong_token = Access { token: Token::new("another-token-of-enough-characters").ok(), ..valid.clone() };
+    for (access, wanted) in [(&no_token, "requires a token"), (&wrong_token, "not this coordinator's")] {
         let status = call(&url, access).await.unwrap_err();
         assert!(status.code() == Code::Unauthenticated && status.message().contains(wanted), "{status}");
         assert!(!status.message().contains(TOKEN));
         let refused = work(url.clone(), access.clone()).await.unwrap_err();
         assert!(matches!(&refused, WorkerError::Refused(why) if why.contains(wanted)), "{refused}");
     }
-    let misled = Access { authority: Some(other.certificate.clone()), ..friend.clone() };
-    let status = call(&url, &misled).await.unwrap_err();
+    let wrong_authority = Access { authority: Some(other.certificate.clone()), ..valid.clone() };
+    let status = call(&url, &wrong_authority).await.unwrap_err();
     assert!(status.code() == Code::Unavailable && proto::explain(&status).contains("certificate"), "{status:?}");
-    // (The token would not be sent without encryption.)
+    let refused = work(url.clone(), wrong_authority).await.unwrap_err().to_string();
+    assert!(refused.starts_with("--tls-ca") && refused.contains("not valid"), "{refused}");
+    // (The client does not send the token unencrypted.)
     let open = call(&format!("http://{address}"), &Access::default()).await.unwrap_err();
     assert_ne!(open.code(), Code::Ok);
-    // Whether it is alive, anyone may ask who trusts it.
+    // The health check needs no token.
     let tls = tonic::transport::ClientTlsConfig::new()
         .ca_certificate(tonic::transport::Certificate::from_pem(&authority.certificate));
     let channel = Endpoint::from_shared(url.clone()).unwrap().tls_config(tls).unwrap().connect_lazy();
@@ -115,7 +117,7 @@ async fn beyond_this_machine_callers_need_trust_and_the_token() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_coordinator_may_ask_for_certificates() {
+async fn a_coordinator_may_require_client_certificates() {
     let (authority, other) = (Authority::new(), Authority::new());
     let token = Token::new(TOKEN).ok();
     let client_authority = Some(authority.certificate.clone());
@@ -124,16 +126,48 @@ async fn a_coordinator_may_ask_for_certificates() {
     let url = format!("https://{address}");
     let with = |identity| Access { authority: Some(authority.certificate.clone()), identity, token: token.clone() };
     call(&url, &with(Some(authority.pair()))).await.unwrap();
-    for stranger in [None, Some(other.pair())] {
-        // TLS 1.3 refuses a certificate once its owner has begun to speak: how the broken connection shows is a matter of time.
-        let refused = call(&url, &with(stranger)).await.unwrap_err();
+    for (identity, problem) in
+        [(None, "requires a client certificate"), (Some(other.pair()), "rejects the client certificate")]
+    {
+        // In TLS 1.3 the alert arrives after the client's handshake, so gRPC's error code depends on timing.
+        let refused = call(&url, &with(identity.clone())).await.unwrap_err();
         assert!(matches!(refused.code(), Code::Unavailable | Code::Unknown | Code::Cancelled), "{refused:?}");
+        // A worker does not retry: it ends with the flags to give.
+        let refused = work(url.clone(), with(identity)).await.unwrap_err();
+        assert!(matches!(&refused, WorkerError::Input(input) if input.subject == "--tls-cert"), "{refused}");
+        let line = refused.to_string();
+        assert!(line.contains(problem) && line.contains("--tls-key") && line.lines().count() == 1, "{line}");
     }
     stop.cancel();
 }
 
+/// Neither a refused connection nor one that breaks in the handshake is about certificates: the worker retries until shutdown.
+#[tokio::test(flavor = "multi_thread")]
+async fn network_errors_do_not_end_a_worker() {
+    let authority = Authority::new();
+    let access = Access { authority: Some(authority.certificate.clone()), ..Access::default() };
+    let broken = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let broken_url = format!("https://{}", broken.local_addr().unwrap());
+    // Accepts and closes at once.
+    tokio::spawn(async move { while broken.accept().await.is_ok() {} });
+    let closed = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let closed_url = format!("https://{}", closed.local_addr().unwrap());
+    drop(closed);
+    for coordinator_url in [broken_url, closed_url] {
+        assert_eq!(proto::rejected_certificate(&coordinator_url, &access).await, None, "{coordinator_url}");
+        let (worker_id, backend) = ("w".into(), "cpu-none".into());
+        let options = worker::Options { coordinator_url, access: access.clone(), worker_id, backend, memory_bytes: 0 };
+        let shutdown = CancellationToken::new();
+        let running = tokio::spawn(worker::run(options, Arc::new(Idle), shutdown.clone()));
+        tokio::time::sleep(Duration::from_secs(1)).await;
+        assert!(!running.is_finished());
+        shutdown.cancel();
+        running.await.unwrap().unwrap();
+    }
+}
+
 #[tokio::test]
-async fn a_certificate_that_is_none_is_said_before_anyone_calls() {
+async fn an_invalid_certificate_ends_the_coordinator_at_its_start() {
     let pair = KeyPair { certificate: b"no certificate".to_vec(), key: b"no key".to_vec() };
     let security = Security { identity: Some(pair), token: Token::new(TOKEN).ok(), client_authority: None };
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
@@ -143,33 +177,34 @@ async fn a_certificate_that_is_none_is_said_before_anyone_calls() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn an_old_worker_is_told_to_update() {
+async fn an_outdated_worker_is_refused_with_advice_to_update() {
     let (address, stop) = host("127.0.0.1:0", Security::default()).await;
     let channel = Endpoint::from_shared(format!("http://{address}")).unwrap().connect_lazy();
     let request = || proto::LeaseRequest { worker: "old".into(), backend: "cpu-none".into(), ..Default::default() };
-    // The first version of the wire did not say its number.
-    let silent = CoordinatorClient::new(channel.clone()).lease(request()).await.unwrap_err();
-    let said = |version: &'static str| {
+    // The first protocol version did not send its number.
+    let unversioned = CoordinatorClient::new(channel.clone()).lease(request()).await.unwrap_err();
+    let with_version = |version: &'static str| {
         move |mut request: Request<()>| {
             request.metadata_mut().insert(proto::VERSION_HEADER, version.parse().unwrap());
             Ok(request)
         }
     };
-    let older = CoordinatorClient::with_interceptor(channel.clone(), said("1")).lease(request()).await.unwrap_err();
-    for status in [silent, older] {
+    let older =
+        CoordinatorClient::with_interceptor(channel.clone(), with_version("1")).lease(request()).await.unwrap_err();
+    for status in [unversioned, older] {
         assert_eq!(status.code(), Code::FailedPrecondition);
         assert!(status.message().contains("too old") && status.message().contains("update it"), "{status}");
     }
-    let newer = CoordinatorClient::with_interceptor(channel, said("99")).lease(request()).await.unwrap_err();
+    let newer = CoordinatorClient::with_interceptor(channel, with_version("99")).lease(request()).await.unwrap_err();
     assert!(newer.message().contains("update the coordinator"), "{newer}");
-    // None of them is known as a worker.
+    // None of them was registered as a worker.
     let mut client = proto::connect(&format!("http://{address}"), &Access::default()).unwrap();
     assert!(client.about(proto::AboutRequest {}).await.unwrap().into_inner().backends.is_empty());
     stop.cancel();
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_is_too_large_or_no_call_at_all_does_no_harm() {
+async fn oversize_messages_and_random_bytes_have_no_effect() {
     let (address, stop) = host("127.0.0.1:0", Security::default()).await;
     let url = format!("http://{address}");
     let channel = Endpoint::from_shared(url.clone()).unwrap().connect_lazy();
@@ -177,14 +212,14 @@ async fn what_is_too_large_or_no_call_at_all_does_no_harm() {
         request.metadata_mut().insert(proto::VERSION_HEADER, proto::VERSION.into());
         Ok(request)
     };
-    // A client that does not keep to the limit itself.
+    // A client without the message limit.
     let mut large = CoordinatorClient::with_interceptor(channel, version).max_encoding_message_size(usize::MAX);
     for bytes in [proto::MESSAGE_BYTES_LIMIT + 1, 8 * proto::MESSAGE_BYTES_LIMIT] {
         let request = proto::SubmitRequest { plan: vec![0; bytes], store_url: String::new() };
         let status = large.submit(request).await.unwrap_err();
         assert!(status.code() == Code::OutOfRange && status.message().contains("too large"), "{status}");
     }
-    // Bytes that are no HTTP/2, that begin as such and go on at random, and silence.
+    // Bytes that are not HTTP/2, random bytes after an HTTP/2 preface, and connections that send nothing.
     let mut silent = Vec::new();
     for seed in 0..200u64 {
         let mut stream = TcpStream::connect(address).await.unwrap();
@@ -192,7 +227,7 @@ async fn what_is_too_large_or_no_call_at_all_does_no_harm() {
             stream.write_all(b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n").await.unwrap();
         }
         let noise = (0..512u64).flat_map(|i| ArtefactId::of(&(seed << 32 | i).to_le_bytes()).0).collect::<Vec<u8>>();
-        // It may have hung up already.
+        // The coordinator may have closed the connection already.
         let _ = stream.write_all(&noise[..(seed as usize * 83) % noise.len()]).await;
         if seed % 10 == 0 {
             silent.push(stream);
