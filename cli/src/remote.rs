@@ -142,7 +142,7 @@ async fn watch(
         let Some(event) = event.event else { continue };
         *pause = Duration::from_millis(100);
         if let Event::Changed(changed) = &event {
-            results.note(changed.clone()).map_err(Lost::Job)?;
+            results.update(changed.clone()).map_err(Lost::Job)?;
         }
         on_update(results, &event);
         if let Event::Finished(finished) = event {
