@@ -1,8 +1,9 @@
 use std::collections::BTreeMap;
+use std::fs;
 use std::path::PathBuf;
 
-use city::faults::FaultKind;
-use city::{Layout, Traffic};
+use city::faults::{Fault, FaultKind};
+use city::{CitySettings, Layout, Traffic};
 use glam::{DVec2, DVec3};
 
 use super::*;

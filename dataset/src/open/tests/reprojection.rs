@@ -25,7 +25,7 @@ fn points_project_to_their_real_keypoints() {
             let ([fx, fy, cx, cy], k) = (model.focal_and_centre(), camera.pinhole);
             for &(keypoint, point) in &keypoints[&image.id] {
                 let bent = DVec2::new((keypoint.x - cx) / fx, (keypoint.y - cy) / fy);
-                let ideal = lens::undistort(&model, bent).unwrap();
+                let ideal = undistortion::undistort(&model, bent).unwrap();
                 let (pixel, depth) = camera.project(positions[&point]);
                 assert!(depth > 0.0);
                 errors.push(pixel.distance(DVec2::new(k.fx * ideal.x + k.cx, k.fy * ideal.y + k.cy)));
