@@ -211,7 +211,7 @@ fn new_pixels_by_height(tasks: &[Task], positions: &[TreePosition], capture: &Ca
     for (height, coverage) in heights.into_iter().rev() {
         let weight = if height > 0 { INNER_WEIGHT } else { 1.0 };
         first.insert(height, weight * coverage.new_pixels(&before, REPEATED_PIXEL_WEIGHT));
-        before = coverage.union(before);
+        before = coverage.max_per_view(before);
     }
     first
 }

@@ -1,7 +1,8 @@
 //! The cost model of a training step.
 //!
-//! One model serves three users: `budgets` divides the work of a plan by it, the worker's progress estimate scales with
-//! it, and the coordinator derives the scheduler's estimate of a task's duration from it.
+//! `budgets` divides the work of a plan by it, and the coordinator derives the scheduler's estimate of a task's duration
+//! from it. Its constants decide how many steps a block gets, so a change of them changes every model. The worker's
+//! estimate of a plan's CPU time has constants of its own.
 
 use crate::ground::HALO_SCALE;
 use crate::plan::Task;
@@ -39,11 +40,10 @@ impl StepCost {
 
     /// The mean cost of a step of this task.
     pub fn of(task: &Task) -> Self {
-        let splats = f64::from(task.budget) * if task.block.level == 0 { 1.0 } else { HALO_AREA };
         Self {
             pixels: task.window_pixels() as f64 / task.views.len().max(1) as f64,
             visible: PER_VISIBLE * f64::from(task.visible_splats),
-            trained: PER_TRAINED * splats,
+            trained: PER_TRAINED * trained_splats(task),
             context: PER_FROZEN * f64::from(task.visible_context_splats),
         }
     }
@@ -52,6 +52,11 @@ impl StepCost {
     pub fn total(&self) -> f64 {
         self.pixels + self.visible + self.trained + self.context
     }
+}
+
+/// Splats of core and halo at the end of a task.
+pub fn trained_splats(task: &Task) -> f64 {
+    f64::from(task.budget) * if task.block.level == 0 { 1.0 } else { HALO_AREA }
 }
 
 /// The cost of one epoch of a task (one step on each of its windows), pixels.

@@ -1,6 +1,7 @@
-//! Pixel coverage: how many pixels of the photos a set of windows shows, each pixel counted once.
+//! Pixel coverage: for each view, how many pixels a set of training windows shows. This is an upper bound: the windows' areas
+//! are added up, and the sum is capped at the area of the image.
 //!
-//! The planner uses it to measure how much detail a level of the tree adds to the level above.
+//! The planner takes the difference of two levels' coverage as the detail that the finer level adds.
 
 use std::collections::BTreeMap;
 
@@ -8,7 +9,7 @@ use scene::Capture;
 
 use crate::plan::ViewUse;
 
-/// The covered pixels of each view, by view index.
+/// The coverage of each view, by view index. All windows of a view have the same mip.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct PixelCoverage(BTreeMap<u32, ViewCoverage>);
 
@@ -21,6 +22,7 @@ struct ViewCoverage {
 }
 
 impl ViewCoverage {
+    /// Upper bound of the number of covered pixels.
     fn pixels(self) -> u64 {
         self.in_windows.min(self.in_image)
     }
@@ -42,22 +44,22 @@ impl PixelCoverage {
         self.0.values().map(|of_view| of_view.in_windows).sum()
     }
 
-    /// Pixels that this coverage has beyond `coarser`: detail that is new at this level. Each view contributes at least
-    /// the share `min_share` of its pixels.
+    /// For each view, how many more pixels are covered than by `coarser`: detail that is new at this level. Each view
+    /// contributes at least the share `min_share` of its covered pixels, so that every level gets some work.
     pub(crate) fn new_pixels(&self, coarser: &Self, min_share: f64) -> f64 {
-        let of_views = self.0.iter().map(|(view, now)| {
-            let before = coarser.0.get(view).map_or(0, |before| before.pixels());
-            (now.pixels().saturating_sub(before) as f64).max(min_share * now.pixels() as f64)
+        let of_views = self.0.iter().map(|(view, finer)| {
+            let coarser = coarser.0.get(view).map_or(0, |coarser| coarser.pixels());
+            (finer.pixels().saturating_sub(coarser) as f64).max(min_share * finer.pixels() as f64)
         });
         of_views.sum()
     }
 
-    /// The union of both: for each view the larger coverage.
-    pub(crate) fn union(mut self, other: Self) -> Self {
+    /// For each view the larger of both coverages.
+    pub(crate) fn max_per_view(mut self, other: Self) -> Self {
         for (view, other) in other.0 {
-            let now = self.0.entry(view).or_insert(other);
-            if other.pixels() > now.pixels() {
-                *now = other;
+            let largest = self.0.entry(view).or_insert(other);
+            if other.pixels() > largest.pixels() {
+                *largest = other;
             }
         }
         self
@@ -72,7 +74,7 @@ mod tests {
     use crate::testing::aerial;
 
     #[test]
-    fn pixels_count_once() {
+    fn covered_pixels_are_capped_at_the_image() {
         let capture = aerial(3, 60.0, 300);
         let camera = capture.views[0].camera;
         let covered = |mip: u8, windows: u32| {
@@ -86,7 +88,7 @@ mod tests {
         assert_eq!(covered(0, 3).new_pixels(&PixelCoverage::default(), 0.0), area as f64);
         assert_eq!(covered(0, 3).new_pixels(&covered(1, 1), 0.0), 0.75 * area as f64);
         assert_eq!(covered(0, 3).new_pixels(&covered(0, 1), 0.05), 0.05 * area as f64);
-        assert_eq!(covered(1, 1).union(covered(0, 1)).new_pixels(&covered(0, 1), 0.0), 0.0);
+        assert_eq!(covered(1, 1).max_per_view(covered(0, 1)).new_pixels(&covered(0, 1), 0.0), 0.0);
         // A window smaller than the image covers only its own pixels.
         let mut corner = PixelCoverage::default();
         let window = Rect { x: 0, y: 0, width: 16, height: 16 };

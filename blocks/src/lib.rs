@@ -28,7 +28,7 @@ mod view_selection;
 mod visibility;
 
 pub use budgets::initial_splats;
-pub use cost::StepCost;
+pub use cost::{StepCost, trained_splats};
 pub use cut::{cut, keep_core, merge, merge_cut};
 pub use draw::draw;
 pub use ground::{Ground, Square};

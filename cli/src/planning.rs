@@ -3,6 +3,7 @@
 use blocks::{Plan, Severity};
 use scene::{ArtefactId, Capture, frame};
 use worker::estimate::Estimate;
+use worker::speed::relative_speed;
 
 use crate::args::PlanOptions;
 use crate::captures;
@@ -32,7 +33,7 @@ pub(crate) fn check_plan(plan: &Plan, capture: &Capture, output: &Output) -> Res
 
 /// The plan as text, a line per level.
 pub(crate) fn describe(plan: &Plan) -> String {
-    let estimate = Estimate::of(plan);
+    let estimate = Estimate::of(plan, relative_speed());
     let mut text = format!(
         "{:?} plan of {} level{}, {} task{}, root {:.1} m: about {:.0} CPU seconds and {} MB a task\n",
         plan.settings.mode,

@@ -4,7 +4,8 @@ use std::hash::Hash;
 
 use lru::LruCache;
 
-/// Values by key. Inserting evicts the least recently used values until the total size fits the limit.
+/// Values by key. Inserting evicts the least recently used values until the new value fits the limit. Sizes are those that
+/// the caller gives; keys are not counted.
 #[derive(Debug)]
 pub struct ByteLru<K: Hash + Eq, V> {
     /// Size in bytes and value.
@@ -39,8 +40,9 @@ impl<K: Hash + Eq, V> ByteLru<K, V> {
         self.entries.get(key).map(|(_, value)| value)
     }
 
-    /// Inserts a value of `bytes` bytes. Does nothing if the key has a value already or the value alone exceeds the limit.
-    pub fn put(&mut self, key: K, value: V, bytes: usize) {
+    /// Inserts a value that takes `bytes` bytes. Does nothing if the key has a value already, which then stays as old as it
+    /// was, or if the value alone exceeds the limit.
+    pub fn insert_if_absent(&mut self, key: K, value: V, bytes: usize) {
         if bytes > self.limit || self.entries.contains(&key) {
             return;
         }
@@ -61,16 +63,16 @@ mod tests {
     #[test]
     fn the_least_recently_used_is_evicted_first() {
         let mut cache = ByteLru::new(100);
-        cache.put('a', 1, 40);
-        cache.put('b', 2, 40);
+        cache.insert_if_absent('a', 1, 40);
+        cache.insert_if_absent('b', 2, 40);
         assert_eq!(cache.get(&'a'), Some(&1));
-        cache.put('c', 3, 40);
+        cache.insert_if_absent('c', 3, 40);
         assert_eq!(['a', 'b', 'c'].map(|key| cache.contains(&key)), [true, false, true]);
-        cache.put('d', 4, 101);
+        cache.insert_if_absent('d', 4, 101);
         assert_eq!((cache.get(&'d').copied(), cache.bytes()), (None, 80), "a value over the limit evicts nothing");
-        cache.put('a', 5, 1);
+        cache.insert_if_absent('a', 5, 1);
         assert_eq!((cache.get(&'a').copied(), cache.bytes()), (Some(1), 80));
-        cache.put('e', 6, 100);
+        cache.insert_if_absent('e', 6, 100);
         assert_eq!((cache.contains(&'a'), cache.get(&'e').copied(), cache.bytes()), (false, Some(6), 100));
     }
 }

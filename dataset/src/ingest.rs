@@ -207,7 +207,8 @@ impl Job<'_> {
             photo.rgb = undistorter.rgb(&photo.rgb);
         }
         let Pinhole { width, height, .. } = undistorter.pinhole();
-        let mut pixels = Pixels { width, height, rgb: photo::planes(&photo.rgb), mask: photo.mask };
+        let mut pixels =
+            Pixels { width, height, rgb: photo::planes(&photo.rgb), mask: photo.mask, weights: None, depth: None };
         drop(photo.rgb);
         if self.downscale > 1 {
             pixels = mips::downscale(&pixels, self.downscale);

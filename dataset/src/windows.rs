@@ -258,7 +258,7 @@ impl Shared {
     }
 
     fn insert(&self, key: WindowKey, pixels: &Arc<Pixels>) {
-        self.cache().windows.put(key, Arc::clone(pixels), memory_bytes(pixels));
+        self.cache().windows.insert_if_absent(key, Arc::clone(pixels), memory_bytes(pixels));
     }
 
     fn cache(&self) -> MutexGuard<'_, WindowCache> {

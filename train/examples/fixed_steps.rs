@@ -38,7 +38,7 @@ fn steps() -> Splats {
         let mut renderer = Renderer::default();
         let frame = renderer.forward(&truth, Some(&context), &view.camera, &Options::default());
         let rgb = frame.colour.iter().map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u8).collect();
-        Arc::new(Pixels { width: WIDTH, height: HEIGHT, rgb, mask: None })
+        Arc::new(Pixels { width: WIDTH, height: HEIGHT, rgb, mask: None, weights: None, depth: None })
     };
     let photos = Photos(views.iter().map(photo).collect());
     let recipe = Recipe { coarse: Vec::new(), sh_from: [0.0; 3], ..Recipe::default() };

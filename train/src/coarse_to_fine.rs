@@ -1,4 +1,5 @@
-//! Decides from the training error when to go to a finer mip and when to end growth.
+//! Measures what decides when to go to a finer mip and when to end growth. The trainer compares the measurements with the
+//! recipe.
 //!
 //! The mean absolute error of an epoch (every view once) is a by-product of training. Two rules use it:
 //!
@@ -86,15 +87,15 @@ pub(crate) struct CoarseToFine {
     pub(crate) stage_start: u32,
     /// Errors of the current epoch.
     pub(crate) tally: Tally,
-    /// For each epoch of this stage: number of splats at its end, and mean absolute error in dB.
+    /// For each epoch of this stage: number of splats at its end, and -20 log10 of the mean absolute error (higher is better).
     epochs: Vec<(u32, f32)>,
 }
 
 impl CoarseToFine {
-    /// Ends an epoch of `epoch` steps. Returns its mean error, or `None` if a step was skipped.
-    pub(crate) fn end_epoch(&mut self, splats: usize, epoch: u32) -> Option<f64> {
+    /// Ends an epoch of `steps` steps with `splats` splats. Returns its mean error, or `None` if a step was skipped.
+    pub(crate) fn end_epoch(&mut self, splats: usize, steps: u32) -> Option<f64> {
         let Tally { sum, count } = std::mem::take(&mut self.tally);
-        let (mean, full) = (sum / f64::from(count.max(1)), count == epoch);
+        let (mean, full) = (sum / f64::from(count.max(1)), count == steps);
         if full {
             self.epochs.push((splats as u32, (-20.0 * mean.max(1e-9).log10()) as f32));
         }
@@ -108,13 +109,13 @@ impl CoarseToFine {
         self.epochs.clear();
     }
 
-    /// True if the last growth by at least a factor of 1.3 gained less than `worth_db` for each five percent of splats.
+    /// True if the last growth by at least [`MIN_MEASURED_GROWTH`] gained less than `worth_db` for each five percent of splats.
     pub(crate) fn growth_gains_less_than(&self, worth_db: f64) -> bool {
         let Some(&(splats, now)) = self.epochs.last() else { return false };
         let before = self.epochs.iter().rev().find(|(n, _)| f64::from(*n) * MIN_MEASURED_GROWTH <= f64::from(splats));
         before.is_some_and(|&(n, then)| {
-            let growth_steps = (f64::from(splats) / f64::from(n.max(1))).ln() / 1.05f64.ln();
-            f64::from(now - then) < worth_db * growth_steps
+            let five_percents = (f64::from(splats) / f64::from(n.max(1))).ln() / 1.05f64.ln();
+            f64::from(now - then) < worth_db * five_percents
         })
     }
 }
@@ -136,7 +137,7 @@ mod tests {
             let grey = |x: u32| if mip > 0 { 100 } else { 80 + 40 * ((rect.x + x) % 2) as u8 };
             let row: Vec<u8> = (0..rect.width).map(grey).collect();
             let rgb = row.repeat(3 * rect.height as usize);
-            Ok(Arc::new(Pixels { width: rect.width, height: rect.height, rgb, mask: None }))
+            Ok(Arc::new(Pixels { width: rect.width, height: rect.height, rgb, mask: None, weights: None, depth: None }))
         }
     }
 

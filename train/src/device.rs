@@ -17,10 +17,10 @@ use self::step::TrainDevice;
 use crate::checkpoint::State;
 use crate::error::TrainError;
 
-/// The device that computes training steps.
+/// Which device computes training steps. Equal names give equal bits.
 #[derive(Debug, Clone, Default)]
 pub enum Backend {
-    /// SIMD and threads.
+    /// The CPU, with SIMD and threads.
     #[default]
     Cpu,
     /// A GPU, or a software adapter.
@@ -29,7 +29,7 @@ pub enum Backend {
 }
 
 impl Backend {
-    /// Full name with the instruction set or adapter. Results of two names may differ in the last bits.
+    /// Full name with the instruction set or adapter. Results of backends with different names may differ in the last bits.
     pub fn name(&self) -> String {
         match self {
             Self::Cpu => format!("cpu-{}", Isa::detect().name()),
@@ -43,7 +43,11 @@ impl Backend {
         !matches!(self, Self::Cpu)
     }
 
-    /// Sets up a device that continues from `state`; `lambda` is the weight of D-SSIM in the loss.
+    /// Sets up a device that continues from `state`; the CPU works on the host's state directly. `lambda` is the weight of D-SSIM
+    /// in the loss. `context` are frozen splats of other blocks, rendered but not trained.
+    ///
+    /// # Errors
+    /// A GPU that fails or has too little memory.
     #[cfg_attr(not(feature = "gpu"), allow(unused_variables))]
     pub(crate) fn open<'a>(
         &self,

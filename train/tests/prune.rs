@@ -69,7 +69,14 @@ fn render(splats: &Splats, context: Option<&Splats>, view: &TrainView) -> Vec<f3
 
 fn photos(splats: &Splats) -> Photos {
     let bytes = |planes: Vec<f32>| planes.iter().map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u8).collect();
-    let photo = |view| Pixels { width: WIDTH, height: HEIGHT, rgb: bytes(render(splats, None, view)), mask: None };
+    let photo = |view| Pixels {
+        width: WIDTH,
+        height: HEIGHT,
+        rgb: bytes(render(splats, None, view)),
+        mask: None,
+        weights: None,
+        depth: None,
+    };
     Photos(views().iter().map(|view| Arc::new(photo(view))).collect())
 }
 

@@ -1,8 +1,9 @@
 //! Estimates the time and memory that a plan takes before it runs. No result depends on the estimate.
 //!
-//! The cost of a training step is the plan's ([`StepCost`]). Pixels and splats change over a task's schedule (coarse mips first,
-//! densification towards the budget); the estimate uses their means. The constants are of one machine, whose speed varies by a factor
-//! of 1.4.
+//! The plan's [`StepCost`] divides work among tasks, so its constants stay as they are; the estimate has constants of its own. They
+//! are fitted to 19 trainings of six captures and one of a city (docs/decisions/0054) and scaled by the measured speed of this
+//! machine ([`crate::speed`]). Pixels and splats change over a task's schedule (coarse mips first, densification towards the
+//! budget); the estimate uses their means.
 
 use std::collections::BTreeSet;
 
@@ -13,14 +14,20 @@ use train::prune::{self, Pruning};
 
 use crate::recipe::recipe_of;
 
-/// Pixels per step at the mean resolution of a schedule of coarse mips, which [`StepCost`] assumes, relative to all of a window.
-const MEAN_PIXELS: f64 = 0.475;
+/// CPU seconds per pixel of a step's window.
+const SECONDS_PER_PIXEL: f64 = 0.096e-6;
+/// CPU seconds per trained splat that the window shows, at the window's full resolution.
+const SECONDS_PER_VISIBLE_SPLAT: f64 = 0.115e-6;
+/// CPU seconds per trained splat, shown or not.
+const SECONDS_PER_TRAINED_SPLAT: f64 = 0.303e-6;
 /// CPU seconds per pixel of a window that is read for the first time.
 const SECONDS_PER_READ_PIXEL: f64 = 0.3e-6;
+/// Steps that training spends on a coarse mip, relative to the recipe's largest share: the error usually ends a stage earlier.
+const COARSE_SHARE: f64 = 0.2;
 /// Cost of rendering a window without training on it, relative to a step.
-const RENDER_COST: f64 = 0.45;
+const RENDER_COST: f64 = 0.5;
 /// Mean number of splats during pruning, relative to those before.
-const PRUNED_SHARE: f64 = 0.75;
+const PRUNED_SHARE: f64 = 0.65;
 /// Splats that a child inherits from its parent, relative to the child's budget.
 const INHERITED_SHARE: f64 = 0.4;
 /// Floats of a splat of SH degree 0 to 3 in a merged PLY: position, normal, colour, opacity, scale and rotation.
@@ -38,13 +45,14 @@ pub struct Estimate {
 }
 
 impl Estimate {
-    /// The estimate for one task at a time.
-    pub fn of(plan: &Plan) -> Self {
+    /// The estimate for one task at a time, on a machine of this [speed](crate::speed::relative_speed).
+    pub fn of(plan: &Plan, relative_speed: f64) -> Self {
         let parents = parents(plan);
         let leaf = |task: &&Task| !parents.contains(&task.block);
         let splats: u64 = plan.tasks.iter().filter(leaf).map(|task| u64::from(task.budget)).sum();
+        let cpu_seconds: f64 = plan.tasks.iter().map(|task| cpu_seconds(plan, task, leaf(&task))).sum();
         Self {
-            cpu_seconds: plan.tasks.iter().map(|task| cpu_seconds(plan, task, leaf(&task))).sum(),
+            cpu_seconds: cpu_seconds / relative_speed,
             memory_bytes: plan.tasks.iter().map(|task| task.memory_bytes).max().unwrap_or(0),
             bytes: splats * 4 * PLY_FLOATS[usize::from(plan.settings.sh_degree.min(3))],
         }
@@ -56,10 +64,12 @@ pub(crate) fn parents(plan: &Plan) -> BTreeSet<BlockId> {
     plan.tasks.iter().filter_map(|task| task.parent).collect()
 }
 
-/// CPU seconds of a task on the CPU backend.
+/// CPU seconds of a task on the CPU backend of the machine of the constants.
 pub(crate) fn cpu_seconds(plan: &Plan, task: &Task, leaf: bool) -> f64 {
     let settings = &plan.settings;
-    let cost = StepCost::of(task);
+    let pixels = StepCost::of(task).pixels;
+    let visible_splats = f64::from(task.visible_splats);
+    let trained_splats = blocks::trained_splats(task);
     let recipe = recipe_of(settings, task);
     let first = match task.parent {
         Some(_) => INHERITED_SHARE,
@@ -73,14 +83,16 @@ pub(crate) fn cpu_seconds(plan: &Plan, task: &Task, leaf: bool) -> f64 {
     let mean_splats = until * mean_growing + (1.0 - until) * first.max(1.0);
     let (mut mean_pixels, mut left) = (0.0, 1.0);
     for (n, share) in recipe.coarse.iter().enumerate() {
-        mean_pixels += f64::from(*share) * 0.25f64.powi((recipe.coarse.len() - n) as i32);
-        left -= f64::from(*share);
+        let share = COARSE_SHARE * f64::from(*share);
+        mean_pixels += share * 0.25f64.powi((recipe.coarse.len() - n) as i32);
+        left -= share;
     }
     mean_pixels += left;
-    let seconds = |pixels: f64, splats: f64| {
-        // The visible splats are those of a full budget, also for a root that starts with more than its budget.
-        let splats = cost.visible * splats.min(1.0) + cost.trained * splats;
-        StepCost::CPU_SECONDS * (cost.pixels * pixels / MEAN_PIXELS + splats + cost.context)
+    // Shares are relative to the full window and to the budget. Coarse pixels make visible splats cheaper as well.
+    let seconds = |pixel_share: f64, splat_share: f64| {
+        SECONDS_PER_PIXEL * pixels * pixel_share
+            + SECONDS_PER_VISIBLE_SPLAT * visible_splats * splat_share.min(1.0) * pixel_share
+            + SECONDS_PER_TRAINED_SPLAT * trained_splats * splat_share
     };
     let step = seconds(mean_pixels, mean_splats);
     let read = SECONDS_PER_READ_PIXEL * task.window_pixels() as f64;

@@ -248,7 +248,9 @@ impl BlockTrainer {
             let missing: Vec<usize> = (0..some.len()).filter(|&i| found[i].is_none()).collect();
             let ids: Vec<ArtefactId> = missing.iter().map(|&i| some[i].2).collect();
             for (i, bytes) in missing.into_iter().zip(self.context.store.get_all_or_discard(&ids)?) {
-                bytes.iter().for_each(|bytes| self.cached_results().put(some[i].2, bytes.clone(), bytes.len()));
+                bytes
+                    .iter()
+                    .for_each(|bytes| self.cached_results().insert_if_absent(some[i].2, bytes.clone(), bytes.len()));
                 found[i] = bytes;
             }
             for (&(block, index, id), found) in some.iter().zip(found) {

@@ -26,6 +26,7 @@ mod recompute;
 mod refine;
 mod result_cache;
 mod run;
+pub mod speed;
 mod task;
 pub mod time_limit;
 mod train_block;

@@ -2,7 +2,8 @@
 
 use sysinfo::{MemoryRefreshKind, Pid, ProcessRefreshKind, ProcessesToUpdate, System};
 
-/// Memory of this machine, or of this process's container if that is less, bytes; `None` if the system reports neither.
+/// Memory of this machine, or of this process's container if that is less, bytes. `None` if the machine
+/// does not report its memory.
 pub fn total_bytes() -> Option<u64> {
     let mut system = System::new();
     system.refresh_memory_specifics(MemoryRefreshKind::nothing().with_ram());
@@ -10,7 +11,7 @@ pub fn total_bytes() -> Option<u64> {
     Some(system.total_memory().min(container)).filter(|bytes| *bytes > 0)
 }
 
-/// A bound on this process's resident memory.
+/// A limit on this process's resident memory. Nothing enforces it: the caller polls [`MemoryBudget::overrun`].
 pub(crate) struct MemoryBudget {
     limit: u64,
     system: System,
@@ -18,8 +19,8 @@ pub(crate) struct MemoryBudget {
 }
 
 impl MemoryBudget {
-    /// A budget of `limit` bytes; `None` if the system does not report resident memory. The limit is at least what is resident now: an
-    /// allocator keeps memory that earlier tasks freed, and reuses it for this one.
+    /// A budget of `limit` bytes, or of what is resident now if that is more: memory that earlier tasks freed may still be
+    /// resident, and the next task reuses it. `None` if the system does not report resident memory.
     pub(crate) fn new(limit: u64) -> Option<Self> {
         let process = sysinfo::get_current_pid().ok()?;
         let mut budget = Self { limit, system: System::new(), process };
@@ -27,7 +28,7 @@ impl MemoryBudget {
         Some(budget)
     }
 
-    /// Resident memory in bytes if it exceeds the budget.
+    /// All resident memory, bytes, if it exceeds the budget. `None` if it does not, or cannot be measured.
     pub(crate) fn overrun(&mut self) -> Option<u64> {
         self.resident().filter(|resident| *resident > self.limit)
     }

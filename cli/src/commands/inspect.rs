@@ -6,6 +6,7 @@ use blocks::Plan;
 use scene::{Capture, GeoOrigin};
 use serde::Serialize;
 use worker::estimate::Estimate;
+use worker::speed::relative_speed;
 
 use crate::args::InspectArgs;
 use crate::captures;
@@ -66,7 +67,7 @@ pub(crate) fn run(args: &InspectArgs, output: &Output) -> Result<(), Failure> {
         geo_origin: capture.geo_origin,
         levels: planned.as_ref().ok().map(|plan| plan.levels),
         tasks: planned.as_ref().ok().map(|plan| plan.tasks.len()),
-        estimate: planned.as_ref().ok().map(Estimate::of),
+        estimate: planned.as_ref().ok().map(|plan| Estimate::of(plan, relative_speed())),
         problem: planned.as_ref().err().map(Failure::to_string),
     };
     output.result(&inspected, &text(&inspected, planned.ok().as_ref()))

@@ -9,6 +9,7 @@ use scene::ArtefactId;
 use serde::Serialize;
 use store::file::save;
 use worker::estimate::Estimate;
+use worker::speed::relative_speed;
 
 use crate::args::PlanArgs;
 use crate::captures;
@@ -42,7 +43,7 @@ pub(crate) fn run(args: &PlanArgs, output: &Output) -> Result<(), Failure> {
         plan: plan.id(),
         levels: plan.levels,
         tasks: plan.tasks.len(),
-        estimate: Estimate::of(&plan),
+        estimate: Estimate::of(&plan, relative_speed()),
         findings: findings.iter().map(Finding::to_string).collect(),
     };
     output.result(&planned, &format!("{}\n{}", describe(&plan), planned.findings.join("\n")))?;

@@ -16,10 +16,11 @@ use serde::Serialize;
 use store::Store;
 use store::file::save;
 use tokio_util::sync::CancellationToken;
-use worker::time_limit::TimeLimit;
 use worker::estimate::Estimate;
-use worker::{BlockTrainer, Shared, TrainerOptions};
 use worker::merged_eval::is_evaluated;
+use worker::speed::relative_speed;
+use worker::time_limit::TimeLimit;
+use worker::{BlockTrainer, Shared, TrainerOptions};
 
 use crate::args::{Backend, TrainArgs};
 use crate::captures::ingest_photos;
@@ -144,7 +145,7 @@ pub(crate) fn train(args: &TrainArgs, output: &Output) -> Result<Trained, Failur
         capped: finished.capped,
         resumed: finished.resumed,
         settled: finished.settled,
-        predicted: Estimate::of(&plan),
+        predicted: Estimate::of(&plan, relative_speed()),
     };
     save_json(&args.out.join("report.json"), &report)?;
     Ok(Trained { capture, report, curve: totals.curve })

@@ -8,8 +8,8 @@ use scene::BadInput;
 use serde::Serialize;
 use tokio_util::sync::CancellationToken;
 use worker::WorkerError;
-use worker::{BlockTrainer, Shared, TrainerOptions};
 use worker::metrics::CountedExecutor;
+use worker::{BlockTrainer, Shared, TrainerOptions};
 
 use crate::args::WorkerArgs;
 use crate::backend;

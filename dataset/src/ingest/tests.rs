@@ -144,7 +144,14 @@ fn windows_are_crops_of_the_mips_and_the_cache_keeps_its_limit() {
     assert_eq!(view.mips.len(), 3);
     let capture = Arc::new(ingested.capture.clone());
     let photo = crate::photo::decode(&std::fs::read(&source.photos[2].path).unwrap(), WIDTH, HEIGHT).unwrap();
-    let decoded = Pixels { width: WIDTH, height: HEIGHT, rgb: crate::photo::planes(&photo.rgb), mask: None };
+    let decoded = Pixels {
+        width: WIDTH,
+        height: HEIGHT,
+        rgb: crate::photo::planes(&photo.rgb),
+        mask: None,
+        weights: None,
+        depth: None,
+    };
     let limit = 40_000;
     let reader = WindowReader::new(Arc::clone(&capture), store.clone(), limit);
     assert!(*reader.window(2, 0, whole(&view.camera)).unwrap() == decoded);

@@ -37,7 +37,7 @@ impl SharedTileCache {
     }
 
     pub(super) fn insert_index(&self, mip: Mip, index: &Arc<TileIndex>) {
-        lock(&self.indexes).put(mip, Arc::clone(index), index.memory_bytes());
+        lock(&self.indexes).insert_if_absent(mip, Arc::clone(index), index.memory_bytes());
     }
 
     /// The cached tiles among those of these byte ranges.
@@ -54,7 +54,7 @@ impl SharedTileCache {
                 // A copy: the slice would keep all coalesced ranges of its request alive.
                 let tile = Bytes::copy_from_slice(&tile);
                 let bytes = tile.len() + Self::TILE_OVERHEAD_BYTES;
-                tiles.put((mip, start), tile, bytes);
+                tiles.insert_if_absent((mip, start), tile, bytes);
             }
         }
     }

@@ -2,7 +2,7 @@
 //!
 //! The loop decides on the host (views, mips, densification) from a [`State`]; a [`TrainDevice`] computes the steps.
 //! The CPU works on the state in place. A GPU keeps its own copy and runs ahead of the host. [`TrainDevice::download`]
-//! brings the host's state up to date; it costs time and changes no bit of the result.
+//! brings the host's state up to date. When and how often it is called does not change the result, bit for bit.
 
 use std::sync::Arc;
 
@@ -19,7 +19,7 @@ pub const MAX_VIEWS_PER_STEP: u32 = 16;
 /// One optimiser step on the sum of the gradients of its samples.
 #[derive(Debug, Clone)]
 pub(crate) struct Step {
-    /// One to [`MAX_VIEWS_PER_STEP`], of different views.
+    /// 1 to [`MAX_VIEWS_PER_STEP`] samples, no view twice.
     pub(crate) samples: Vec<ViewSample>,
     pub(crate) options: Options,
     pub(crate) rates: LearningRates,
@@ -27,7 +27,7 @@ pub(crate) struct Step {
     pub(crate) exposure_rate: f32,
 }
 
-/// A window of a view with its photo.
+/// A rectangular crop (window) of one mip of a view's photo.
 #[derive(Debug, Clone)]
 pub(crate) struct ViewSample {
     /// Index of the view in the capture.
@@ -36,7 +36,7 @@ pub(crate) struct ViewSample {
     pub(crate) photo: Arc<Pixels>,
     /// Camera of the window.
     pub(crate) camera: Camera,
-    /// Exposure of the view, where exposures are given and fixed.
+    /// Exposure of the view where exposures are given and fixed; `None` if they are trained or not used.
     pub(crate) exposure: Option<Exposure>,
 }
 
@@ -51,7 +51,8 @@ pub(crate) enum StatePart {
     All,
 }
 
-/// Computes training steps. A step whose loss is not finite changes nothing but the count of skipped steps.
+/// Computes training steps. A step whose loss is not finite sets the last loss and the count of skipped steps, and changes
+/// nothing else.
 pub(crate) trait TrainDevice {
     /// Starts a step. It may still be running when this returns.
     fn step(&mut self, state: &mut State, step: Step) -> Result<(), TrainError>;
@@ -59,6 +60,7 @@ pub(crate) trait TrainDevice {
     /// Waits for the started steps and copies a part of the state to the host.
     fn download(&mut self, state: &mut State, part: StatePart) -> Result<(), TrainError>;
 
-    /// Copies a part of the state, which the host has changed since it was downloaded, to the device.
+    /// Copies a part of the state to the device. The host has downloaded the same part before, with no step in between, and then
+    /// changed it.
     fn upload(&mut self, state: &State, part: StatePart) -> Result<(), TrainError>;
 }

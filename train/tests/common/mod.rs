@@ -38,7 +38,7 @@ impl WindowSource for Photos {
             // A coarse pixel is used only if all of it is.
             mask.extend(window().map(|(x, y)| if mean(plane, x, y) == 255 { 255 } else { 0 }));
         }
-        Ok(Arc::new(Pixels { width: rect.width, height: rect.height, rgb, mask }))
+        Ok(Arc::new(Pixels { width: rect.width, height: rect.height, rgb, mask, weights: None, depth: None }))
     }
 }
 
@@ -94,7 +94,14 @@ pub fn photo(splats: &Splats, view: &TrainView) -> Vec<f32> {
 
 pub fn photos(splats: &Splats) -> Photos {
     let bytes = |planes: Vec<f32>| planes.iter().map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u8).collect();
-    let photo = |view| Pixels { width: WIDTH, height: HEIGHT, rgb: bytes(photo(splats, view)), mask: None };
+    let photo = |view| Pixels {
+        width: WIDTH,
+        height: HEIGHT,
+        rgb: bytes(photo(splats, view)),
+        mask: None,
+        weights: None,
+        depth: None,
+    };
     Photos(views().iter().map(photo).collect())
 }
 

@@ -46,7 +46,7 @@ fn sample(masked: bool, key: u64, [width, height]: [u32; 2], translation: DVec3)
     let mask = masked.then(|| (0..area).map(|i| if i % width as usize > 50 { 0 } else { 255 }).collect());
     let pinhole = Pinhole { width, height, fx: 70.0, fy: 72.0, cx: 37.0, cy: 27.0 };
     let camera_from_world = Rigid { rotation: DQuat::IDENTITY, translation };
-    let photo = Arc::new(Pixels { width, height, rgb, mask });
+    let photo = Arc::new(Pixels { width, height, rgb, mask, weights: None, depth: None });
     ViewSample { view: 0, photo, camera: Camera { pinhole, camera_from_world }, exposure: None }
 }
 
