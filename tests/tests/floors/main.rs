@@ -175,7 +175,11 @@ fn imports_inside_a_crate_form_no_ring() {
         files += graph.len();
         for ring in modules::rings(&graph) {
             let name = |module: &modules::Module| if module.is_empty() { "lib".to_owned() } else { module.join("::") };
-            lines.push(format!("{}: a ring of imports between {}", package.name, ring.iter().map(name).collect::<Vec<_>>().join(", ")));
+            lines.push(format!(
+                "{}: a ring of imports between {}",
+                package.name,
+                ring.iter().map(name).collect::<Vec<_>>().join(", ")
+            ));
             for from in &ring {
                 let to = graph[from].iter().filter(|to| ring.contains(to));
                 lines.extend(to.map(|to| format!("    {} imports {}", name(from), name(to))));
@@ -191,7 +195,8 @@ fn imports_inside_a_crate_form_no_ring() {
 fn the_drawing_of_imports_is_up_to_date() {
     let metadata = metadata();
     let floors: BTreeMap<&str, u32> = FLOORS.into();
-    let edges = edges_of(&metadata).into_iter().filter(|edge| edge.kind == DependencyKind::Normal && edge.from != "tests");
+    let edges =
+        edges_of(&metadata).into_iter().filter(|edge| edge.kind == DependencyKind::Normal && edge.from != "tests");
     let edges: BTreeSet<(String, String)> = edges.map(|edge| (edge.from, edge.to)).collect();
     let members = metadata.workspace_packages().into_iter().map(|package| package.name.to_string());
     let heights = members.filter(|name| name != "tests").map(|name| (name.clone(), floors[name.as_str()])).collect();

@@ -61,7 +61,8 @@ fn graph_of(files: &BTreeMap<Module, Vec<Item>>) -> Graph {
 
 /// The strongly connected parts of more than one file: each is a ring of imports.
 pub(crate) fn rings(graph: &Graph) -> Vec<Vec<Module>> {
-    let reached: BTreeMap<&Module, BTreeSet<&Module>> = graph.keys().map(|from| (from, reachable(graph, from))).collect();
+    let reached: BTreeMap<&Module, BTreeSet<&Module>> =
+        graph.keys().map(|from| (from, reachable(graph, from))).collect();
     let mut left: BTreeSet<&Module> = graph.keys().collect();
     let mut rings = Vec::new();
     while let Some(first) = left.pop_first() {
@@ -114,15 +115,18 @@ fn child(module: &[String], name: &str) -> Module {
 }
 
 fn is_test(attributes: &[Attribute]) -> bool {
-    attributes.iter().any(|attribute| attribute.path().is_ident("cfg") && {
-        let condition = attribute.meta.to_token_stream().to_string();
-        condition.contains("test") && !condition.contains("not")
+    attributes.iter().any(|attribute| {
+        attribute.path().is_ident("cfg") && {
+            let condition = attribute.meta.to_token_stream().to_string();
+            condition.contains("test") && !condition.contains("not")
+        }
     })
 }
 
 /// The file that defines the item at a full path.
 fn defining_file(path: &[String], modules: &BTreeSet<Module>, reexports: &Reexports, depth: usize) -> Module {
-    let length = (0..=path.len()).rev().find(|&length| modules.contains(&path[..length])).expect("the root is a module");
+    let length =
+        (0..=path.len()).rev().find(|&length| modules.contains(&path[..length])).expect("the root is a module");
     let (module, rest) = path.split_at(length);
     match rest.first().and_then(|name| reexports[module].get(name)) {
         Some(target) if depth < 16 => {
@@ -246,8 +250,12 @@ mod tests {
 
     fn rings_of(files: &[(&str, &str)]) -> Vec<String> {
         let module = |name: &str| name.split("::").filter(|part| !part.is_empty()).map(str::to_owned).collect();
-        let files = files.iter().map(|(name, text)| (module(name), syn::parse_file(text).expect("Rust").items)).collect();
-        rings(&graph_of(&files)).iter().map(|ring| ring.iter().map(|m| m.join("::")).collect::<Vec<_>>().join(" ")).collect()
+        let files =
+            files.iter().map(|(name, text)| (module(name), syn::parse_file(text).expect("Rust").items)).collect();
+        rings(&graph_of(&files))
+            .iter()
+            .map(|ring| ring.iter().map(|m| m.join("::")).collect::<Vec<_>>().join(" "))
+            .collect()
     }
 
     #[test]
