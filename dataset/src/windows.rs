@@ -6,6 +6,7 @@
 //! ([`WindowReader::prefetch`]); background threads fetch them, which hides the latency of a remote store.
 
 mod locks;
+mod sparse_depth;
 mod tile_cache;
 
 use std::collections::HashSet;
@@ -19,6 +20,7 @@ use scene::{Capture, CodecError, Pixels, Rect};
 use store::{BlockingStore, StoreError};
 
 use self::locks::lock;
+use self::sparse_depth::SparseDepth;
 pub use self::tile_cache::SharedTileCache;
 use crate::byte_lru::ByteLru;
 use crate::mip_tiles::MipLayout;
@@ -111,7 +113,26 @@ impl WindowReader {
     ) -> Self {
         let cache = Mutex::new(WindowCache { windows: ByteLru::new(cache_bytes), pending: HashSet::new() });
         let (finished, counters, is_closed) = (Condvar::new(), Counters::default(), AtomicBool::new(false));
-        let shared = Shared { capture, store, tiles, cache, finished, counters, is_closed };
+        let shared = Shared { capture, store, tiles, depth: None, cache, finished, counters, is_closed };
+        Self { shared: Arc::new(shared), prefetch_queue: OnceLock::new() }
+    }
+
+    /// A new reader like this one whose windows carry target depths: those of the capture's sparse points whose track
+    /// contains the view. A capture without tracks gives none.
+    #[must_use]
+    pub fn with_sparse_depth(self) -> Self {
+        let Shared { capture, store, tiles, cache, .. } = &*self.shared;
+        let windows = ByteLru::new(lock(cache).windows.limit());
+        let shared = Shared {
+            capture: Arc::clone(capture),
+            store: store.clone(),
+            tiles: Arc::clone(tiles),
+            depth: Some(SparseDepth::new(capture)),
+            cache: Mutex::new(WindowCache { windows, pending: HashSet::new() }),
+            finished: Condvar::new(),
+            counters: Counters::default(),
+            is_closed: AtomicBool::new(false),
+        };
         Self { shared: Arc::new(shared), prefetch_queue: OnceLock::new() }
     }
 
@@ -155,7 +176,9 @@ impl WindowReader {
         let key = (view, mip, rect);
         let queue = self.prefetch_queue.get_or_init(|| start_prefetch_threads(&self.shared));
         let mut cache = self.shared.cache();
-        let fits = rect.area().saturating_mul(4 * 2 * PREFETCH_QUEUE as u64) <= cache.windows.limit() as u64;
+        // Colour and mask, and a float of depth.
+        let pixel_bytes = if self.shared.depth.is_some() { 8 } else { 4 };
+        let fits = rect.area().saturating_mul(pixel_bytes * 2 * PREFETCH_QUEUE as u64) <= cache.windows.limit() as u64;
         if !fits || cache.windows.contains(&key) || !cache.pending.insert(key) {
             return;
         }
@@ -196,6 +219,8 @@ struct Shared {
     capture: Arc<Capture>,
     store: BlockingStore,
     tiles: Arc<SharedTileCache>,
+    /// Where windows carry target depths.
+    depth: Option<SparseDepth>,
     cache: Mutex<WindowCache>,
     /// Notified when a prefetch ends, with or without an error.
     finished: Condvar,
@@ -252,7 +277,8 @@ impl Shared {
             missing.iter().zip(read(&wanted)?).for_each(|(&i, tile)| tiles[i] = Some(tile));
         }
         let tiles: Vec<Bytes> = tiles.into_iter().flatten().collect();
-        let pixels = index.window(rect, &tiles).map_err(damaged)?;
+        let mut pixels = index.window(rect, &tiles).map_err(damaged)?;
+        pixels.depth = self.depth.as_ref().and_then(|depth| depth.plane(&self.capture, number, mip, rect));
         self.tiles.insert_tiles((number, mip), missing.into_iter().map(|i| (ranges[i].start, tiles[i].clone())));
         Ok(Arc::new(pixels))
     }
@@ -314,7 +340,8 @@ struct WindowCache {
 
 /// Size of a cached window with its approximate overhead, bytes.
 fn memory_bytes(pixels: &Pixels) -> usize {
-    pixels.rgb.len() + pixels.mask.as_ref().map_or(0, Vec::len) + 256
+    let floats = [&pixels.weights, &pixels.depth].map(|plane| plane.as_ref().map_or(0, Vec::len));
+    pixels.rgb.len() + pixels.mask.as_ref().map_or(0, Vec::len) + 4 * floats.iter().sum::<usize>() + 256
 }
 
 #[cfg(test)]

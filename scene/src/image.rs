@@ -1,7 +1,7 @@
 //! Pixels of an image or of a window of a view.
 
 /// An 8-bit sRGB image or window, as planes: all red, all green, all blue, rows from the top.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Pixels {
     /// Width in pixels.
     pub width: u32,
@@ -11,6 +11,11 @@ pub struct Pixels {
     pub rgb: Vec<u8>,
     /// `width · height` bytes if the view has a mask: 255 = use, 0 = leave out.
     pub mask: Option<Vec<u8>>,
+    /// `width · height` factors of the pixels' training loss, finite and at least 0. Pixels of weight 0 are left out
+    /// like masked ones. `None`: all 1.
+    pub weights: Option<Vec<f32>>,
+    /// `width · height` target depths along the camera's z axis, metres; 0 = no target.
+    pub depth: Option<Vec<f32>>,
 }
 
 impl Pixels {

@@ -86,7 +86,7 @@ impl WindowSource for Photo {
     fn window(&self, _: u32, _: u8, rect: Rect) -> Result<Arc<Pixels>, String> {
         let value = |i: u32| (i % rect.width * 255 / rect.width) as u8;
         let rgb = (0..3 * rect.width * rect.height).map(value).collect();
-        Ok(Arc::new(Pixels { width: rect.width, height: rect.height, rgb, mask: None }))
+        Ok(Arc::new(Pixels { width: rect.width, height: rect.height, rgb, mask: None, weights: None, depth: None }))
     }
 }
 

@@ -1,12 +1,13 @@
 use async_trait::async_trait;
 use futures::stream::BoxStream;
+use glam::DVec3;
 use object_store::memory::InMemory;
 use object_store::path::Path;
 use object_store::{
     CopyOptions, GetOptions, GetResult, ListResult, MultipartUpload, ObjectMeta, ObjectStore, PutMultipartOptions,
     PutOptions, PutPayload, PutResult, Result,
 };
-use scene::{Camera, Pinhole, Rigid, View};
+use scene::{Camera, Pinhole, Rigid, SparsePoints, View};
 use store::Store;
 
 use super::*;
@@ -123,4 +124,55 @@ fn a_dropped_reader_discards_queued_prefetches_and_ends_its_threads() {
     // An index and the coalesced tiles for each window that was in flight, which is the whole artefact.
     assert_eq!(gated.reads(), 2 * PREFETCH_THREADS);
     assert_eq!(store.traffic().read, (PREFETCH_THREADS * bytes.len()) as u64);
+}
+
+#[test]
+fn windows_carry_the_depths_of_the_points_that_their_view_observed() {
+    let store = Store::over(Arc::new(InMemory::new()), "memory").blocking();
+    let mips = [image(100, 80, false), image(50, 40, false)];
+    let mips: Vec<_> = mips.iter().map(|pixels| store.put(mip_tiles::encode(pixels).unwrap()).unwrap()).collect();
+    let pinhole = Pinhole { width: 100, height: 80, fx: 80.0, fy: 80.0, cx: 50.0, cy: 40.0 };
+    let camera = |x: f64| {
+        let camera_from_world = Rigid { translation: DVec3::new(x, 0.0, 0.0), ..Rigid::IDENTITY };
+        Camera { pinhole, camera_from_world }
+    };
+    let view = |x| View { name: format!("{x}"), camera: camera(x), mips: mips.clone(), masked: false };
+    // Views 0 and 1 observed the first two points, which share a pixel in view 0; view 1 the third, which is also in
+    // view 0; view 0 the last, which is behind it.
+    let points = SparsePoints {
+        positions: vec![
+            DVec3::new(0.5, 0.25, 4.0),
+            DVec3::new(0.25, 0.125, 2.0),
+            DVec3::new(-1.0, 0.5, 4.0),
+            DVec3::new(0.0, 0.0, -1.0),
+        ],
+        colours: vec![[0; 3]; 4],
+        track_start: vec![0, 2, 4, 5, 6],
+        seen_by: vec![0, 1, 1, 0, 1, 0],
+    };
+    let capture = Capture { views: vec![view(0.0), view(0.5)], points, ..Capture::default() };
+    capture.check().unwrap();
+    let capture = Arc::new(capture);
+    let reader = WindowReader::new(Arc::clone(&capture), store.clone(), 10 << 20);
+    let rect = Rect { x: 20, y: 10, width: 70, height: 60 };
+    assert_eq!(reader.window(0, 0, rect).unwrap().depth, None);
+    let reader = reader.with_sparse_depth();
+    let targets = |view: u32, mip: u8, rect: Rect| -> Vec<(u32, u32, f32)> {
+        let plane = reader.window(view, mip, rect).unwrap().depth.clone().unwrap_or_default();
+        let at = |i: usize| (rect.x + i as u32 % rect.width, rect.y + i as u32 / rect.width);
+        let found = plane.iter().enumerate().filter(|(_, depth)| **depth > 0.0);
+        found.map(|(i, &depth)| (at(i).0, at(i).1, depth)).collect()
+    };
+    assert_eq!(targets(0, 0, rect), [(60, 45, 2.0)], "the nearest of two points, none of another view");
+    let bytes = reader.stats().cached_bytes;
+    assert_eq!(bytes, 70 * 60 * (3 + 4) + 256);
+    for (mip, rect) in [(0, rect), (1, Rect { x: 5, y: 5, width: 40, height: 30 })] {
+        let mut expected: Vec<(u32, u32, f32)> = (0..3)
+            .map(|i| capture.views[1].camera.mip(mip).project(capture.points.positions[i]))
+            .map(|(pixel, depth)| (pixel.x as u32, pixel.y as u32, depth as f32))
+            .collect();
+        expected.sort_by_key(|&(x, y, _)| (y, x));
+        assert_eq!(targets(1, mip, rect), expected, "mip {mip}");
+    }
+    assert_eq!(targets(0, 0, Rect { x: 0, y: 0, width: 10, height: 10 }), [], "no point in the window");
 }
