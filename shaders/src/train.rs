@@ -49,6 +49,8 @@ pub struct OptimiserState {
     pub padding: u32,
     /// Scale factors of the gradients of L1 and of SSIM, for each view of the step.
     pub gradient_scales: [[f32; 2]; MAX_VIEWS],
+    /// Scale factor of the gradient of the depth loss, for each view of the step.
+    pub depth_scales: [f32; MAX_VIEWS],
 }
 
 /// The target photo of one view.
@@ -71,6 +73,12 @@ pub struct Photo {
     pub first_byte: u32,
     /// 1: the photo has a mask.
     pub masked: u32,
+    /// Word of the first pixel weight; 0: the photo has none.
+    pub first_weight: u32,
+    /// Word of the first target depth; 0: the photo has none.
+    pub first_depth: u32,
+    /// Padding.
+    pub padding: [u32; 2],
 }
 
 /// The target photos of a step. Uniform.
@@ -85,6 +93,12 @@ pub struct Photos {
     pub lambda: f32,
     /// 1: pixels are weighted by the share of their alpha that trainable splats contribute.
     pub share_weighted: u32,
+    /// 1: frames have the planes depth and trainable alpha.
+    pub extras: u32,
+    /// Weight of the depth loss; 0 leaves it out. Needs `extras`.
+    pub depth_weight: f32,
+    /// Padding.
+    pub padding: [u32; 2],
     /// The photos; only the first `count` are defined.
     pub photo: [Photo; MAX_VIEWS],
 }

@@ -31,9 +31,10 @@ fn rust_layouts() -> BTreeMap<&'static str, Layout> {
         layout!(Status: overflow, fault, pairs, max_pairs, visible, visible_trainable, entry_scan_len, visible_scan_len, visible_histogram_len,
             pair_histogram_len),
         layout!(OptimiserState: steps_done, adam_steps, steps_skipped, epoch_views, epoch_l1, loss, is_step_valid, padding,
-            gradient_scales),
-        layout!(Photo: width, height, tiles_x, tiles_y, first_tile, first_pixel, first_byte, masked),
-        layout!(Photos: count, tiles, lambda, share_weighted, photo),
+            gradient_scales, depth_scales),
+        layout!(Photo: width, height, tiles_x, tiles_y, first_tile, first_pixel, first_byte, masked,
+            first_weight, first_depth, padding),
+        layout!(Photos: count, tiles, lambda, share_weighted, extras, depth_weight, padding, photo),
         layout!(AdamConstants: mean, log_scale, quat, opacity, sh_dc, sh_rest, beta2, opacity_reg, needle_reg, log_scale_min,
             log_scale_max, columns, stride, views, padding),
     ]

@@ -5,13 +5,15 @@
 //   loss_forward → SSIM derivatives, sums per tile → finish_loss → loss, gradient scales → loss_backward → upstream
 
 @group(0) @binding(0) var<uniform> photos: Photos;
-// Planes per view: red, green, blue, transmittance and, if pixels are weighted by share, depth and trainable alpha.
+// Planes per view: red, green, blue, transmittance and, with extras, depth and trainable alpha.
 @group(0) @binding(1) var<storage, read> frame: array<f32>;
-// Bytes per photo: red, green and blue planes, then the mask if there is one.
+// Bytes per photo: red, green and blue planes, then the mask if there is one; then words: the pixel weights and the
+// target depths, each if there are any.
 @group(0) @binding(2) var<storage, read> photo_words: array<u32>;
 // Per view: dSSIM/dmu, dSSIM/dE[x^2], dSSIM/dE[xy], each times the pixel's weight; three colour planes each.
 @group(0) @binding(3) var<storage, read_write> partials: array<f32>;
-// Per tile, colour and view: sums of w |x - y|, of w SSIM and, for the first colour, of w.
+// Per tile, colour and view: sums of w |x - y|, of w SSIM and, for the first colour, of w. The fourth value is for the
+// depth loss: the sum of w over its pixels (first colour), and of its weighted values (second colour).
 @group(0) @binding(4) var<storage, read_write> sums: array<vec4<f32>>;
 @group(0) @binding(5) var<storage, read_write> state: OptimiserState;
 @group(0) @binding(6) var<storage, read_write> upstream: array<f32>;
@@ -37,7 +39,7 @@ fn photo_byte(i: u32) -> u32 {
 
 // Value i of the planes of this view.
 fn frame_value(i: u32) -> f32 {
-    return frame[frame_planes(photos.share_weighted) * photo.first_pixel + i];
+    return frame[frame_planes(photos.extras) * photo.first_pixel + i];
 }
 
 // Value i of the colour planes of the photo, 0 to 1.
@@ -45,16 +47,33 @@ fn photo_value(i: u32) -> f32 {
     return f32(photo_byte(i)) * (1.0 / 255.0);
 }
 
+// Pixels of weight 0 are left out like masked ones.
 fn is_masked(pixel: u32) -> bool {
+    if photo.first_weight != 0u && !(photo_weight(pixel) > 0.0) {
+        return true;
+    }
     return photo.masked != 0u && photo_byte(3u * photo.width * photo.height + pixel) < 128u;
 }
 
-// Weight of a pixel: 0 under a mask; else, with share weighting, the square of the share of its alpha that trainable
-// splats contribute. Uncovered alpha counts half as trainable.
+fn photo_weight(pixel: u32) -> f32 {
+    return bitcast<f32>(photo_words[photo.first_weight + pixel]);
+}
+
+// Weight of a pixel: 0 under a mask; else the photo's weight times its weight by share.
 fn weight(pixel: u32) -> f32 {
     if is_masked(pixel) {
         return 0.0;
     }
+    let by_share = share_weight(pixel);
+    if photo.first_weight == 0u {
+        return by_share;
+    }
+    return by_share * photo_weight(pixel);
+}
+
+// With share weighting, the square of the share of a pixel's alpha that trainable splats contribute. Uncovered alpha
+// counts half as trainable.
+fn share_weight(pixel: u32) -> f32 {
     if photos.share_weighted == 0u {
         return 1.0;
     }
@@ -63,6 +82,39 @@ fn weight(pixel: u32) -> f32 {
     let open = 0.5 * transmittance + 1e-4;
     let share = (frame_value(5u * area + pixel) + open) / (1.0 - transmittance + open);
     return share * share;
+}
+
+// Relative error at which the depth loss changes from quadratic to linear.
+const DEPTH_BETA: f32 = 0.1;
+// Least alpha at which a pixel has a depth.
+const DEPTH_MIN_ALPHA: f32 = 0.5;
+
+struct DepthError {
+    // False: the pixel has no target depth or too little alpha, and no part in the depth loss.
+    used: bool,
+    alpha: f32,
+    // Expected depth and target depth, metres.
+    depth: f32,
+    goal: f32,
+}
+
+fn depth_error(pixel: u32) -> DepthError {
+    if photo.first_depth == 0u || photos.extras == 0u {
+        return DepthError(false, 0.0, 0.0, 0.0);
+    }
+    let area = photo.width * photo.height;
+    let goal = bitcast<f32>(photo_words[photo.first_depth + pixel]);
+    let alpha = 1.0 - frame_value(3u * area + pixel);
+    if !(goal > 0.0 && alpha > DEPTH_MIN_ALPHA) {
+        return DepthError(false, 0.0, 0.0, 0.0);
+    }
+    return DepthError(true, alpha, frame_value(4u * area + pixel) / alpha, goal);
+}
+
+// Smooth L1 of the relative depth error of a pixel.
+fn depth_value(at: DepthError) -> f32 {
+    let size = abs(at.depth / at.goal - 1.0);
+    return select(size - 0.5 * DEPTH_BETA, 0.5 * size * size / DEPTH_BETA, size < DEPTH_BETA);
 }
 
 struct PlaneTile {
@@ -172,6 +224,12 @@ fn loss_forward(
         partials[6u * area + to] = w * (2.0 * a1 * i12);
         let difference = frame_value(out) - photo_value(out);
         total = vec4<f32>(w * abs(difference), w * ssim, select(0.0, w, at.colour == 0u), 0.0);
+        if photos.depth_weight > 0.0 && at.colour < 2u {
+            let depth = depth_error(i);
+            if depth.used {
+                total.w = select(w * depth_value(depth), w, at.colour == 0u);
+            }
+        }
     }
     total = workgroup_sum(total, local);
     if local == 0u {
@@ -217,6 +275,24 @@ fn finish_loss(@builtin(local_invocation_index) local: u32) {
             state.gradient_scales[v] = vec2<f32>(0.0);
         }
         workgroupBarrier(); // protects `totals` until all threads have read the sum
+        if photos.depth_weight > 0.0 {
+            let tiles = here.tiles_x * here.tiles_y;
+            var depth = vec4<f32>(0.0);
+            for (var k = local; k < tiles; k += WORKGROUP_SIZE) {
+                depth.x += sums[3u * here.first_tile + k].w;
+                depth.y += sums[3u * here.first_tile + tiles + k].w;
+            }
+            depth = workgroup_sum(depth, local);
+            var scale = 0.0;
+            if !(is_finite(depth.x) && depth.x <= 0.0) {
+                scale = photos.depth_weight / depth.x;
+                loss += scale * depth.y;
+            }
+            if local == 0u {
+                state.depth_scales[v] = scale;
+            }
+            workgroupBarrier(); // as above
+        }
     }
     if local != 0u {
         return;
@@ -277,6 +353,19 @@ fn loss_backward(
         return;
     }
     let i = py * photo.width + px;
+    if photos.depth_weight > 0.0 && at.colour == 0u {
+        var d_depth = 0.0;
+        var d_transmittance = 0.0;
+        let depth = depth_error(i);
+        if depth.used {
+            let error = depth.depth / depth.goal - 1.0;
+            let slope = clamp(error / DEPTH_BETA, -1.0, 1.0) / depth.goal;
+            d_depth = state.depth_scales[at.view] * weight(i) * slope / depth.alpha;
+            d_transmittance = d_depth * depth.depth;
+        }
+        upstream[5u * photo.first_pixel + 3u * area + i] = d_transmittance;
+        upstream[5u * photo.first_pixel + 4u * area + i] = d_depth;
+    }
     if is_masked(i) {
         upstream[5u * photo.first_pixel + plane + i] = 0.0;
         return;

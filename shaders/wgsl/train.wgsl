@@ -17,6 +17,8 @@ struct OptimiserState {
     padding: u32,
     // Scale factors of the gradients of L1 and of SSIM, for each view of the step.
     gradient_scales: array<vec2<f32>, MAX_VIEWS>,
+    // Scale factor of the gradient of the depth loss, for each view of the step.
+    depth_scales: array<f32, MAX_VIEWS>,
 }
 
 // The target photo of one view.
@@ -32,6 +34,10 @@ struct Photo {
     first_byte: u32,
     // 1: the photo has a mask.
     masked: u32,
+    // Words of the first pixel weight and of the first target depth; 0: the photo has none.
+    first_weight: u32,
+    first_depth: u32,
+    padding: vec2<u32>,
 }
 
 // The target photos of a step.
@@ -43,6 +49,11 @@ struct Photos {
     lambda: f32,
     // 1: pixels are weighted by the share of their alpha that trainable splats contribute.
     share_weighted: u32,
+    // 1: frames have the planes depth and trainable alpha.
+    extras: u32,
+    // Weight of the depth loss; 0 leaves it out.
+    depth_weight: f32,
+    padding: vec2<u32>,
     photo: array<Photo, MAX_VIEWS>,
 }
 

@@ -5,6 +5,7 @@
 
 pub mod checkpoint;
 pub mod coarse_to_fine;
+mod depth_loss;
 mod device;
 mod error;
 pub mod exposure;

@@ -31,6 +31,8 @@ pub struct PhotometricLoss {
     pub lambda: f32,
     /// dSSIM/dμ, dSSIM/dE[x²], dSSIM/dE[xy]; three colour planes each.
     partials: [Vec<f32>; 3],
+    /// The mask of a photo with weights: also 0 where the weight is.
+    mask: Vec<u8>,
 }
 
 /// The value of the loss.
@@ -47,12 +49,12 @@ pub struct LossValue {
 impl PhotometricLoss {
     /// A loss with weight `lambda` of D-SSIM, computed with instruction set `isa`.
     pub fn new(isa: Isa, lambda: f32) -> Self {
-        Self { isa, lambda, partials: Default::default() }
+        Self { isa, lambda, partials: Default::default(), mask: Vec::new() }
     }
 
     /// Computes the loss of `colour` (three planes) against `photo` and writes its gradient with respect to `colour` to
     /// `gradient` (three planes). `weights` (one plane, or empty for all ones) are the pixel weights. Photo pixels
-    /// under the mask are treated as outside the image. The loss is a weighted mean, so its scale does not depend on
+    /// under the mask, or of weight 0 in the photo, are treated as outside the image. The loss is a weighted mean, so its scale does not depend on
     /// the size of the window.
     pub fn evaluate(&mut self, colour: &[f32], photo: &Pixels, weights: &[f32], gradient: &mut Vec<f32>) -> LossValue {
         let (width, height) = (photo.width as usize, photo.height as usize);
@@ -69,7 +71,17 @@ impl PhotometricLoss {
         let norm = 1.0 / (3.0 * total_weight);
 
         let isa = self.isa;
-        let mask = photo.mask.as_deref().unwrap_or(&[]);
+        if let Some(of_photo) = &photo.weights {
+            self.mask.clear();
+            self.mask.extend(of_photo.iter().map(|&weight| if weight > 0.0 { 255 } else { 0 }));
+            if let Some(mask) = &photo.mask {
+                self.mask.iter_mut().zip(mask).for_each(|(both, &mask)| *both = mask.min(*both));
+            }
+        }
+        let mask = match &photo.weights {
+            Some(_) => &self.mask[..],
+            None => photo.mask.as_deref().unwrap_or(&[]),
+        };
         let band = BAND * width;
         let plane = |all: usize| (all / area) * area..(all / area + 1) * area;
         // Jobs are (colour plane, band of rows), in a fixed order; sums are added in that order.
@@ -403,5 +415,24 @@ mod tests {
                 assert!((f64::from(gradient[i]) - slope).abs() < 2e-7, "{i}: {} against {slope}", gradient[i]);
             }
         }
+    }
+    #[test]
+    fn a_pixel_of_weight_2_counts_twice() {
+        let image = |values: &[u8], weights: Option<Vec<f32>>| Pixels {
+            width: values.len() as u32,
+            height: 1,
+            rgb: [values; 3].concat(),
+            mask: None,
+            weights,
+            depth: None,
+        };
+        let loss = |x: &[f32], photo: &Pixels| {
+            let weights = photo.weights.clone().unwrap_or_default();
+            PhotometricLoss::new(Isa::detect(), 0.0).evaluate(&[x; 3].concat(), photo, &weights, &mut Vec::new()).total
+        };
+        let twice = loss(&[0.1, 0.5, 0.5, 0.9], &image(&[100, 20, 20, 200], None));
+        let weighted = loss(&[0.1, 0.5, 0.9], &image(&[100, 20, 200], Some(vec![1.0, 2.0, 1.0])));
+        let alike = loss(&[0.1, 0.5, 0.9], &image(&[100, 20, 200], None));
+        assert!((twice - weighted).abs() < 1e-7 && (twice - alike).abs() > 1e-3, "{twice} {weighted} {alike}");
     }
 }

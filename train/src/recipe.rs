@@ -10,6 +10,9 @@ use crate::growth::Growth;
 pub struct Recipe {
     /// Weight λ of D-SSIM (1 - SSIM) in the loss.
     pub lambda: f32,
+    /// Weight of the depth loss, for windows with target depths; 0 leaves it out.
+    #[serde(default)]
+    pub depth_weight: f32,
     /// Learning rate of means, in units of each splat's size.
     pub mean: [f32; 2],
     /// Learning rate of ln(scale).
@@ -56,6 +59,7 @@ impl Default for Recipe {
     fn default() -> Self {
         Self {
             lambda: 0.2,
+            depth_weight: 0.0,
             mean: [0.05, 0.005],
             log_scale: [0.017, 0.0085],
             quat: [0.0034, 0.0017],

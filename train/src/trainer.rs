@@ -188,18 +188,21 @@ impl<'a> Trainer<'a> {
         let coarser = (recipe.coarse.len() as u8).saturating_sub(self.state.coarse_to_fine.stage);
         let samples = self.samples(count, coarser)?;
 
+        let has_depth = samples.iter().any(|sample| sample.photo.depth.is_some());
+        let depth_weight = if has_depth { recipe.depth_weight } else { 0.0 };
         let sh_degree = recipe.sh_from.iter().filter(|&&from| progress >= from).count() as u8;
         let options = Options {
             antialiased: self.job.antialiased,
             sh_degree: sh_degree.min(self.state.splats.sh_degree()),
             background: [0.0; 3],
-            extras: context.is_some(),
+            extras: context.is_some() || depth_weight > 0.0,
         };
         let visits = (steps as f32 / views.len() as f32).max(1.0);
         let inputs = Step {
             samples,
             options,
             rates: learning_rates(recipe, progress, (count as f32).sqrt(), self.log_scale_bounds),
+            depth_weight,
             exposure_rate: geometric(recipe.exposure, progress) / visits,
         };
         self.device.step(&mut self.state, inputs)?;

@@ -7,6 +7,7 @@ use scene::{Pixels, Splats};
 
 use super::step::{StatePart, Step, TrainDevice, ViewSample};
 use crate::checkpoint::State;
+use crate::depth_loss::depth_loss;
 use crate::error::TrainError;
 use crate::exposure::{expose, expose_backward};
 use crate::loss::PhotometricLoss;
@@ -41,19 +42,28 @@ impl<'a> CpuDevice<'a> {
 
 impl TrainDevice for CpuDevice<'_> {
     fn step(&mut self, state: &mut State, step: Step) -> Result<(), TrainError> {
-        let Step { samples, options, mut rates, exposure_rate } = step;
+        let Step { samples, options, mut rates, depth_weight, exposure_rate } = step;
         let several = samples.len() > 1;
         let before = several.then(|| state.densification.clone());
         let (mut loss, mut errors, mut by_exposure, mut visible_sum) = (0.0, Vec::new(), Vec::new(), 0);
         for ViewSample { view, photo, camera, exposure } in &samples {
             let frame = self.renderer.forward(&state.splats, self.context, camera, &options);
-            pixel_weights(frame, photo, &mut self.weights);
+            pixel_weights(frame, photo, self.context.is_some(), &mut self.weights);
             let exposure = state.exposures.as_ref().map_or(*exposure, |exposures| exposures.of(*view));
             let shown = exposure.as_ref().map_or(&frame.colour, |exposure| {
                 expose(exposure, &frame.colour, &mut self.exposed);
                 &self.exposed
             });
-            let value = self.loss.evaluate(shown, photo, &self.weights, &mut self.upstream.colour);
+            let mut value = self.loss.evaluate(shown, photo, &self.weights, &mut self.upstream.colour);
+            match &photo.depth {
+                Some(target) if depth_weight > 0.0 => {
+                    value.total += depth_loss(frame, target, &self.weights, depth_weight, &mut self.upstream);
+                }
+                _ => {
+                    self.upstream.depth.clear();
+                    self.upstream.transmittance.clear();
+                }
+            }
             loss += value.total / samples.len() as f64;
             if !value.total.is_finite() {
                 (state.loss, state.skipped) = (loss, state.skipped + 1);
@@ -117,11 +127,11 @@ fn accumulate(sum: &mut Gradients, more: &Gradients, first: bool) {
     sum.seen.iter_mut().zip(&more.seen).for_each(|(sum, more)| *sum |= more);
 }
 
-/// Loss weight of each pixel: zero under a mask, else from the share of the pixel that the block's own splats explain.
-/// Empty where all weights are 1.
-pub(super) fn pixel_weights(frame: &Frame, photo: &Pixels, weights: &mut Vec<f32>) {
+/// Loss weight of each pixel: zero under a mask, else the photo's weight times, beside a context (`share_weighted`), the
+/// squared share of the pixel that the block's own splats explain. Empty where all weights are 1.
+pub(super) fn pixel_weights(frame: &Frame, photo: &Pixels, share_weighted: bool, weights: &mut Vec<f32>) {
     weights.clear();
-    if !frame.trainable_alpha.is_empty() {
+    if share_weighted {
         // Transmittance that nothing explains yet counts half as the block's own, so that a block may fill it. The
         // share is squared: Adam normalises gradients, so small steady ones would still move splats.
         const UNEXPLAINED: f32 = 0.5;
@@ -131,6 +141,12 @@ pub(super) fn pixel_weights(frame: &Frame, photo: &Pixels, weights: &mut Vec<f32
             let share = (own + open) / (1.0 - transmittance + open);
             share * share
         }));
+    }
+    if let Some(of_photo) = &photo.weights {
+        if weights.is_empty() {
+            weights.resize(of_photo.len(), 1.0);
+        }
+        weights.iter_mut().zip(of_photo).for_each(|(weight, of_photo)| *weight *= of_photo);
     }
     if let Some(mask) = &photo.mask {
         if weights.is_empty() {

@@ -54,7 +54,7 @@ pub(crate) struct GpuDevice {
     views: GrowableBuffer,
     /// One [`OptimiserState`].
     optimiser: Buffer,
-    /// Photos with their masks, one byte per value.
+    /// Photos with their masks, one byte per value, then pixel weights and target depths, one float per pixel.
     photo: GrowableBuffer,
     /// Derivatives of SSIM.
     partials: GrowableBuffer,
@@ -156,8 +156,8 @@ impl GpuDevice {
     /// Submits a step.
     fn submit(&mut self, step: &Step) -> Result<(), GpuError> {
         let gpu = Arc::clone(&self.gpu);
-        let Step { samples, options, rates, .. } = step;
-        let (photos, bytes) = self.photos(samples, options.extras);
+        let Step { samples, options, rates, depth_weight, .. } = step;
+        let (photos, bytes) = self.photos(samples, options.extras, *depth_weight);
         let area: usize = samples.iter().map(|sample| sample.photo.area()).sum();
         let tiles = 3 * photos.tiles;
         self.photo.reserve(&gpu, bytes.len() as u64)?;
@@ -180,7 +180,11 @@ impl GpuDevice {
             let bindings = [bindings[0], bindings[1], bindings[2], bindings[3], (5, &self.optimiser), (6, upstream)];
             loss_backward.run(&gpu, pass, &bindings, tiles);
         }
-        self.renderer.backward(&mut encoder, &self.splats, UpstreamPlanes::default())?;
+        let planes = match *depth_weight > 0.0 {
+            true => UpstreamPlanes { transmittance: true, depth: true },
+            false => UpstreamPlanes::default(),
+        };
+        self.renderer.backward(&mut encoder, &self.splats, planes)?;
         self.update_splats(&mut encoder, options.sh_degree, rates, samples.len());
         self.in_flight.push_back(gpu.submit(encoder)?);
         match self.in_flight.len() > IN_FLIGHT {
@@ -190,12 +194,14 @@ impl GpuDevice {
     }
 
     /// The layout of the photos in the photo buffer, and the bytes of all photos.
-    fn photos(&self, samples: &[ViewSample], by_share: bool) -> (Photos, Vec<u8>) {
+    fn photos(&self, samples: &[ViewSample], extras: bool, depth_weight: f32) -> (Photos, Vec<u8>) {
         let (mut bytes, mut first_pixel) = (Vec::new(), 0);
         let mut photos = Photos {
             count: samples.len() as u32,
             lambda: self.lambda,
-            share_weighted: by_share.into(),
+            share_weighted: self.context.is_some().into(),
+            extras: extras.into(),
+            depth_weight,
             ..Photos::zeroed()
         };
         for (layout, ViewSample { photo, .. }) in photos.photo.iter_mut().zip(samples) {
@@ -209,12 +215,23 @@ impl GpuDevice {
                 first_pixel,
                 first_byte: bytes.len() as u32,
                 masked: photo.mask.is_some().into(),
+                ..Photo::zeroed()
             };
             photos.tiles += layout.tiles_x * layout.tiles_y;
             first_pixel += photo.area() as u32;
             bytes.extend_from_slice(&photo.rgb);
             bytes.extend_from_slice(photo.mask.as_deref().unwrap_or_default());
             bytes.resize(bytes.len().next_multiple_of(4), 0);
+            let mut append = |plane: &Option<Vec<f32>>| match plane {
+                Some(plane) => {
+                    let first_word = (bytes.len() / 4) as u32;
+                    bytes.extend_from_slice(bytemuck::cast_slice(plane));
+                    first_word
+                }
+                None => 0,
+            };
+            layout.first_weight = append(&photo.weights);
+            layout.first_depth = if depth_weight > 0.0 { append(&photo.depth) } else { 0 };
         }
         (photos, bytes)
     }

@@ -23,6 +23,8 @@ pub(crate) struct Step {
     pub(crate) samples: Vec<ViewSample>,
     pub(crate) options: Options,
     pub(crate) rates: LearningRates,
+    /// Weight of the depth loss. Above 0 a sample has target depths and the options ask for the planes that they need.
+    pub(crate) depth_weight: f32,
     /// Learning rate of exposures, where they are trained.
     pub(crate) exposure_rate: f32,
 }

@@ -1,11 +1,12 @@
 //! Compares each stage of a GPU step with the CPU, on the inputs that the previous stage left on the device.
 
 use glam::{DQuat, DVec3, Vec3};
-use render::Options;
+use render::{Options, Upstream};
 use scene::{Camera, Pinhole, Pixels, Rigid, Splat};
 
 use super::*;
 use crate::coarse_to_fine::CoarseToFine;
+use crate::depth_loss::depth_loss;
 use crate::loss::PhotometricLoss;
 use crate::random::{bits, uniform};
 
@@ -67,8 +68,20 @@ fn step(masked: bool, extras: bool, key: u64) -> Step {
             needle_reg: 0.01,
             log_scale_bounds: [-5.0, -1.0],
         },
+        depth_weight: 0.0,
         exposure_rate: 0.0,
     }
+}
+
+/// The photo of a sample with noise as pixel weights and target depths: a third of each is 0.
+fn with_weights_and_depth(mut sample: ViewSample, key: u64) -> ViewSample {
+    let plane = |key: u64, of: &dyn Fn(f32) -> f32| {
+        let value = |i: u64| if i.is_multiple_of(3) { 0.0 } else { of(uniform(key, i)) };
+        Some((0..sample.photo.area() as u64).map(value).collect())
+    };
+    let (weights, depth) = (plane(key + 20, &|u| 0.2 + 2.0 * u), plane(key + 30, &|u| 2.5 + 3.0 * u));
+    sample.photo = Arc::new(Pixels { weights, depth, ..Pixels::clone(&sample.photo) });
+    sample
 }
 
 fn new_state(splats: Splats) -> State {
@@ -102,13 +115,20 @@ fn words(state: &State) -> Vec<u32> {
 #[test]
 fn stages_agree_with_the_cpu() {
     let Some(gpu) = gpu() else { return };
-    for (sh_degree, masked, extras) in [(0, false, false), (1, true, false), (2, false, true), (3, true, true)] {
+    let cases = [(0, false, false, 0.0), (1, true, false, 0.0), (2, false, true, 0.0), (3, true, true, 0.0)];
+    // With pixel weights and target depths.
+    let deep = [(0, true, false, 0.5), (2, false, true, 3.0)];
+    for (sh_degree, masked, extras, depth_weight) in cases.into_iter().chain(deep) {
         let context = extras.then(|| cloud(7, 60, 3));
         let mut state = new_state(cloud(3, 300, sh_degree));
         let mut device = GpuDevice::new(&gpu, &state, 0.2, context.as_ref()).unwrap();
         // The second step starts with nonzero moments.
         for key in [1, 2] {
-            let step = step(masked, extras, key);
+            let mut step = step(masked, extras, key);
+            if depth_weight > 0.0 {
+                step.samples = step.samples.into_iter().map(|sample| with_weights_and_depth(sample, key)).collect();
+                (step.options.extras, step.depth_weight) = (true, depth_weight);
+            }
             let photo = &step.samples[0].photo;
             device.download(&mut state, StatePart::All).unwrap();
             let mut expected = state.clone();
@@ -117,15 +137,26 @@ fn stages_agree_with_the_cpu() {
 
             let frame = device.renderer.read_frame(0).unwrap();
             let mut weights = Vec::new();
-            super::super::cpu::pixel_weights(&frame, photo, &mut weights);
-            let mut upstream = Vec::new();
-            let value =
-                PhotometricLoss::new(Isa::detect(), 0.2).evaluate(&frame.colour, photo, &weights, &mut upstream);
+            super::super::cpu::pixel_weights(&frame, photo, extras, &mut weights);
+            let mut planes = Upstream::default();
+            let mut value =
+                PhotometricLoss::new(Isa::detect(), 0.2).evaluate(&frame.colour, photo, &weights, &mut planes.colour);
+            let mut depth_off = 0.0;
+            if depth_weight > 0.0 {
+                let target = photo.depth.as_ref().unwrap();
+                let depth = depth_loss(&frame, target, &weights, depth_weight, &mut planes);
+                assert!(depth > 0.05 * value.total && planes.depth.iter().filter(|d| **d != 0.0).count() > 100);
+                value.total += depth;
+                let (area, buffer) = (photo.area(), device.renderer.upstream());
+                depth_off = off(&gpu.read(buffer, 3 * area, area).unwrap(), &planes.transmittance)
+                    .max(off(&gpu.read(buffer, 4 * area, area).unwrap(), &planes.depth));
+            }
+            let upstream = planes.colour;
             let found: Vec<f32> = gpu.read(device.renderer.upstream(), 0, upstream.len()).unwrap();
             let loss_off = (state.loss - value.total).abs() / value.total;
             let l1_off =
                 (state.coarse_to_fine.tally.sum - expected.coarse_to_fine.tally.sum - value.l1).abs() / value.l1;
-            let upstream_off = off(&found, &upstream);
+            let upstream_off = off(&found, &upstream).max(depth_off);
 
             let gradients = device.renderer.read_gradients(&device.splats).unwrap();
             expected.adam.step(&mut expected.splats, &gradients, 3, &step.rates);
@@ -140,7 +171,7 @@ fn stages_agree_with_the_cpu() {
             let stats_off = off(&state.densification.error, &expected.densification.error)
                 .max(off(&state.densification.weight, &expected.densification.weight));
             println!(
-                "SH {sh_degree}, masked {masked}, context {extras}, step {key}: loss {loss_off:.1e}, L1 {l1_off:.1e}, \
+                "SH {sh_degree}, masked {masked}, context {extras}, depth {depth_weight}, step {key}: loss {loss_off:.1e}, L1 {l1_off:.1e}, \
                  upstream {upstream_off:.1e}, splats {splats_off:.1e}, moments {moments_off:.1e}, statistics {stats_off:.1e}"
             );
             assert_eq!((steps, state.densification.views.clone()), (cpu_steps, expected.densification.views));
@@ -157,18 +188,33 @@ fn stages_agree_with_the_cpu() {
 /// Samples of several sizes, one of them masked, in front of a context. The CPU renders them one after the other.
 #[test]
 fn steps_of_several_samples_agree_with_the_cpu() {
+    several_samples_agree_with_the_cpu(0.0);
+}
+
+/// The same, with pixel weights and target depths in two of the samples.
+#[test]
+fn steps_of_several_samples_with_weights_and_depth_agree_with_the_cpu() {
+    several_samples_agree_with_the_cpu(1.0);
+}
+
+fn several_samples_agree_with_the_cpu(depth_weight: f32) {
     let Some(gpu) = gpu() else { return };
     let context = cloud(7, 60, 3);
     let begin = new_state(cloud(3, 300, 2));
     let samples: Vec<ViewSample> = [[75, 53], [16, 16], [33, 90], [64, 48]]
         .into_iter()
         .zip(1..)
-        .map(|(size, key)| sample(key == 3, key, size, DVec3::new(0.3 * key as f64, 0.0, 0.5)))
+        .map(|(size, key)| (key, sample(key == 3, key, size, DVec3::new(0.3 * key as f64, 0.0, 0.5))))
+        .map(|(key, sample)| match depth_weight > 0.0 && key % 2 == 1 {
+            true => with_weights_and_depth(sample, key),
+            false => sample,
+        })
         .collect();
     let one = |samples: &[ViewSample]| {
         let mut step = step(false, true, 1);
         // Regularisers large enough to exceed rounding errors.
         (step.rates.opacity_reg, step.rates.needle_reg) = (30.0, 30.0);
+        step.depth_weight = depth_weight;
         Step { samples: samples.to_vec(), ..step }
     };
     let run = |device: &mut dyn TrainDevice, samples: &[ViewSample]| {
