@@ -452,3 +452,82 @@ fn announced_windows_are_read() {
         assert!(announced.len().abs_diff(read.len()) <= 16 && announced.len() + 16 > read.len());
     }
 }
+
+/// A pixel of weight 0 is left out like a masked one, whatever it shows.
+#[test]
+fn pixels_of_weight_0_do_not_affect_the_loss() {
+    let ground_truth = cloud(13, 120, 0.8);
+    let photos = photos(&ground_truth);
+    let run = |photos: &Photos| {
+        let recipe = Recipe { coarse: Vec::new(), ..no_growth() };
+        Setup { steps: 40, recipe, ..Setup::new(perturbed(&ground_truth), photos) }.run()
+    };
+    let with_weights = |mut photos: Photos| {
+        for photo in &mut photos.0 {
+            let mask = photo.mask.take().unwrap();
+            photo.weights = Some(mask.iter().map(|&mask| if mask == 0 { 0.0 } else { 1.0 }).collect());
+        }
+        photos
+    };
+    let masks = masked(&photos, |_| 0);
+    let noise = with_weights(masked(&photos, |i| random::bits(8, i as u64) as u8));
+    let expected = run(&masks);
+    assert!(run(&with_weights(masks)) == expected, "a weight of 0 acts like a mask");
+    assert!(run(&noise) == expected, "pixels of weight 0 changed parameters");
+}
+
+/// A textureless wall before one camera position: photos cannot tell its distance, target depths can.
+#[test]
+fn target_depths_pull_splats_to_a_depth_that_photos_leave_ambiguous() {
+    let views = &views()[..1];
+    let camera = &views[0].camera;
+    // A grid of splats of one colour that fills the photo, at a depth in metres along the camera's axis. Sizes grow with
+    // the depth, so that every depth gives the same picture.
+    let wall = |depth: f64| {
+        let mut splats = Splats::new(0);
+        for y in 0..7 {
+            for x in 0..9 {
+                let on_axis =
+                    glam::DVec3::new((f64::from(x) * 8.0 - 32.0) / 70.0, (f64::from(y) * 8.0 - 24.0) / 70.0, 1.0);
+                let place = camera.camera_from_world.inverse().apply(depth * on_axis).as_vec3();
+                splats.push(&Splat::round(place, (depth as f32 * 0.09).ln(), Vec3::splat(0.6), 0.9));
+            }
+        }
+        splats
+    };
+    const TRUE_DEPTH: f64 = 4.0;
+    let sparse = |i: usize| if i.is_multiple_of(5) { TRUE_DEPTH as f32 } else { 0.0 };
+    let mut photos = photos(&wall(TRUE_DEPTH));
+    photos.0.truncate(1);
+    photos.0[0].depth = Some((0..AREA).map(sparse).collect());
+    let initial = wall(3.0);
+    let mean_depth = |splats: &Splats| {
+        let depth = |i: usize| camera.camera_from_world.apply(splats.mean(i).as_dvec3()).z;
+        (0..splats.len()).map(depth).sum::<f64>() / splats.len() as f64
+    };
+    let fit = |depth_weight: f32| {
+        let recipe = Recipe { depth_weight, ..no_growth() };
+        let job = Job {
+            initial: initial.clone(),
+            context: None,
+            views,
+            counts: &|_| true,
+            keeps: &|_| true,
+            budget: initial.len(),
+            steps: 300,
+            antialiased: false,
+            seed: 5,
+            size_bounds_metres: [1e-3, 2.0],
+            exposures: None,
+            trains_exposures: false,
+            recipe: &recipe,
+            source: &photos,
+            backend: &Backend::Cpu,
+        };
+        mean_depth(&train(job, &mut |_| Flow::Continue).unwrap())
+    };
+    let (without, with) = (fit(0.0), fit(1.0));
+    println!("mean depth {without:.2} m without target depths, {with:.2} m with, {TRUE_DEPTH} m is true");
+    assert!((without - TRUE_DEPTH).abs() > 0.5, "photos alone must leave the depth open: {without}");
+    assert!((with - TRUE_DEPTH).abs() < 0.1, "{with}");
+}

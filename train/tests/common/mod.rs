@@ -38,7 +38,14 @@ impl WindowSource for Photos {
             // A coarse pixel is used only if all of it is.
             mask.extend(window().map(|(x, y)| if mean(plane, x, y) == 255 { 255 } else { 0 }));
         }
-        Ok(Arc::new(Pixels { width: rect.width, height: rect.height, rgb, mask, weights: None, depth: None }))
+        // Weights and depths of a coarse pixel are those of its first pixel.
+        let first = |plane: &Option<Vec<f32>>| {
+            let of =
+                |plane: &Vec<f32>| window().map(|(x, y)| plane[(y * side * photo.width + x * side) as usize]).collect();
+            plane.as_ref().map(of)
+        };
+        let (weights, depth) = (first(&photo.weights), first(&photo.depth));
+        Ok(Arc::new(Pixels { width: rect.width, height: rect.height, rgb, mask, weights, depth }))
     }
 }
 
