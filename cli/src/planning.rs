@@ -1,7 +1,7 @@
 //! Plans a capture, checks the plan, and describes it.
 
 use blocks::{Plan, Severity};
-use scene::{ArtefactId, Capture, frame};
+use scene::{ArtefactId, BadInput, Capture, frame};
 use worker::estimate::Estimate;
 use worker::speed::relative_speed;
 
@@ -14,6 +14,10 @@ use crate::output::Output;
 pub(crate) fn plan_of(capture: &Capture, options: &PlanOptions) -> Result<(Capture, Plan), Failure> {
     let capture = captures::shrunk(capture, options.downscale)?;
     let id = ArtefactId::of(&frame::encode(dataset::ingest::CAPTURE, &capture, &[]));
+    if options.depth_weight > 0.0 && capture.points.seen_by.is_empty() {
+        let problem = "the capture does not say which photos observed its sparse points, so it has no target depths";
+        return Err(BadInput::new("--depth-weight", problem, "leave it").into());
+    }
     let settings = options.settings(&capture);
     let plan = blocks::plan(&capture, id, &settings, &train::Backend::Cpu.name())?;
     Ok((capture, plan))

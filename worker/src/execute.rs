@@ -103,6 +103,7 @@ impl Execute for BlockTrainer {
         let (capture, tiles) = self.capture(plan.capture)?;
         let window_bytes = options.cache_bytes - 2 * self.remote_bytes;
         let reader = WindowReader::with_shared_tiles(tiles, capture.clone(), store.clone(), window_bytes);
+        let reader = if plan.settings.depth_weight > 0.0 { reader.with_sparse_depth() } else { reader };
         let (results, given) = self.results(&plan, task, order, report)?;
         let cache = options.resume.then(|| ResultCache::of(order)).filter(|_| shared.time_limit.is_none());
         if let Some((artefact, splats)) = cache.as_ref().and_then(|cache| cache.result(store)) {

@@ -9,6 +9,7 @@ const _: () = assert!(blocks::MAX_VIEWS_PER_STEP == train::MAX_VIEWS_PER_STEP);
 pub(crate) fn recipe_of(settings: &PlanSettings, task: &Task) -> Recipe {
     let from_points = task.parent.is_none();
     let recipe = if from_points { Recipe::default() } else { Recipe::refinement() };
-    let recipe = Recipe { views_per_step: settings.views_per_step, ..recipe };
+    let depth_weight = settings.depth_weight as f32;
+    let recipe = Recipe { views_per_step: settings.views_per_step, depth_weight, ..recipe };
     if settings.residual > 0.0 { recipe } else { recipe.fixed_schedule(from_points) }
 }

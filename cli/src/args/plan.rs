@@ -5,7 +5,7 @@ use clap::{Args, ValueEnum};
 use scene::Capture;
 use serde::Serialize;
 
-use super::values::{Auto, decibels, residual, views_per_step};
+use super::values::{Auto, decibels, residual, views_per_step, weight};
 
 /// How the scene is divided.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum, Serialize)]
@@ -67,6 +67,10 @@ pub(crate) struct PlanOptions {
     /// Label each splat with the block that trained it, as the integer property `block` of merged.ply
     #[arg(long)]
     pub(crate) label_blocks: bool,
+    /// Weight of a loss that compares rendered depths with the sparse points that the photo observed. It keeps splats from floating
+    /// where few photos overlap; 0 leaves it out
+    #[arg(long, value_name = "W", value_parser = weight, default_value_t = 0.0)]
+    pub(crate) depth_weight: f64,
     /// Use photos at one N-th of their size
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
     pub(crate) downscale: u32,
@@ -98,6 +102,7 @@ impl PlanOptions {
             antialiased: self.antialiased,
             exposure: self.exposure,
             label_blocks: self.label_blocks,
+            depth_weight: self.depth_weight,
             ..PlanSettings::default()
         }
     }

@@ -136,6 +136,7 @@ pub(crate) fn settings(args: &DemoArgs) -> (Settings, TrainArgs) {
             antialiased: false,
             exposure: false,
             label_blocks: false,
+            depth_weight: 0.0,
             test_every: 8,
             downscale: 1,
         },
