@@ -226,10 +226,11 @@ impl Plan {
         if self.version != VERSION {
             return bad(format!("has version {}; this program reads version {VERSION}", self.version));
         }
-        let PlanSettings { sh_degree, views_per_step, .. } = self.settings;
+        let PlanSettings { sh_degree, views_per_step, depth_weight, .. } = self.settings;
         let is_batch = (1..=MAX_VIEWS_PER_STEP).contains(&views_per_step);
-        if !self.ground.is_sane() || self.levels > MAX_LEVELS || sh_degree > 3 || !is_batch {
-            return bad("has a ground, depth, SH degree or number of views per step out of range".into());
+        let is_weight = depth_weight.is_finite() && depth_weight >= 0.0;
+        if !self.ground.is_sane() || self.levels > MAX_LEVELS || sh_degree > 3 || !is_batch || !is_weight {
+            return bad("has a ground, depth, SH degree, number of views per step or weight out of range".into());
         }
         let sane = |rho: &f64| rho.is_finite() && *rho > 0.0;
         if self.rho_metres.len() != usize::from(self.levels) + 1 || !self.rho_metres.iter().all(sane) {

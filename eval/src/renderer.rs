@@ -21,7 +21,7 @@ pub struct Uploaded<'a>(Place<'a>);
 enum Place<'a> {
     Cpu(&'a Splats),
     #[cfg(feature = "gpu")]
-    Gpu(render::gpu::GpuSplats),
+    Gpu(Box<render::gpu::GpuSplats>),
 }
 
 impl Renderer {
@@ -54,7 +54,7 @@ impl Renderer {
         Ok(Uploaded(match &self.0 {
             Inner::Cpu(_) => Place::Cpu(splats),
             #[cfg(feature = "gpu")]
-            Inner::Gpu(gpu) => Place::Gpu(gpu.upload(splats)?),
+            Inner::Gpu(gpu) => Place::Gpu(Box::new(gpu.upload(splats)?)),
         }))
     }
 

@@ -69,8 +69,8 @@ mod tests {
     /// Targets on every third pixel, some near the rendered depth and some far from it; weights from 0 to 2.
     fn targets() -> (Vec<f32>, Vec<f32>) {
         let area = (WIDTH * HEIGHT) as usize;
-        let target = |i: usize| if i % 3 == 0 { 3.0 + 2.0 * uniform(7, i as u64) } else { 0.0 };
-        let weight = |i: usize| if i % 9 == 0 { 0.0 } else { 2.0 * uniform(8, i as u64) };
+        let target = |i: usize| if i.is_multiple_of(3) { 3.0 + 2.0 * uniform(7, i as u64) } else { 0.0 };
+        let weight = |i: usize| if i.is_multiple_of(9) { 0.0 } else { 2.0 * uniform(8, i as u64) };
         ((0..area).map(target).collect(), (0..area).map(weight).collect())
     }
 

@@ -32,7 +32,7 @@ impl Block<'_> {
         recipe: &Recipe,
     ) -> Result<InitialSplats, ExecuteError> {
         if results.is_empty() {
-            return Ok(InitialSplats { trained: self.from_points(views, recipe)?, context: None });
+            return Ok(InitialSplats { trained: self.splats_from_points(views, recipe)?, context: None });
         }
         let (plan, task) = (self.plan, self.task);
         let sh_degree = plan.settings.sh_degree;
@@ -60,7 +60,7 @@ impl Block<'_> {
     }
 
     /// Splats at the capture's sparse points, and a backdrop around them.
-    fn from_points(&self, views: &[TrainView], recipe: &Recipe) -> Result<Splats, ExecuteError> {
+    fn splats_from_points(&self, views: &[TrainView], recipe: &Recipe) -> Result<Splats, ExecuteError> {
         let (plan, task) = (self.plan, self.task);
         let sh_degree = plan.settings.sh_degree;
         let all = plan.settings.mode != Mode::Flat;
