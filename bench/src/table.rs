@@ -65,8 +65,9 @@ pub fn short_table(lines: &[ResultLine]) -> String {
         let line = &best.line;
         let reference = of_scene(scene, true).next().map(|run| (run.line.best_psnr(), &run.line));
         let against = reference.map(|(psnr, reference)| {
-            let reached = |line: &ResultLine| line.cpu_seconds_to(psnr).map_or("not reached".into(), seconds);
-            format!("{psnr:.2} | {} | {}", reached(reference), reached(line))
+            // A reference without a curve reached its PSNR at its end.
+            let its = reference.cpu_seconds_to(psnr).unwrap_or(reference.cpu_seconds);
+            format!("{psnr:.2} | {} | {}", seconds(its), line.cpu_seconds_to(psnr).map_or("not reached".into(), seconds))
         });
         let _ = writeln!(
             text,

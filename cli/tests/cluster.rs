@@ -170,7 +170,7 @@ fn a_block_is_given_to_a_worker_with_enough_memory() {
     let small = begin("small", "24");
     let failed = until("2", "incomplete");
     let line = failed["failures"][0]["message"].as_str().unwrap();
-    assert!(line.contains("--memory gives it 24") && line.contains("add a larger one"), "{line}");
+    assert!(line.contains("--memory gives it 24") && line.contains("add a larger worker"), "{line}");
     let first = asked(&["status", "1"]);
     assert!(first["state"] == "running" && first["running"].as_array().unwrap().is_empty(), "{first}");
     small.signal("-TERM");
