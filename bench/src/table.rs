@@ -67,7 +67,11 @@ pub fn short_table(lines: &[ResultLine]) -> String {
         let against = reference.map(|(psnr, reference)| {
             // A reference without a curve reached its PSNR at its end.
             let its = reference.cpu_seconds_to(psnr).unwrap_or(reference.cpu_seconds);
-            format!("{psnr:.2} | {} | {}", seconds(its), line.cpu_seconds_to(psnr).map_or("not reached".into(), seconds))
+            format!(
+                "{psnr:.2} | {} | {}",
+                seconds(its),
+                line.cpu_seconds_to(psnr).map_or("not reached".into(), seconds)
+            )
         });
         let _ = writeln!(
             text,
