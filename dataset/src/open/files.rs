@@ -94,7 +94,7 @@ pub(super) fn image_size(path: &Path) -> Result<(u32, u32), BadInput> {
     };
     let file = File::open(path).map_err(|e| cannot(&e))?;
     let (width, height) = photo::size(BufReader::new(file)).map_err(|e| match e {
-        ImageError::Limits(_) => cannot(&"its header needs too much memory"),
+        ImageError::Limits(_) => cannot(&"its header claims more pixels than any photo has"),
         other => cannot(&other),
     })?;
     check_size(path, width, height)?;
