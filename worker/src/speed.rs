@@ -8,7 +8,8 @@ use train::{Backend, Flow, Job, Recipe, TrainView, WindowSource};
 
 use crate::clock;
 
-/// CPU seconds of one measured step on the machine of the estimate's constants (an EPYC core with AVX-512).
+/// CPU seconds of one measured step on the machine of the estimate's constants (an EPYC core with AVX-512), known to a fifth
+/// (docs/decisions/0054).
 const REFERENCE_STEP_SECONDS: f64 = 6.0e-3;
 /// Width and height of the measured window, pixels.
 const SIZE: [u32; 2] = [256, 144];
