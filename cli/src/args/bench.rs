@@ -58,10 +58,6 @@ pub(crate) struct ParetoArgs {
 pub(crate) struct IngestArgs {
     /// Folder of the capture: COLMAP or transforms.json
     pub(crate) capture: PathBuf,
-    /// Compensate opacity for the pixel's blur: the model may be drawn at any resolution by viewers that do the same, for
-    /// 0.2 to 0.6 dB at its own
-    #[arg(long)]
-    pub(crate) antialiased: bool,
     /// Use photos at one N-th of their size
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
     pub(crate) downscale: u32,
