@@ -54,6 +54,9 @@ pub struct ResultLine {
     pub wall_seconds: Option<f64>,
     /// User and system time of training, seconds; with image loading, without evaluation.
     pub cpu_seconds: f64,
+    /// `cpu_seconds` as estimated before training; null in old lines.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub predicted_cpu_seconds: Option<f64>,
     /// PSNR over held-out views, dB.
     pub psnr: f64,
     /// PSNR over held-out views after an affine colour correction of each view, dB.

@@ -69,6 +69,7 @@ fn mean(last: &ResultLine, runs: &[&ResultLine], variant: String) -> Averaged {
     let psnr = |run: &&ResultLine| run.psnr;
     let line = ResultLine {
         cpu_seconds: of(&|run| run.cpu_seconds),
+        predicted_cpu_seconds: maybe(&|run| run.predicted_cpu_seconds),
         psnr: of(&|run| run.psnr),
         cc_psnr: maybe(&|run| run.cc_psnr),
         ssim: maybe(&|run| run.ssim),

@@ -14,8 +14,8 @@ const SHORT_ROWS: usize = 8;
 pub fn table(lines: &[ResultLine]) -> String {
     let runs = averaged(lines);
     let mut text = String::from(
-        "| scene | run | backend | PSNR, dB | SSIM | SSIMULACRA2 | CPU s | to the reference's best, CPU s | splats | peak MB |\n\
-         |---|---|---|---:|---:|---:|---:|---:|---:|---:|\n",
+        "| scene | run | backend | PSNR, dB | SSIM | SSIMULACRA2 | CPU s | estimate over outcome | to the reference's best, CPU s | splats | peak MB |\n\
+         |---|---|---|---:|---:|---:|---:|---:|---:|---:|---:|\n",
     );
     for scene in scenes(runs.iter().map(|run| &run.line)) {
         let of_scene = |referred: bool| {
@@ -27,7 +27,7 @@ pub fn table(lines: &[ResultLine]) -> String {
             // Writing to a String cannot fail.
             let _ = writeln!(
                 text,
-                "| {} | {} | {} | {} | {} | {} | {} | {} | {} | {} |",
+                "| {} | {} | {} | {} | {} | {} | {} | {} | {} | {} | {} |",
                 scene_cell(line),
                 cell(&name(run)),
                 cell(&line.backend),
@@ -35,6 +35,7 @@ pub fn table(lines: &[ResultLine]) -> String {
                 number(line.ssim, 3),
                 number(line.perceptual, 1),
                 seconds(line.cpu_seconds),
+                number(line.predicted_cpu_seconds.map(|predicted| predicted / line.cpu_seconds), 2),
                 reference.map_or("–".into(), |reference| to_best(line, reference)),
                 line.splats.map_or("–".into(), thousands),
                 number(line.peak_memory_bytes.map(|bytes| bytes as f64 / 1e6), 0),
@@ -160,11 +161,12 @@ mod tests {
         let mut reference = line("OpenSplat", "fox", &[(100.0, 20.0), (1000.0, 28.0)]);
         reference.source = Some("measured".into());
         let ours = line("plat tree", "fox", &[(10.0, 26.0), (30.0, 30.0)]);
+        let ours = ResultLine { predicted_cpu_seconds: Some(33.0), ..ours };
         let worse = line("plat | flat", "fox", &[(10.0, 26.0)]);
         let text = table(&[ours, reference, worse]);
         let rows: Vec<&str> = text.lines().skip(2).collect();
-        assert!(rows[0].contains("OpenSplat") && rows[0].contains("| 1000 | 1000 |"), "{}", rows[0]);
-        assert!(rows[1].contains("| 20.0 (50.0×) | 12,010 |"), "{}", rows[1]);
+        assert!(rows[0].contains("OpenSplat") && rows[0].contains("| 1000 | – | 1000 |"), "{}", rows[0]);
+        assert!(rows[1].contains("| 30.0 | 1.10 | 20.0 (50.0×) | 12,010 |"), "{}", rows[1]);
         assert!(rows[2].contains("plat \\| flat") && rows[2].contains("not reached"), "{}", rows[2]);
     }
 

@@ -2,8 +2,8 @@
 //!
 //! The ground plane is a quadtree of blocks ([`Ground`]). One half-open ownership rule assigns every place to a block.
 //! [`cut()`] and [`merge()`] share it, so `merge(cut(s)) == s`. [`plan()`] turns a capture into an immutable, hashed
-//! list of tasks. A task states which block trains on which windows of which views, against which frozen context and
-//! within which budgets. [`lint()`] checks a plan, [`draw()`] draws it as an SVG.
+//! list of tasks. A training task states which block trains on which windows of which views, against which frozen context
+//! and within which budgets; an evaluation task states on which views the merged model is measured. [`lint()`] checks a plan, [`draw()`] draws it as an SVG.
 //!
 //! Architecture invariant: this crate does no I/O, reads no clock, starts no thread and uses no GPU. All functions are
 //! pure, and equal inputs give equal bytes.
@@ -14,6 +14,7 @@ mod cost;
 mod coverage;
 pub mod cut;
 pub mod draw;
+mod evaluation;
 pub mod ground;
 mod layout;
 pub mod lint;
@@ -34,7 +35,7 @@ pub use draw::draw;
 pub use ground::{Ground, Square};
 pub use lint::{Finding, Severity, lint};
 pub use lod::{Cut, context_of, sweep_of};
-pub use plan::{MAX_VIEWS_PER_STEP, Mode, Plan, PlanError, PlanSettings, Task, ViewUse};
+pub use plan::{EvalTask, MAX_VIEWS_PER_STEP, Mode, Plan, PlanError, PlanSettings, PlannedTask, Task, ViewUse};
 pub use planner::plan;
 pub use seams::{Face, Seams};
 pub use view_cut::ViewTree;

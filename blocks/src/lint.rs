@@ -7,7 +7,7 @@ use scene::{BlockId, Capture};
 
 use crate::layout::MIN_VIEWS;
 use crate::lod::training_order;
-use crate::plan::{Mode, Plan, Task, ViewUse};
+use crate::plan::{EvalTask, Mode, Plan, Task, ViewUse};
 use crate::visibility::max_mip;
 
 /// How bad a finding is.
@@ -60,6 +60,7 @@ pub fn lint(plan: &Plan, capture: &Capture) -> Vec<Finding> {
         check_budgets(plan, task, &mut findings);
         earlier.insert(task.block);
     }
+    plan.eval_tasks.iter().for_each(|task| check_evaluation(plan, task, capture, &mut findings));
     let finest: u64 = plan.leaves().blocks().iter().filter_map(|&b| plan.task(b)).map(|t| u64::from(t.budget)).sum();
     let deepest: u64 = plan.tasks.iter().filter(|t| t.block.level == plan.levels).map(|t| u64::from(t.budget)).sum();
     let (budget, parts) = (u64::from(plan.settings.budget), plan.tasks.len() as u64);
@@ -187,6 +188,24 @@ fn check_budgets(plan: &Plan, task: &Task, findings: &mut Findings) {
     }
 }
 
+/// Checks that the views of an evaluation exist and are held out, and that the whole model fits in memory.
+fn check_evaluation(plan: &Plan, task: &EvalTask, capture: &Capture, findings: &mut Findings) {
+    for &view in &task.views {
+        if view as usize >= capture.views.len() {
+            findings.error(None, format!("evaluates view {view}, the capture has {}", capture.views.len()));
+        } else if !Capture::is_test(view as usize, plan.settings.test_every) {
+            findings.error(None, format!("evaluates training view {view}"));
+        }
+    }
+    let (bytes, limit) = (task.memory_bytes, plan.settings.memory_limit_bytes);
+    if bytes > limit {
+        let [bytes, limit] = [bytes, limit].map(|bytes| bytes.div_ceil(1 << 20));
+        let advice = "lower --budget, or leave --evaluate and use plat eval";
+        findings
+            .error(None, format!("evaluating the merged model needs {bytes} MiB, the limit is {limit} MiB; {advice}"));
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use scene::ArtefactId;
@@ -233,6 +252,24 @@ mod tests {
         let mut poor = good.clone();
         poor.tasks[1].budget += 90_000;
         assert!(lint(&poor, &capture).iter().any(|f| f.message.contains("do not add up")));
+        // Views 0 and 8 are held out.
+        let evaluates = |views: &[u32], memory_bytes: u64| {
+            let task = EvalTask { views: views.to_vec(), pixels: 1, memory_bytes };
+            lint(&Plan { eval_tasks: vec![task], ..good.clone() }, &capture)
+        };
+        assert!(evaluates(&[0, 8], 1).is_empty());
+        for (views, bytes, expected) in [
+            (&[0, 9][..], 1, "evaluates training view 9"),
+            (&[4000], 1, "the capture has 36"),
+            (&[8, 0], 1, "twice or out of order"),
+            (&[0, 0], 1, "twice or out of order"),
+            (&[], 1, "without views"),
+            (&[0], u64::MAX, "leave --evaluate"),
+        ] {
+            let findings = evaluates(views, bytes);
+            let found = findings.iter().any(|f| f.severity == Severity::Error && f.message.contains(expected));
+            assert!(found, "{expected}: {findings:?}");
+        }
         let mut fewer = capture.clone();
         fewer.views.truncate(20);
         assert!(lint(&good, &fewer).iter().any(|f| f.message.contains("the capture has 20")));

@@ -1,7 +1,9 @@
-//! The plan: an immutable, hashed list of training tasks, with its settings and its codec.
+//! The plan: an immutable, hashed list of tasks, with its settings and its codec.
 //!
 //! A plan is stored as positional bincode in a frame, and as JSON. The order of fields and the serde names are part of
 //! both formats.
+
+use std::collections::BTreeSet;
 
 use glam::DVec3;
 use scene::frame::{self, Kind};
@@ -12,7 +14,7 @@ use crate::ground::{Ground, HALO_SCALE};
 use crate::lod::{Cut, training_order};
 
 /// The format version of [`Plan`] that this program reads and writes.
-pub const VERSION: u32 = 6;
+pub const VERSION: u32 = 7;
 /// The frame kind of a plan.
 pub const PLAN: Kind = Kind(*b"plan", VERSION);
 /// The maximum depth of a plan: 65,536 blocks a side.
@@ -75,6 +77,8 @@ pub struct PlanSettings {
     pub label_blocks: bool,
     /// Weight of the depth loss against the capture's sparse points; 0 leaves it out.
     pub depth_weight: f64,
+    /// Whether tasks of the job measure the merged model on the held-out views after training.
+    pub evaluate: bool,
 }
 
 impl Default for PlanSettings {
@@ -95,6 +99,7 @@ impl Default for PlanSettings {
             memory_limit_bytes: 4 << 30,
             label_blocks: false,
             depth_weight: 0.0,
+            evaluate: false,
         }
     }
 }
@@ -175,6 +180,44 @@ impl Task {
     }
 }
 
+/// The task of measuring the merged model on some held-out views. It reads the results of all blocks.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct EvalTask {
+    /// Indices of the views, ascending. They are compared at full resolution.
+    pub views: Vec<u32>,
+    /// Pixels of all these views.
+    pub pixels: u64,
+    /// Estimated peak memory, bytes.
+    pub memory_bytes: u64,
+}
+
+/// A task of any kind, as [`Plan::planned`] finds it. A new kind of task is a list in [`Plan`] and a variant here.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum PlannedTask<'a> {
+    /// Trains a block.
+    Train(&'a Task),
+    /// Measures the merged model.
+    Evaluate(&'a EvalTask),
+}
+
+impl PlannedTask<'_> {
+    /// The steps that its progress counts: optimiser steps, or views.
+    pub fn steps(&self) -> u64 {
+        match self {
+            Self::Train(task) => task.steps.into(),
+            Self::Evaluate(task) => task.views.len() as u64,
+        }
+    }
+
+    /// Estimated peak memory, bytes.
+    pub fn memory_bytes(&self) -> u64 {
+        match self {
+            Self::Train(task) => task.memory_bytes,
+            Self::Evaluate(task) => task.memory_bytes,
+        }
+    }
+}
+
 /// An immutable list of tasks in topological order: each task follows its dependencies.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Plan {
@@ -192,8 +235,11 @@ pub struct Plan {
     pub levels: u8,
     /// Resolution of each level, metres per pixel; `levels + 1` entries.
     pub rho_metres: Vec<f64>,
-    /// Sorted by level, sweep, row and column. Each task follows its parent and its context.
+    /// The training tasks, sorted by level, sweep, row and column. Each task follows its parent and its context.
     pub tasks: Vec<Task>,
+    /// Tasks after training: each view that they measure is held out and named once. Empty without
+    /// [`PlanSettings::evaluate`].
+    pub eval_tasks: Vec<EvalTask>,
 }
 
 impl Plan {
@@ -249,6 +295,10 @@ impl Plan {
                 return bad(format!("has an empty or too large window in task {}", task.block));
             }
         }
+        let measured = self.eval_tasks.iter().flat_map(|task| &task.views);
+        if !measured.is_sorted_by(|a, b| a < b) || self.eval_tasks.iter().any(|task| task.views.is_empty()) {
+            return bad("has evaluation tasks without views, or with views twice or out of order".into());
+        }
         if self.tasks.is_empty() || !self.tasks.is_sorted_by(|a, b| training_order(a.block) < training_order(b.block)) {
             return bad("has no tasks, or its tasks are out of order".into());
         }
@@ -257,10 +307,47 @@ impl Plan {
 
     /// The task of a block, if it has one.
     pub fn task(&self, block: BlockId) -> Option<&Task> {
-        self.tasks
-            .binary_search_by_key(&training_order(block), |t| training_order(t.block))
-            .ok()
-            .map(|i| &self.tasks[i])
+        self.index(block).map(|index| &self.tasks[index as usize])
+    }
+
+    /// The number of tasks of all kinds.
+    pub fn len(&self) -> usize {
+        self.tasks.len() + self.eval_tasks.len()
+    }
+
+    /// Whether there is no task of any kind; false for a plan that passed [`Plan::check`].
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// The task of an index: first the training tasks, then those that evaluate. The index identifies the task towards
+    /// the coordinator and its workers.
+    pub fn planned(&self, index: u32) -> Option<PlannedTask<'_>> {
+        let index = index as usize;
+        match index.checked_sub(self.tasks.len()) {
+            None => self.tasks.get(index).map(PlannedTask::Train),
+            Some(index) => self.eval_tasks.get(index).map(PlannedTask::Evaluate),
+        }
+    }
+
+    /// All tasks, by index.
+    pub fn all_tasks(&self) -> impl Iterator<Item = PlannedTask<'_>> {
+        let evaluate = self.eval_tasks.iter().map(PlannedTask::Evaluate);
+        self.tasks.iter().map(PlannedTask::Train).chain(evaluate)
+    }
+
+    /// The blocks whose results a task reads.
+    pub fn inputs(&self, task: PlannedTask) -> BTreeSet<BlockId> {
+        match task {
+            PlannedTask::Train(task) => task.context_cut().blocks(),
+            PlannedTask::Evaluate(_) => self.tasks.iter().map(|task| task.block).collect(),
+        }
+    }
+
+    /// The index of a block's training task.
+    pub fn index(&self, block: BlockId) -> Option<u32> {
+        let found = self.tasks.binary_search_by_key(&training_order(block), |t| training_order(t.block));
+        found.ok().map(|index| index as u32)
     }
 
     /// The finest cut: the owner of every place in the merged model. Every place has exactly one.

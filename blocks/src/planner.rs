@@ -3,6 +3,7 @@
 use scene::{ArtefactId, Capture};
 
 use crate::budgets::{self, DetailShares};
+use crate::evaluation::eval_tasks;
 use crate::ground::{Ground, quantile};
 use crate::layout::{Layout, level_rho_metres};
 use crate::plan::{MAX_LEVELS, MAX_VIEWS_PER_STEP, Mode, Plan, PlanError, PlanSettings, VERSION};
@@ -57,6 +58,7 @@ pub fn plan(
     let shares = DetailShares::of(capture, &observations, &ground, levels, finest_metres);
     let whole = layout.lay_out(Mode::Whole, 0, finest_metres)?.1.remove(0);
     budgets::set_all(&mut tasks, whole, &shares, capture, &ground, settings);
+    let eval_tasks = if settings.evaluate { eval_tasks(capture, &tasks, settings) } else { Vec::new() };
     Ok(Plan {
         version: VERSION,
         capture: capture_id,
@@ -66,6 +68,7 @@ pub fn plan(
         levels,
         rho_metres: (0..=levels).map(|level| level_rho_metres(finest_metres, base, level)).collect(),
         tasks,
+        eval_tasks,
     })
 }
 
@@ -86,6 +89,10 @@ fn check(settings: &PlanSettings) -> Result<(), PlanError> {
     }
     if !(0.0..1.0).contains(&settings.residual) {
         return bad("--residual", format!("{} is out of range", settings.residual), "give 0 to 1, such as 0.4");
+    }
+    if settings.evaluate && settings.test_every == 0 {
+        let problem = "no view is held out to measure the model on";
+        return bad("--evaluate", problem.into(), "omit it, or give --test-every a number from 1");
     }
     if settings.exposure && settings.mode == Mode::Flat {
         let problem = "flat blocks have no root that trains the exposures";

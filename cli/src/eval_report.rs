@@ -14,7 +14,9 @@ use crate::run_record::Record;
 pub(crate) struct Evaluated {
     #[serde(flatten)]
     pub(crate) record: Record,
-    pub(crate) sheet: PathBuf,
+    /// The contact sheet; tasks of a job draw none.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(crate) sheet: Option<PathBuf>,
     pub(crate) views: Vec<ViewFigures>,
     /// With `--level` or `--budget`.
     #[serde(skip_serializing_if = "Vec::is_empty")]
@@ -45,7 +47,7 @@ pub(crate) fn text(evaluated: &Evaluated) -> String {
     if let Some(report) = &evaluated.seams {
         text += &format!("\n{}\n\n", seams(report));
     }
-    text + &evaluated.sheet.display().to_string()
+    text + &evaluated.sheet.as_ref().map_or(String::new(), |sheet| sheet.display().to_string())
 }
 
 fn figure(value: Option<f64>, digits: usize) -> String {

@@ -81,7 +81,7 @@ impl<'a> LiveStatus<'a> {
         let (done, all) = (count(results, TaskState::Done), results.tasks().len());
         match changed.state() {
             TaskState::Done => self.output.note(format!("{name} done, {done} of {all}")),
-            TaskState::Leased => self.output.note(format!("{name} is trained by {}", changed.worker)),
+            TaskState::Leased => self.output.note(format!("{name} runs on {}", changed.worker)),
             TaskState::Failed | TaskState::Quarantined => {
                 self.output.note(format!("{name} failed: {}", proto::one_line(&changed.message)));
             }
@@ -95,7 +95,7 @@ impl<'a> LiveStatus<'a> {
         let all = results.tasks().len();
         let failed = all - done - leased - ready - waiting;
         let mut lines = vec![format!(
-            "job {}: {done} of {all} done, {leased} being trained, {ready} ready, {waiting} waiting, {failed} failed",
+            "job {}: {done} of {all} done, {leased} running, {ready} ready, {waiting} waiting, {failed} failed",
             self.job
         )];
         let running = results.tasks().iter().filter(|task| task.state() == TaskState::Leased);

@@ -11,6 +11,7 @@ mod clock;
 mod commands;
 mod config;
 mod eval_report;
+mod eval_results;
 mod failure;
 mod live_status;
 mod metrics_log;

@@ -5,8 +5,8 @@ use std::path::{Path, PathBuf};
 
 use bench::CurvePoint;
 use blocks::Plan;
-use proto::TaskState;
 use proto::watch_event::Event;
+use proto::{TaskChanged, TaskState};
 use scene::BlockId;
 use serde::Serialize;
 use store::file::{SaveError, append};
@@ -69,6 +69,10 @@ pub(crate) struct MetricsLog<'a> {
     progress: &'a Progress,
     totals: Totals,
     done: usize,
+    /// Number of evaluation tasks, and how many are done.
+    evaluations: (usize, usize),
+    /// CPU and wall seconds when the first evaluation task began. Evaluation does not count.
+    trained_at: Option<(f64, f64)>,
     failed: Option<Failure>,
 }
 
@@ -92,6 +96,8 @@ impl<'a> MetricsLog<'a> {
             progress,
             totals: Totals::default(),
             done: 0,
+            evaluations: (plan.eval_tasks.len(), 0),
+            trained_at: None,
             failed: None,
         })
     }
@@ -100,7 +106,9 @@ impl<'a> MetricsLog<'a> {
     pub(crate) fn update(&mut self, update: &Event) {
         match update {
             Event::Changed(changed) => {
-                let Some((block, _)) = self.planned.get(changed.task as usize) else { return };
+                let Some((block, _)) = self.planned.get(changed.task as usize) else {
+                    return self.evaluation_changed(changed);
+                };
                 match changed.state() {
                     TaskState::Done => {
                         self.done += 1;
@@ -120,6 +128,22 @@ impl<'a> MetricsLog<'a> {
                 }
             }
             Event::Finished(_) => {}
+        }
+    }
+
+    /// Evaluation tasks begin after training.
+    fn evaluation_changed(&mut self, changed: &TaskChanged) {
+        let (all, done) = &mut self.evaluations;
+        match changed.state() {
+            TaskState::Leased if self.trained_at.is_none() => self.trained_at = Some(self.clocks()),
+            TaskState::Done => {
+                *done += 1;
+                self.progress.note(format!("evaluation {done} of {all} done"));
+            }
+            TaskState::Failed | TaskState::Quarantined => {
+                self.progress.note(format!("evaluation failed: {}", proto::one_line(&changed.message)));
+            }
+            TaskState::Waiting | TaskState::Ready | TaskState::Leased => {}
         }
     }
 
@@ -162,6 +186,9 @@ impl<'a> MetricsLog<'a> {
 
     /// CPU and wall seconds since the start of the command.
     fn clocks(&self) -> (f64, f64) {
+        if let Some(trained_at) = self.trained_at {
+            return trained_at;
+        }
         if self.workers > 1 {
             return (self.clock.cpu_seconds(), self.clock.wall_seconds());
         }

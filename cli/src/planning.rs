@@ -38,8 +38,12 @@ pub(crate) fn check_plan(plan: &Plan, capture: &Capture, output: &Output) -> Res
 /// The plan as text, a line per level.
 pub(crate) fn describe(plan: &Plan) -> String {
     let estimate = Estimate::of(plan, relative_speed());
+    let evaluation = match plan.eval_tasks.len() {
+        0 => String::new(),
+        count => format!(" and {count} evaluation task{}", if count == 1 { "" } else { "s" }),
+    };
     let mut text = format!(
-        "{:?} plan of {} level{}, {} task{}, root {:.1} m: about {:.0} CPU seconds and {} MB a task\n",
+        "{:?} plan of {} level{}, {} task{}{evaluation}, root {:.1} m: about {:.0} CPU seconds and {} MB a task\n",
         plan.settings.mode,
         plan.levels + 1,
         if plan.levels == 0 { "" } else { "s" },

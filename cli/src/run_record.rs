@@ -23,6 +23,9 @@ pub(crate) struct Record {
     /// Of ingest, training and merging; evaluation is left out.
     pub(crate) wall_seconds: Option<f64>,
     pub(crate) cpu_seconds: Option<f64>,
+    /// As estimated before training; `report.json` has the whole estimate.
+    #[serde(skip)]
+    pub(crate) predicted_cpu_seconds: Option<f64>,
     /// dB over the held-out views.
     pub(crate) psnr: Option<f64>,
     /// dB over the held-out views, after the affine colour correction of each.
@@ -71,6 +74,7 @@ impl Record {
             workers: self.workers,
             wall_seconds: self.wall_seconds,
             cpu_seconds: self.cpu_seconds.unwrap_or(f64::NAN),
+            predicted_cpu_seconds: self.predicted_cpu_seconds,
             psnr: self.psnr.unwrap_or(f64::NAN),
             cc_psnr: self.cc_psnr,
             ssim: self.ssim,

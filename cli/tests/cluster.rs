@@ -35,7 +35,7 @@ fn a_cluster_whose_workers_are_killed_and_stopped_gives_the_bytes_of_one_process
     let (host, url) = coordinator(at);
     let asked = |words: &[&str]| common::done(at, &[words, &["--coordinator", &url]].concat());
     assert_eq!(asked(&["jobs"])["jobs"].as_array().unwrap().len(), 0);
-    let words = ["submit", "city", "--coordinator", &url, "--wait", "--out", "far", "--json"];
+    let words = ["submit", "city", "--coordinator", &url, "--wait", "--out", "far", "--json", "--evaluate"];
     let submit = Running::start(&mut common::command(at, &[&words[..], &PLAN].concat()));
 
     // One worker is killed while it trains; one is stopped and returns its task. Each is the only worker until then, so that it has a
@@ -64,11 +64,14 @@ fn a_cluster_whose_workers_are_killed_and_stopped_gives_the_bytes_of_one_process
     });
     assert!(ends.iter().any(|end| end["resumed"].as_u64() >= Some(1)), "no worker resumed from a checkpoint: {ends:?}");
 
-    let calm = common::done(at, &[&["train", "city", "--out", "calm", "--workers", "1"][..], &PLAN].concat());
+    let train = ["train", "city", "--out", "calm", "--workers", "1", "--evaluate"];
+    let calm = common::done(at, &[&train[..], &PLAN].concat());
     let bytes = |path: &str| std::fs::read(at.join(path)).unwrap();
     assert!(bytes("far/merged.ply") == bytes("calm/merged.ply"), "the cluster changes the result");
     assert_eq!((&said["plan"], &said["splats"]), (&calm["plan"], &calm["splats"]));
-    assert!(common::done(at, &["eval", "far", "city"])["psnr"].is_f64(), "the model cannot be evaluated");
+    // The workers measured the model too.
+    let measured = common::done(at, &["eval", "far", "city", "--out", "eval"]);
+    assert!(measured["psnr"].is_f64() && measured["psnr"] == said["psnr"] && said["psnr"] == calm["psnr"], "{said}");
 
     // The log is complete, and no task is left.
     let log = asked(&["logs", "1"]);

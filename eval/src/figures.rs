@@ -3,14 +3,18 @@
 //! Renders are compared as floats clamped to 0..1, not rounded to 8 bits. PSNR counts unmasked pixels only. For the other measures
 //! masked pixels of the render are replaced by the photo's.
 
-use scene::{BadInput, Pixels};
-use serde::Serialize;
+use scene::frame::{self, Kind};
+use scene::{BadInput, CodecError, Pixels};
+use serde::{Deserialize, Serialize};
 use train::metrics;
 
 use crate::lpips::Lpips;
 
-/// Figures of one view. The field names are keys of `eval/report.json`.
-#[derive(Debug, Clone, Serialize)]
+/// The frame kind of a list of [`ViewFigures`].
+pub const FIGURES: Kind = Kind(*b"figs", 1);
+
+/// Figures of one view. The field names are keys of `eval/report.json`; their order is part of the frame's format.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ViewFigures {
     /// The view's name.
     pub view: String,
@@ -24,6 +28,19 @@ pub struct ViewFigures {
     pub perceptual: Option<f64>,
     /// Null without a network.
     pub lpips: Option<f64>,
+}
+
+/// Encodes figures as a frame: the result of an evaluation task.
+pub fn figures_to_frame(figures: &[ViewFigures]) -> Vec<u8> {
+    frame::encode(FIGURES, &figures, &[])
+}
+
+/// Decodes [`figures_to_frame`].
+///
+/// # Errors
+/// A damaged frame or another version.
+pub fn figures_from_frame(bytes: &[u8]) -> Result<Vec<ViewFigures>, CodecError> {
+    Ok(frame::decode(FIGURES, bytes)?.0)
 }
 
 /// A photo and a render of the same size, each as three planes of sRGB values in 0..1.

@@ -1,8 +1,10 @@
-//! Carries out a task: trains a block.
+//! Carries out a task of a plan: trains a block, or measures the merged model.
 //!
 //! ```text
-//! plan, capture, results of parent and context ──from the store──▶ initial splats and frozen context
-//!   ──train──▶ splats of the block, halo included ──to the store──▶ artefact
+//! train:    plan, capture, results of parent and context ──from the store──▶ initial splats and frozen context
+//!             ──train──▶ splats of the block, halo included ──to the store──▶ artefact
+//! evaluate: plan, capture, results of all blocks ──from the store──▶ merged model
+//!             ──render held-out views──▶ figures of each view ──to the store──▶ artefact
 //! ```
 //! The result is a function of the plan and its inputs, so an attempt on any worker gives the same bytes.
 
@@ -10,7 +12,7 @@ use std::collections::BTreeMap;
 use std::sync::atomic::Ordering;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use blocks::{Plan, Task};
+use blocks::{EvalTask, Plan, PlannedTask, Task};
 use bytes::Bytes;
 use dataset::byte_lru::ByteLru;
 use dataset::ingest::IngestError;
@@ -22,6 +24,7 @@ use train::Backend;
 
 use crate::block::Block;
 use crate::clock::Stopwatch;
+use crate::evaluate::evaluate;
 use crate::merged_eval::{MergedEvaluator, evaluates_after};
 use crate::recompute::recompute;
 use crate::result_cache::ResultCache;
@@ -34,8 +37,8 @@ const REMOTE_CACHE_FRACTION: usize = 4;
 /// Results that are fetched concurrently. Encoded they take less memory than as splats.
 const CONCURRENT_FETCHES: usize = 8;
 
-/// Trains blocks.
-pub struct BlockTrainer {
+/// Carries out the tasks of plans on one backend.
+pub struct PlanExecutor {
     pub(crate) context: TrainerContext,
     pool: rayon::ThreadPool,
     /// The plan of the last task. A city's plan has megabytes, and most consecutive tasks are of the same job.
@@ -51,11 +54,8 @@ pub struct BlockTrainer {
 /// A capture and the tiles that its readers share.
 type CachedCapture = (ArtefactId, Arc<Capture>, Arc<SharedTileCache>);
 
-/// The inputs of a task: splats by block, and the parent's exposures and residual.
-type Inputs = (BTreeMap<BlockId, Splats>, TrainingInfo);
-
-impl BlockTrainer {
-    /// A trainer over this store.
+impl PlanExecutor {
+    /// An executor over this store.
     ///
     /// # Errors
     /// The operating system refused the threads.
@@ -77,13 +77,13 @@ impl BlockTrainer {
         Ok(Self { context, pool, plan, capture, results, remote_bytes })
     }
 
-    /// Runs `work` on the trainer's threads.
+    /// Runs `work` on the executor's threads.
     pub(crate) fn install<T: Send>(&self, work: impl FnOnce() -> T + Send) -> T {
         self.pool.install(work)
     }
 }
 
-impl Execute for BlockTrainer {
+impl Execute for PlanExecutor {
     fn execute(
         &self,
         order: &TaskOrder,
@@ -98,20 +98,54 @@ impl Execute for BlockTrainer {
             let message = format!("the plan is for the backend {planned}, this worker computes on {own}");
             return Err(ExecuteError::work(message));
         }
-        let task = plan.tasks.get(order.task as usize);
-        let task = task.ok_or_else(|| ExecuteError::work("the plan has no such task"))?;
+        let task = plan.planned(order.task).ok_or_else(|| ExecuteError::work("the plan has no such task"))?;
         let (capture, tiles) = self.capture(plan.capture)?;
         let window_bytes = options.cache_bytes - 2 * self.remote_bytes;
         let reader = WindowReader::with_shared_tiles(tiles, capture.clone(), store.clone(), window_bytes);
-        let reader = if plan.settings.depth_weight > 0.0 { reader.with_sparse_depth() } else { reader };
-        let (results, given) = self.results(&plan, task, order, report)?;
         let cache = options.resume.then(|| ResultCache::of(order)).filter(|_| shared.time_limit.is_none());
-        if let Some((artefact, splats)) = cache.as_ref().and_then(|cache| cache.result(store)) {
+        drop(fetch_span);
+        let job = Assignment { order, plan: &plan, capture: &capture, cache: cache.as_ref() };
+        match task {
+            PlannedTask::Train(task) => self.train(&job, task, reader, &mut stopwatch, report),
+            PlannedTask::Evaluate(task) => self.evaluate(&job, task, &reader, &stopwatch, report),
+        }
+    }
+}
+
+/// What carrying out a task of any kind needs.
+struct Assignment<'a> {
+    order: &'a TaskOrder,
+    plan: &'a Plan,
+    capture: &'a Arc<Capture>,
+    /// `None` if nothing is resumed.
+    cache: Option<&'a ResultCache>,
+}
+
+impl PlanExecutor {
+    /// Trains a block; the artefact is its splats.
+    fn train(
+        &self,
+        job: &Assignment,
+        task: &Task,
+        reader: WindowReader,
+        stopwatch: &mut Stopwatch,
+        report: &mut (dyn FnMut(Report) -> Flow + Send),
+    ) -> Result<ArtefactId, ExecuteError> {
+        let &Assignment { order, plan, capture, cache } = job;
+        let TrainerContext { store, shared, .. } = &self.context;
+        let fetch_span = tracing::info_span!("fetch").entered();
+        let reader = if plan.settings.depth_weight > 0.0 { reader.with_sparse_depth() } else { reader };
+        let (mut results, mut given) = (BTreeMap::new(), TrainingInfo::default());
+        self.for_each_input(plan, PlannedTask::Train(task), order, report, |block, splats, training| {
+            results.insert(block, splats);
+            given = if Some(block) == task.parent { training } else { given };
+        })?;
+        let decode = |bytes: &[u8]| frame::decode_splats(bytes).ok();
+        if let Some((artefact, splats)) = cache.and_then(|cache| cache.result(store, decode)) {
             shared.resumed.fetch_add(1, Ordering::Relaxed);
-            self.report_cached(order, &plan, &reader, (&results, &splats), &stopwatch, report);
+            self.report_cached(order, plan, &reader, (&results, &splats), stopwatch, report);
             return Ok(artefact);
         }
-        let cache = cache.as_ref();
         let exposures = match given.exposures {
             Some(id) => Some(Exposures::from_frame(&store.get(id)?).map_err(ExecuteError::work)?),
             None => None,
@@ -121,16 +155,16 @@ impl Execute for BlockTrainer {
         let block = Block {
             context: &self.context,
             order,
-            plan: &plan,
+            plan,
             task,
-            capture: &capture,
+            capture,
             reader: &reader,
             cache,
             given_exposures,
             given_residual,
         };
         let train_span = tracing::info_span!("train", block = %task.block);
-        let trained = self.pool.install(|| train_span.in_scope(|| block.train(results, &mut stopwatch, report)));
+        let trained = self.pool.install(|| train_span.in_scope(|| block.train(results, stopwatch, report)));
         drop(train_span);
         shared.metrics.count_reads(reader.stats());
         // The next block has splats and a cache of its own.
@@ -145,9 +179,42 @@ impl Execute for BlockTrainer {
         }
         Ok(artefact)
     }
-}
 
-impl BlockTrainer {
+    /// Measures the merged model on some held-out views; the artefact is their figures.
+    fn evaluate(
+        &self,
+        job: &Assignment,
+        task: &EvalTask,
+        reader: &WindowReader,
+        stopwatch: &Stopwatch,
+        report: &mut (dyn FnMut(Report) -> Flow + Send),
+    ) -> Result<ArtefactId, ExecuteError> {
+        let &Assignment { order, plan, cache, .. } = job;
+        let TrainerContext { store, shared, backend, .. } = &self.context;
+        let decode = |bytes: &[u8]| eval::figures_from_frame(bytes).ok();
+        if let Some((artefact, _)) = cache.and_then(|cache| cache.result(store, decode)) {
+            shared.resumed.fetch_add(1, Ordering::Relaxed);
+            return Ok(artefact);
+        }
+        let (mut parts, leaves) = (Vec::new(), plan.leaves());
+        self.for_each_input(plan, PlannedTask::Evaluate(task), order, report, |block, splats, _| {
+            parts.push((block, leaves.keep(&splats, &plan.ground, block)));
+        })?;
+        let span = tracing::info_span!("evaluate", views = task.views.len());
+        let figures = self.pool.install(|| {
+            span.in_scope(|| {
+                let model = blocks::merge(parts);
+                evaluate(plan, task, &model, reader, backend, stopwatch, report)
+            })
+        });
+        shared.metrics.count_reads(reader.stats());
+        let artefact = store.put(eval::figures_to_frame(&figures?))?;
+        if let Some(cache) = cache {
+            cache.put_result(store, artefact);
+        }
+        Ok(artefact)
+    }
+
     /// Reports a task whose result an earlier run left, evaluated as if it had been trained now.
     fn report_cached(
         &self,
@@ -226,18 +293,17 @@ impl BlockTrainer {
         self.results.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// The results of the parent and the context blocks.
-    fn results(
+    /// Fetches the results that a task reads, in the order of their blocks, and hands them to `take` one by one.
+    fn for_each_input(
         &self,
         plan: &Plan,
-        task: &Task,
+        task: PlannedTask,
         order: &TaskOrder,
         report: &mut (dyn FnMut(Report) -> Flow + Send),
-    ) -> Result<Inputs, ExecuteError> {
-        let (mut results, mut given) = (BTreeMap::new(), TrainingInfo::default());
-        let wanted = task.context_cut().blocks().into_iter().map(|block| {
-            let index = plan.tasks.iter().position(|t| t.block == block);
-            let known = index.and_then(|i| order.inputs.get_key_value(&(i as u32)));
+        mut take: impl FnMut(BlockId, Splats, TrainingInfo),
+    ) -> Result<(), ExecuteError> {
+        let wanted = plan.inputs(task).into_iter().map(|block| {
+            let known = plan.index(block).and_then(|index| order.inputs.get_key_value(&index));
             known
                 .map(|(&index, &id)| (block, index, id))
                 .ok_or_else(|| ExecuteError::work(format!("the grant does not name the result of block {block}")))
@@ -260,11 +326,10 @@ impl BlockTrainer {
                     None => recompute(self, &self.context.store, plan, order, (index, id), report)?,
                 };
                 let (splats, training) = frame::decode_result(&bytes).map_err(ExecuteError::work)?;
-                results.insert(block, splats);
-                given = if Some(block) == task.parent { training } else { given };
+                take(block, splats, training);
             }
         }
-        Ok((results, given))
+        Ok(())
     }
 }
 

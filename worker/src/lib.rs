@@ -14,6 +14,7 @@ mod block;
 pub mod clock;
 mod coordinator_link;
 pub mod estimate;
+mod evaluate;
 mod execute;
 mod initial_splats;
 pub mod memory_budget;
@@ -28,12 +29,14 @@ mod result_cache;
 mod run;
 pub mod speed;
 mod task;
+#[cfg(test)]
+mod testing;
 pub mod time_limit;
 mod train_block;
 mod trainer_context;
 
 pub use coordinator_link::leader_of;
-pub use execute::BlockTrainer;
+pub use execute::PlanExecutor;
 pub use merged_eval::FinishedBlocks;
 pub use options::{Options, WorkerError};
 pub use proto::FailureKind;

@@ -152,29 +152,16 @@ impl MergedEvaluator {
 
 #[cfg(test)]
 mod tests {
-    use blocks::{Ground, PlanSettings};
-    use glam::{DQuat, DVec2, Vec3};
+    use blocks::PlanSettings;
+    use glam::Vec3;
     use scene::Splat;
 
     use super::*;
+    use crate::testing::{plan_of, task};
 
     fn plan(mode: Mode) -> Plan {
-        Plan {
-            version: blocks::plan::VERSION,
-            capture: ArtefactId([1; 32]),
-            settings: PlanSettings { mode, sh_degree: 0, ..PlanSettings::default() },
-            backend: "none".into(),
-            ground: Ground {
-                ground_from_world: DQuat::IDENTITY,
-                min: DVec2::ZERO,
-                edge_metres: 8.0,
-                height_metres: 0.0,
-                near_metres: 1e300,
-            },
-            levels: 1,
-            rho_metres: vec![2.0, 1.0],
-            tasks: Vec::new(),
-        }
+        let plan = plan_of(mode, Vec::new());
+        Plan { settings: PlanSettings { sh_degree: 0, ..plan.settings.clone() }, ..plan }
     }
 
     /// A splat of log-scale `size` at the centre of each quarter of the ground.
@@ -206,29 +193,12 @@ mod tests {
         assert_eq!(sizes(&finished.merged_with(ArtefactId([3; 32]), &plan, b, &four(3.0))), [3]);
     }
 
-    fn task() -> blocks::Task {
-        blocks::Task {
-            block: BlockId::ROOT,
-            parent: None,
-            context: Vec::new(),
-            views: Vec::new(),
-            test_views: Vec::new(),
-            points: 0,
-            budget: 1,
-            visible_splats: 0,
-            visible_context_splats: 0,
-            steps: 1,
-            rho_metres: 1.0,
-            memory_bytes: 0,
-        }
-    }
-
     #[test]
     fn large_merged_models_are_not_evaluated() {
         let evaluated = |tasks: usize, budget: u32, sh_degree: u8| {
             let plan = plan(Mode::Tree);
             let settings = PlanSettings { budget, sh_degree, ..plan.settings.clone() };
-            is_evaluated(&Plan { tasks: vec![task(); tasks], settings, ..plan })
+            is_evaluated(&Plan { tasks: vec![task(BlockId::ROOT, 1); tasks], settings, ..plan })
         };
         // 59 floats of four bytes each: 284,359 splats are 64 MiB.
         assert!(evaluated(5, 284_359, 3) && !evaluated(5, 284_360, 3));
@@ -239,7 +209,7 @@ mod tests {
     fn large_plans_are_evaluated_after_some_tasks_and_the_last() {
         let mut plan = plan(Mode::Tree);
         let mut evaluations = |count: usize| {
-            plan.tasks = vec![task(); count];
+            plan.tasks = vec![task(BlockId::ROOT, 1); count];
             (0..count as u32).filter(|&i| evaluates_after(&plan, i)).collect::<Vec<u32>>()
         };
         assert_eq!(evaluations(5), [0, 1, 2, 3, 4]);

@@ -1,5 +1,5 @@
 //! Trains a plan of one block in process with any recipe, to compare recipes. Initial splats, windows, random numbers and evaluation are
-//! those of [`BlockTrainer`]; the block is not pruned, and nothing is written to the store.
+//! those of [`PlanExecutor`]; the block is not pruned, and nothing is written to the store.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -14,7 +14,7 @@ use train::{Backend, Flow, Recipe};
 
 use crate::block::Block;
 use crate::clock::Stopwatch;
-use crate::execute::BlockTrainer;
+use crate::execute::PlanExecutor;
 use crate::initial_splats::InitialSplats;
 use crate::merged_eval::MergedEvaluator;
 use crate::recipe::recipe_of;
@@ -71,13 +71,13 @@ impl OneBlockTraining<'_> {
         };
         let shared = Arc::new(Shared::default());
         let trainer =
-            BlockTrainer::new(self.store.clone(), options, shared, self.backend.clone()).map_err(ExecuteError::work)?;
+            PlanExecutor::new(self.store.clone(), options, shared, self.backend.clone()).map_err(ExecuteError::work)?;
         trainer.install(|| self.train_with(&trainer, change))
     }
 
     fn train_with(
         &self,
-        trainer: &BlockTrainer,
+        trainer: &PlanExecutor,
         change: impl Fn(Recipe) -> Recipe,
     ) -> Result<Vec<Evaluation>, ExecuteError> {
         let mut clock = Stopwatch::start();

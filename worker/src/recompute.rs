@@ -25,9 +25,8 @@ pub(crate) fn recompute(
     report: &mut (dyn FnMut(Report) -> Flow + Send),
 ) -> Result<Bytes, ExecuteError> {
     tracing::warn!(task, "recomputing its result {wanted}, which is lost or damaged");
-    let steps = plan.tasks.get(order.task as usize).map_or(0, |task| task.steps);
-    let mut heartbeat =
-        |of: Report| report(Report { step: 0, steps: steps.into(), psnr: None, merged_splats: None, ..of });
+    let steps = plan.planned(order.task).map_or(0, |task| task.steps());
+    let mut heartbeat = |of: Report| report(Report { step: 0, steps, psnr: None, merged_splats: None, ..of });
     let recomputed = result_of(executor, plan, order, task, &mut heartbeat)?;
     if recomputed != wanted {
         let hint =
@@ -67,7 +66,6 @@ fn result_of(
 
 /// The tasks whose results a task takes as inputs.
 fn dependencies(plan: &Plan, task: u32) -> Vec<u32> {
-    let Some(task) = plan.tasks.get(task as usize) else { return Vec::new() };
-    let index = |block| plan.tasks.iter().position(|task| task.block == block).map(|index| index as u32);
-    task.context.iter().copied().chain(task.parent).filter_map(index).collect()
+    let Some(task) = plan.planned(task) else { return Vec::new() };
+    plan.inputs(task).into_iter().filter_map(|block| plan.index(block)).collect()
 }

@@ -5,7 +5,7 @@
 
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use scene::{ArtefactId, Splats, frame};
+use scene::ArtefactId;
 use store::BlockingStore;
 use train::State;
 
@@ -32,10 +32,14 @@ impl ResultCache {
         }
     }
 
-    pub(crate) fn result(&self, store: &BlockingStore) -> Option<(ArtefactId, Splats)> {
+    /// The result and its id, if it is there and `decode` accepts it.
+    pub(crate) fn result<T>(
+        &self,
+        store: &BlockingStore,
+        decode: impl FnOnce(&[u8]) -> Option<T>,
+    ) -> Option<(ArtefactId, T)> {
         let id = ArtefactId(store.get_record(&self.result).ok()??.as_ref().try_into().ok()?);
-        let splats = frame::decode_splats(&store.get_or_discard(id).ok()??).ok()?;
-        Some((id, splats))
+        Some((id, decode(&store.get_or_discard(id).ok()??)?))
     }
 
     /// Records the result and empties the checkpoint, which is large and no longer needed.

@@ -223,46 +223,20 @@ fn growth(job: &Job) -> f64 {
 
 #[cfg(test)]
 mod tests {
-    use blocks::{Ground, PlanSettings, Task};
-    use glam::{DQuat, DVec2};
-    use scene::ArtefactId;
+    use blocks::{Mode, Task};
 
     use super::*;
+    use crate::testing::{plan_of, task};
 
     /// The root, two children that may run in parallel, and one that depends on them; `steps` is their work.
     fn plan(steps: [u32; 4]) -> Plan {
         let block = |level, x, y| BlockId { level, x, y };
         let blocks = [block(0, 0, 0), block(1, 0, 0), block(1, 1, 0), block(1, 0, 1)];
-        let task = |i: usize| Task {
-            block: blocks[i],
-            parent: blocks[i].parent(),
-            context: if i == 3 { blocks[1..3].to_vec() } else { Vec::new() },
-            views: Vec::new(),
-            test_views: Vec::new(),
-            points: 0,
-            budget: 1000,
-            steps: steps[i],
-            rho_metres: 1.0,
-            visible_splats: 1000,
-            visible_context_splats: 0,
-            memory_bytes: 0,
+        let task = |i: usize| {
+            let context = if i == 3 { blocks[1..3].to_vec() } else { Vec::new() };
+            Task { context, ..task(blocks[i], steps[i]) }
         };
-        Plan {
-            version: blocks::plan::VERSION,
-            capture: ArtefactId([1; 32]),
-            settings: PlanSettings::default(),
-            backend: "none".into(),
-            ground: Ground {
-                ground_from_world: DQuat::IDENTITY,
-                min: DVec2::ZERO,
-                edge_metres: 8.0,
-                height_metres: 0.0,
-                near_metres: 1e300,
-            },
-            levels: 1,
-            rho_metres: vec![2.0, 1.0],
-            tasks: (0..4).map(task).collect(),
-        }
+        plan_of(Mode::Tree, (0..4).map(task).collect())
     }
 
     #[test]

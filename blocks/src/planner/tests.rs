@@ -9,7 +9,7 @@ use super::*;
 use crate::budgets::BLOCK_SPLATS;
 use crate::cost::epoch_cost;
 use crate::lint::{Severity, lint};
-use crate::plan::Task;
+use crate::plan::{PlannedTask, Task};
 use crate::testing::{aerial, capture, look_at, noise, street};
 
 fn settings(mode: Mode, levels: Option<u8>) -> PlanSettings {
@@ -22,6 +22,33 @@ fn plan_of(capture: &Capture, mode: Mode, levels: Option<u8>) -> Plan {
         (lint(&plan, capture).iter()).filter(|f| f.severity == Severity::Error).map(ToString::to_string).collect();
     assert!(errors.is_empty(), "{errors:?}");
     plan
+}
+
+#[test]
+fn evaluation_tasks_come_after_training_and_read_all_blocks() {
+    let capture = aerial(8, 300.0, 8000);
+    let settings = settings(Mode::Tree, Some(1));
+    let plain = plan(&capture, ArtefactId::of(b"capture"), &settings, "cpu").unwrap();
+    let settings = PlanSettings { evaluate: true, ..settings };
+    let evaluated = plan(&capture, ArtefactId::of(b"capture"), &settings, "cpu").unwrap();
+    assert!(evaluated.tasks == plain.tasks && plain.eval_tasks.is_empty() && lint(&evaluated, &capture).is_empty());
+    let (training, all) = (evaluated.tasks.len() as u32, evaluated.len() as u32);
+    assert_eq!(all, training + evaluated.eval_tasks.len() as u32);
+    assert!(evaluated.all_tasks().eq((0..all).filter_map(|index| evaluated.planned(index))));
+    assert!(all > training && evaluated.planned(all).is_none() && evaluated.planned(u32::MAX).is_none());
+    for index in 0..all {
+        let task = evaluated.planned(index).unwrap();
+        let inputs: Vec<u32> = evaluated.inputs(task).into_iter().filter_map(|b| evaluated.index(b)).collect();
+        match task {
+            PlannedTask::Train(_) => assert!(inputs.iter().all(|&input| input < index)),
+            PlannedTask::Evaluate(_) => {
+                assert_eq!(inputs.into_iter().collect::<BTreeSet<u32>>(), (0..training).collect());
+            }
+        }
+    }
+    let none = PlanSettings { test_every: 0, ..settings };
+    let error = plan(&capture, ArtefactId::of(b"capture"), &none, "cpu").unwrap_err();
+    assert!(error.to_string().contains("--evaluate"), "{error}");
 }
 
 #[test]

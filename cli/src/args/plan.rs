@@ -71,6 +71,10 @@ pub(crate) struct PlanOptions {
     /// where few photos overlap; 0 leaves it out
     #[arg(long, value_name = "W", value_parser = weight, default_value_t = 0.0)]
     pub(crate) depth_weight: f64,
+    /// After training, measure the merged model on the held-out photos in tasks of the job, which any worker can take. The
+    /// figures are those of `plat eval`, without the contact sheet; they go to OUT/eval/report.json
+    #[arg(long)]
+    pub(crate) evaluate: bool,
     /// Use photos at one N-th of their size
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
     pub(crate) downscale: u32,
@@ -103,6 +107,7 @@ impl PlanOptions {
             exposure: self.exposure,
             label_blocks: self.label_blocks,
             depth_weight: self.depth_weight,
+            evaluate: self.evaluate,
             ..PlanSettings::default()
         }
     }

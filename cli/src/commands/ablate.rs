@@ -137,6 +137,7 @@ fn plan_options(args: &AblateArgs, seed: u64) -> PlanOptions {
         exposure: false,
         label_blocks: false,
         depth_weight: 0.0,
+        evaluate: false,
         downscale: args.downscale,
     }
 }

@@ -33,7 +33,7 @@ pub(crate) struct Built {
 pub(crate) struct Shown {
     #[serde(flatten)]
     pub(crate) report: Report,
-    sheet: PathBuf,
+    sheet: Option<PathBuf>,
     birdseye: PathBuf,
     oblique: PathBuf,
     merged: PathBuf,
@@ -85,7 +85,7 @@ pub(crate) fn build(args: &DemoArgs, output: &Output) -> Result<Built, Failure> 
         report.record.wall_seconds.unwrap_or_default(),
         birdseye.display(),
         oblique.display(),
-        evaluated.sheet.display(),
+        eval_folder.join("sheet.png").display(),
         args.out.join("plan.svg").display(),
         args.out.join("merged.ply").display(),
     );
@@ -137,6 +137,7 @@ pub(crate) fn settings(args: &DemoArgs) -> (Settings, TrainArgs) {
             exposure: false,
             label_blocks: false,
             depth_weight: 0.0,
+            evaluate: false,
             test_every: 8,
             downscale: 1,
         },

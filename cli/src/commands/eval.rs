@@ -87,5 +87,5 @@ fn evaluated(request: &Request, output: &Output) -> Result<Evaluated, Failure> {
         ..Record::new("eval")
     };
     let Evaluation { views, sheet, cuts, seams, .. } = evaluation;
-    Ok(Evaluated { record, sheet, views, cuts, seams })
+    Ok(Evaluated { record, sheet: Some(sheet), views, cuts, seams })
 }

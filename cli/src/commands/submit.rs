@@ -15,11 +15,13 @@ use tracing::field::Empty;
 use crate::args::{Backend, SubmitArgs};
 use crate::captures::{self, ingest_photos};
 use crate::clock::Stopwatch;
+use crate::eval_results;
 use crate::failure::{Failure, make_folder};
 use crate::live_status::LiveStatus;
 use crate::output::Output;
 use crate::planning::{check_plan, plan_of};
 use crate::remote::{Remote, result_of};
+use crate::run_record::Record;
 
 #[derive(Serialize)]
 struct Submitted {
@@ -32,6 +34,8 @@ struct Submitted {
     /// Of the merged model, with `--out`.
     splats: Option<u64>,
     bytes: Option<u64>,
+    /// Of the merged model over the held-out views in dB, with `--evaluate` and `--out`.
+    psnr: Option<f64>,
     /// From the job's acceptance to its end, with `--wait`.
     job_seconds: Option<f64>,
     /// From the start of the command to the end of the job, with `--wait`.
@@ -69,6 +73,7 @@ pub(crate) fn run(args: &SubmitArgs, output: &Output) -> Result<(), Failure> {
         tasks: job.tasks,
         splats: None,
         bytes: None,
+        psnr: None,
         job_seconds: None,
         wall_seconds: None,
     };
@@ -88,10 +93,21 @@ pub(crate) fn run(args: &SubmitArgs, output: &Output) -> Result<(), Failure> {
         if let Some(out) = &args.out {
             let results = results.all()?;
             save_json(&out.join("plan.json"), &plan)?;
-            let written =
-                model::write(out, &plan, &results, &store.blocking(), capture.geo_origin, args.plan.downscale)?;
+            let (store, downscale) = (store.blocking(), args.plan.downscale);
+            let written = model::write(out, &plan, &results, &store, capture.geo_origin, downscale)?;
             (submitted.splats, submitted.bytes) = (Some(written.splats), Some(written.bytes));
-            text = format!("{} splats in {} blocks\n{}", written.splats, job.tasks, out.join("merged.ply").display());
+            let about = Record {
+                scene: captures::name_of(&args.capture),
+                downscale,
+                backend: plan.backend.clone(),
+                splats: written.splats,
+                ..Record::new("eval")
+            };
+            let evaluated = eval_results::collect(&plan, &results, &store, about, out)?;
+            submitted.psnr = evaluated.and_then(|evaluated| evaluated.record.psnr);
+            let psnr = submitted.psnr.map_or(String::new(), |psnr| format!(", {psnr:.2} dB held out"));
+            let (splats, blocks, file) = (written.splats, plan.tasks.len(), out.join("merged.ply"));
+            text = format!("{splats} splats in {blocks} blocks{psnr}\n{}", file.display());
         }
         submitted.wall_seconds = Some(clock.wall_seconds());
         if let Some(out) = &args.out {

@@ -20,11 +20,12 @@ use worker::estimate::Estimate;
 use worker::merged_eval::is_evaluated;
 use worker::speed::relative_speed;
 use worker::time_limit::TimeLimit;
-use worker::{BlockTrainer, Shared, TrainerOptions};
+use worker::{PlanExecutor, Shared, TrainerOptions};
 
 use crate::args::{Backend, TrainArgs};
 use crate::captures::ingest_photos;
 use crate::clock::Stopwatch;
+use crate::eval_results;
 use crate::failure::{Failure, make_folder};
 use crate::metrics_log::{MetricsLog, Totals};
 use crate::output::Output;
@@ -107,13 +108,15 @@ pub(crate) fn train(args: &TrainArgs, output: &Output) -> Result<Trained, Failur
     let clock = Stopwatch::start();
     let prepared = prepare(args, &clock, output)?;
     let finished = train_plan(args, &prepared, clock, output)?;
+    // Between the clocks, as it takes a quarter of a CPU second.
+    let predicted = Estimate::of(&prepared.plan, relative_speed());
 
     let clock = Stopwatch::start();
     let Prepared { capture, capture_id, plan, plan_id, config_hash, store, ingest_cpu_seconds, .. } = prepared;
     let (store, downscale) = (store.blocking(), args.plan.downscale);
     let written = model::write(&args.out, &plan, &finished.results, &store, capture.geo_origin, downscale)?;
     let totals = finished.totals;
-    let record = Record {
+    let mut record = Record {
         scene: captures::name_of(&args.capture),
         downscale,
         config_hash: Some(config_hash.to_string()),
@@ -125,6 +128,7 @@ pub(crate) fn train(args: &TrainArgs, output: &Output) -> Result<Trained, Failur
         threads: threads_of(args),
         wall_seconds: Some(totals.wall_seconds + clock.wall_seconds()),
         cpu_seconds: Some(totals.cpu_seconds + clock.cpu_seconds()),
+        predicted_cpu_seconds: Some(predicted.cpu_seconds),
         // Concurrent tasks do not see each other's last splats, so the last measurement is not of the final model.
         psnr: totals.last_psnr.filter(|_| args.workers == 1 || plan.tasks.len() == 1),
         splats: written.splats,
@@ -134,6 +138,9 @@ pub(crate) fn train(args: &TrainArgs, output: &Output) -> Result<Trained, Failur
         seed: Some(args.plan.seed),
         ..Record::new("train")
     };
+    if let Some(evaluated) = eval_results::collect(&plan, &finished.results, &store, record.clone(), &args.out)? {
+        record.set_quality(&evaluated.record);
+    }
     let report = Report {
         record,
         plan: plan_id,
@@ -145,7 +152,7 @@ pub(crate) fn train(args: &TrainArgs, output: &Output) -> Result<Trained, Failur
         capped: finished.capped,
         resumed: finished.resumed,
         settled: finished.settled,
-        predicted: Estimate::of(&plan, relative_speed()),
+        predicted,
     };
     save_json(&args.out.join("report.json"), &report)?;
     Ok(Trained { capture, report, curve: totals.curve })
@@ -178,7 +185,8 @@ fn prepare(args: &TrainArgs, clock: &Stopwatch, output: &Output) -> Result<Prepa
 fn train_plan(args: &TrainArgs, prepared: &Prepared, clock: Stopwatch, output: &Output) -> Result<Finished, Failure> {
     let Prepared { plan, plan_id, backend, store, .. } = prepared;
     if plan.settings.test_every > 0 && !is_evaluated(plan) {
-        output.note("the model is too large to be measured during training; plat eval measures it afterwards");
+        let advice = if plan.settings.evaluate { "--evaluate does so" } else { "plat eval does so" };
+        output.note(format!("the model is too large to be measured during training; afterwards {advice}"));
     }
     let progress = output.progress("training", plan.tasks.iter().map(|task| u64::from(task.steps)).sum());
     let mut log = MetricsLog::create(&args.out.join("metrics.jsonl"), plan, args.workers, clock.clone(), &progress)?;
@@ -194,7 +202,7 @@ fn train_plan(args: &TrainArgs, prepared: &Prepared, clock: Stopwatch, output: &
         checkpoint_seconds: args.checkpoint_every,
     };
     let trainers =
-        (0..args.workers).map(|_| BlockTrainer::new(metered.blocking(), options, shared.clone(), backend.clone()));
+        (0..args.workers).map(|_| PlanExecutor::new(metered.blocking(), options, shared.clone(), backend.clone()));
     let trainers = trainers.map(|trainer| trainer.map(Arc::new)).collect::<Result<_, _>>().map_err(Failure::Work)?;
     let outcome = run_job(trainers, &plan.backend, store, *plan_id, &mut log, output);
     let totals = log.close()?;
@@ -202,7 +210,7 @@ fn train_plan(args: &TrainArgs, prepared: &Prepared, clock: Stopwatch, output: &
     let results = outcome?;
     let resumed = shared.resumed.load(Ordering::Relaxed);
     if resumed > 0 {
-        let tasks = plan.tasks.len();
+        let tasks = plan.len();
         output.note(format!("{resumed} of {tasks} tasks were resumed from an earlier run; --fresh starts over"));
     }
     let capped = shared.time_limit.as_ref().is_some_and(TimeLimit::is_shortened);
@@ -261,7 +269,7 @@ const LOCAL_STORE_ATTEMPTS: u32 = 3;
 
 /// Runs a coordinator and its workers in this process until the job ends. Ctrl-C cancels the job.
 fn run_job(
-    trainers: Vec<Arc<BlockTrainer>>,
+    trainers: Vec<Arc<PlanExecutor>>,
     backend: &str,
     store: &Store,
     plan: ArtefactId,

@@ -9,7 +9,7 @@ use serde::Serialize;
 use tokio_util::sync::CancellationToken;
 use worker::WorkerError;
 use worker::metrics::CountedExecutor;
-use worker::{BlockTrainer, Shared, TrainerOptions};
+use worker::{PlanExecutor, Shared, TrainerOptions};
 
 use crate::args::WorkerArgs;
 use crate::backend;
@@ -91,7 +91,7 @@ pub(crate) fn run(args: &WorkerArgs, output: &Output) -> Result<(), Failure> {
                 checkpoint_seconds: args.checkpoint_every,
             };
             shared.metrics.export_traffic_of(store.clone());
-            let trainer = BlockTrainer::new(store.blocking(), options, shared.clone(), backend);
+            let trainer = PlanExecutor::new(store.blocking(), options, shared.clone(), backend);
             let measured = CountedExecutor::new(trainer.map_err(Failure::Work)?, shared.metrics.clone());
             output.note(format!("worker {} for {url}: {} on {threads} threads", worked.name, worked.backend));
             worker::run(worker, Arc::new(measured), stop).await.map_err(worker_failure)?;

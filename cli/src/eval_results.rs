@@ -1,0 +1,83 @@
+//! Collects the figures that a job's evaluation tasks measured.
+
+use std::path::Path;
+
+use blocks::Plan;
+use eval::{ViewFigures, mean};
+use model::save_json;
+use scene::ArtefactId;
+use store::BlockingStore;
+
+use crate::eval_report::Evaluated;
+use crate::failure::{Failure, make_folder};
+use crate::run_record::Record;
+
+/// Reads the figures from the results of all tasks of the plan, in the plan's order, and writes them to `OUT/eval/report.json`. `None`
+/// without evaluation tasks. `about` says what was trained.
+///
+/// # Errors
+/// A store that fails, a damaged result, a file that cannot be written.
+pub(crate) fn collect(
+    plan: &Plan,
+    results: &[ArtefactId],
+    store: &BlockingStore,
+    about: Record,
+    out: &Path,
+) -> Result<Option<Evaluated>, Failure> {
+    if plan.eval_tasks.is_empty() {
+        return Ok(None);
+    }
+    let views = views_of(results.get(plan.tasks.len()..).unwrap_or_default(), store)?;
+    let of = |figure: fn(&ViewFigures) -> Option<f64>| mean(views.iter().map(figure));
+    let record = Record {
+        psnr: of(|view| view.psnr),
+        cc_psnr: of(|view| view.cc_psnr),
+        ssim: of(|view| Some(view.ssim)),
+        perceptual: of(|view| view.perceptual),
+        wall_seconds: None,
+        cpu_seconds: None,
+        command: "eval",
+        ..about
+    };
+    let evaluated = Evaluated { record, sheet: None, views, cuts: Vec::new(), seams: None };
+    let folder = out.join("eval");
+    make_folder(&folder)?;
+    save_json(&folder.join("report.json"), &evaluated)?;
+    Ok(Some(evaluated))
+}
+
+/// The views that evaluation tasks measured, by the tasks' results.
+fn views_of(results: &[ArtefactId], store: &BlockingStore) -> Result<Vec<ViewFigures>, Failure> {
+    let mut views = Vec::new();
+    for &id in results {
+        let damaged = |error| Failure::Work(format!("the evaluation {id} in {}: {error}", store.store().url()));
+        views.extend(eval::figures_from_frame(&store.get(id)?).map_err(damaged)?);
+    }
+    Ok(views)
+}
+
+#[cfg(test)]
+mod tests {
+    use store::Store;
+
+    use super::*;
+
+    #[test]
+    fn views_of_all_tasks_are_read_in_order() {
+        let store = Store::open("memory://").unwrap().blocking();
+        let view = |name: &str, psnr: Option<f64>| ViewFigures {
+            view: name.into(),
+            psnr,
+            cc_psnr: psnr,
+            ssim: 0.5,
+            perceptual: None,
+            lpips: None,
+        };
+        let tasks = [vec![view("a", Some(20.0)), view("b", None)], vec![view("c", Some(30.0))]];
+        let ids: Vec<ArtefactId> = tasks.iter().map(|task| store.put(eval::figures_to_frame(task)).unwrap()).collect();
+        assert_eq!(views_of(&ids, &store).unwrap(), tasks.concat());
+        let splats = store.put(scene::frame::encode_splats(&scene::Splats::new(0))).unwrap();
+        let line = views_of(&[ids[0], splats], &store).unwrap_err().to_string();
+        assert!(line.contains(&splats.to_string()) && line.contains("not a plat 'figs' frame"), "{line}");
+    }
+}

@@ -1,0 +1,59 @@
+//! Carries out an evaluation task: measures the merged model on held-out views.
+
+use blocks::{EvalTask, Plan};
+use dataset::windows::WindowReader;
+use eval::{EvalError, ViewFigures};
+use proto::FailureKind;
+use render::Options;
+use scene::Splats;
+use train::Backend;
+
+use crate::clock::Stopwatch;
+use crate::task::{ExecuteError, Flow, Report};
+
+/// The figures of the task's views. Equal models and photos give equal figures, as `plat eval` does.
+///
+/// # Errors
+/// Photos that cannot be read, a renderer that fails, or a report that was answered with [`Flow::Stop`].
+pub(crate) fn evaluate(
+    plan: &Plan,
+    task: &EvalTask,
+    model: &Splats,
+    reader: &WindowReader,
+    backend: &Backend,
+    stopwatch: &Stopwatch,
+    report: &mut (dyn FnMut(Report) -> Flow + Send),
+) -> Result<Vec<ViewFigures>, ExecuteError> {
+    let options =
+        Options { antialiased: plan.settings.antialiased, sh_degree: model.sh_degree(), ..Options::default() };
+    let steps = task.views.len() as u64;
+    let goes_on = |done: usize| {
+        let report = report(Report {
+            step: done as u64,
+            steps,
+            loss: f64::NAN,
+            splats: model.len() as u64,
+            cpu_seconds: stopwatch.cpu_seconds(),
+            wall_seconds: stopwatch.wall_seconds(),
+            psnr: None,
+            merged_splats: None,
+        });
+        report == Flow::Continue
+    };
+    let figures = eval::figures_of_views(model, &options, reader, &task.views, backend, goes_on);
+    let figures = figures.map_err(failure)?;
+    // The last view's report needs no answer: the task is finished anyway.
+    if figures.len() < task.views.len() {
+        return Err(ExecuteError::work("stopped before all views were measured"));
+    }
+    Ok(figures)
+}
+
+fn failure(error: EvalError) -> ExecuteError {
+    match error {
+        EvalError::Store(error) => error.into(),
+        // Most photos that cannot be read are a store's failure, which may pass.
+        error @ EvalError::Window(_) => ExecuteError::of(FailureKind::Infrastructure, error),
+        error => ExecuteError::work(error),
+    }
+}
