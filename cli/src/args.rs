@@ -120,7 +120,7 @@ pub(crate) struct DoctorArgs {
 
 #[derive(Debug, Clone, Args)]
 pub(crate) struct InspectArgs {
-    /// Folder of the capture: COLMAP or transforms.json
+    /// Folder of the capture: COLMAP, transforms.json, OpenSfM or KITTI-360
     pub(crate) capture: PathBuf,
     #[command(flatten)]
     pub(crate) plan: PlanOptions,
@@ -128,7 +128,7 @@ pub(crate) struct InspectArgs {
 
 #[derive(Debug, Clone, Args)]
 pub(crate) struct PlanArgs {
-    /// Folder of the capture: COLMAP or transforms.json
+    /// Folder of the capture: COLMAP, transforms.json, OpenSfM or KITTI-360
     pub(crate) capture: PathBuf,
     /// Write the plan as JSON
     #[arg(long, value_name = "FILE")]
@@ -143,7 +143,7 @@ pub(crate) struct PlanArgs {
 #[derive(Debug, Clone, Args, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub(crate) struct TrainArgs {
-    /// Folder of the capture: COLMAP or transforms.json
+    /// Folder of the capture: COLMAP, transforms.json, OpenSfM or KITTI-360
     #[serde(skip)]
     pub(crate) capture: PathBuf,
     /// Folder for the model and its reports

@@ -28,6 +28,8 @@ pub(crate) struct Remote {
     access: Access,
     /// As given by the user.
     url: String,
+    /// Of the coordinator that `client` calls.
+    address: String,
     /// The store whose leases name the leader, if no coordinator was named.
     leases: Option<Store>,
 }
@@ -39,8 +41,8 @@ impl Remote {
         let url = connection.coordinator.clone();
         let named = ["http://", "https://"].iter().any(|scheme| url.starts_with(scheme)) || !url.contains("://");
         let leases = if named { None } else { Some(Store::open(&url)?) };
-        let client = runtime.block_on(find(&url, leases.as_ref(), &access))?;
-        Ok(Self { runtime, client, access, url, leases })
+        let (client, address) = runtime.block_on(find(&url, leases.as_ref(), &access))?;
+        Ok(Self { runtime, client, access, url, address, leases })
     }
 
     /// Makes one call.
@@ -93,8 +95,9 @@ impl Remote {
                     // The timer must be created inside the runtime.
                     self.runtime.block_on(async { tokio::time::sleep(pause).await });
                     // The leader may have changed.
-                    if let Ok(client) = self.runtime.block_on(find(&self.url, self.leases.as_ref(), &self.access)) {
-                        self.client = client;
+                    let found = self.runtime.block_on(find(&self.url, self.leases.as_ref(), &self.access));
+                    if let Ok((client, address)) = found {
+                        (self.client, self.address) = (client, address);
                     }
                     pause = MAX_PAUSE.min(2 * pause);
                 }
@@ -103,9 +106,14 @@ impl Remote {
         }
     }
 
-    /// Maps a status to bad input or failed work.
+    /// Maps a status to bad input or failed work. A coordinator that rejects the certificates looks like one that is not there.
     fn failure(&self, status: Status) -> Failure {
         let is_transient = is_transient(&status);
+        if is_transient
+            && let Some(rejected) = self.runtime.block_on(proto::rejected_certificate(&self.address, &self.access))
+        {
+            return rejected.into();
+        }
         match of_status(status) {
             LocalError::Failed(line) if is_transient => {
                 Failure::Work(format!("the coordinator {} does not answer: {line}; check that it is running", self.url))
@@ -115,11 +123,13 @@ impl Remote {
     }
 }
 
-/// A client of the named coordinator, or of the leader.
-async fn find(url: &str, leases: Option<&Store>, access: &Access) -> Result<Client, Failure> {
-    let Some(store) = leases else { return Ok(proto::connect(url, access)?) };
-    let lease = worker::leader_of(store).await.map_err(|status| Failure::Work(status.message().into()))?;
-    Ok(proto::connect(&lease.address, access)?)
+/// A client of the named coordinator, or of the leader, and that coordinator's URL.
+async fn find(url: &str, leases: Option<&Store>, access: &Access) -> Result<(Client, String), Failure> {
+    let address = match leases {
+        None => url.to_owned(),
+        Some(store) => worker::leader_of(store).await.map_err(|status| Failure::Work(status.message().into()))?.address,
+    };
+    Ok((proto::connect(&address, access)?, address))
 }
 
 /// Why watching ended before the job did.

@@ -7,6 +7,7 @@ use std::path::Path;
 use std::time::Duration;
 
 use common::cluster::{Running, has_task};
+use rcgen::{BasicConstraints, CertificateParams, IsCa, Issuer, KeyPair};
 use serde_json::Value;
 
 #[rustfmt::skip]
@@ -278,4 +279,39 @@ fn jobs_can_be_controlled_and_wrong_requests_are_refused_in_one_line() {
     let pair = ["--tls-cert", "token", "--tls-key", "token"];
     common::refused(at, &[&listen[..], &["127.0.0.1:0"], &pair[..]].concat(), "certificate");
     common::refused(at, &[&listen[..], &["0.0.0.0:0", "--quiet"]].concat(), "other machines");
+}
+
+#[test]
+fn a_missing_client_certificate_is_named() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    let signed = |params: CertificateParams, issuer: Option<&Issuer<KeyPair>>| {
+        let key = KeyPair::generate().unwrap();
+        let certificate = match issuer {
+            Some(issuer) => params.signed_by(&key, issuer).unwrap(),
+            None => params.clone().self_signed(&key).unwrap(),
+        };
+        (certificate.pem(), key, params)
+    };
+    let mut params = CertificateParams::new(Vec::<String>::new()).unwrap();
+    params.is_ca = IsCa::Ca(BasicConstraints::Unconstrained);
+    let (authority, key, params) = signed(params, None);
+    let issuer = Issuer::new(params, key);
+    std::fs::write(at.join("ca.pem"), authority).unwrap();
+    for name in ["server", "client"] {
+        let params = CertificateParams::new(["127.0.0.1".to_string()]).unwrap();
+        let (certificate, key, _) = signed(params, Some(&issuer));
+        std::fs::write(at.join(format!("{name}.pem")), certificate).unwrap();
+        std::fs::write(at.join(format!("{name}.key")), key.serialize_pem()).unwrap();
+    }
+    #[rustfmt::skip]
+    let words = ["coordinator", "--store", "s", "--listen", "127.0.0.1:0", "--tls-cert", "server.pem", "--tls-key", "server.key",
+        "--tls-client-ca", "ca.pem"];
+    let host = Running::start(&mut common::command(at, &words));
+    let line = host.line_with("https://");
+    let url = line.split_whitespace().find(|word| word.starts_with("https://")).unwrap().trim_end_matches(',');
+    host.line_with("leading");
+    let jobs = ["jobs", "--coordinator", url, "--tls-ca", "ca.pem"];
+    common::done(at, &[&jobs[..], &["--tls-cert", "client.pem", "--tls-key", "client.key"]].concat());
+    common::refused(at, &jobs, "requires a client certificate, and none is given; give --tls-cert");
 }

@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::error::TrainError;
 use crate::exposure::{expose, square_gain};
-use crate::metrics::MAX_PSNR_DB;
+use crate::metrics::psnr_of;
 use crate::source::{self, WindowSource};
 use crate::view::TrainView;
 
@@ -118,7 +118,7 @@ impl<'a> EvaluationViews<'a> {
         let (mut sum, mut count) = (0.0, 0.0f64);
         self.compare(splats, Some(weights), |_, compared| {
             if compared.pixels >= 1.0 {
-                sum += (-10.0 * compared.mse.log10()).min(MAX_PSNR_DB);
+                sum += psnr_of(compared.mse);
                 count += 1.0;
             }
         })?;

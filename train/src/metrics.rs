@@ -35,7 +35,13 @@ pub fn psnr(a: &[f32], b: &[f32], mask: Option<&[u8]>) -> Option<f64> {
             count += 1;
         }
     }
-    (count > 0).then(|| (-10.0 * (sum / count as f64).log10()).min(MAX_PSNR_DB))
+    (count > 0).then(|| psnr_of(sum / count as f64))
+}
+
+/// PSNR of a mean squared error, dB, at most [`MAX_PSNR_DB`]. An error that is not a number counts as 1: 0 dB.
+pub(crate) fn psnr_of(mse: f64) -> f64 {
+    let mse = if mse.is_nan() { 1.0 } else { mse };
+    (-10.0 * mse.log10()).min(MAX_PSNR_DB)
 }
 
 /// Colour-corrected PSNR in dB: [`psnr`] after the affine colour transform of the render (3×3 matrix and offset) that
@@ -220,6 +226,7 @@ mod tests {
         let b: Vec<f32> = a.iter().map(|v| v + 0.1).collect();
         assert!((psnr(&a, &b, None).unwrap() - 20.0).abs() < 1e-4);
         assert_eq!(psnr(&a, &a, None), Some(MAX_PSNR_DB));
+        assert_eq!(psnr(&vec![f32::NAN; a.len()], &a, None), Some(0.0), "a render of NaN is no perfect one");
     }
 
     #[test]

@@ -126,13 +126,13 @@ pub(crate) struct WorkerArgs {
 
 #[derive(Debug, Clone, Args)]
 pub(crate) struct SubmitArgs {
-    /// Folder of the capture: COLMAP or transforms.json
+    /// Folder of the capture: COLMAP, transforms.json, OpenSfM or KITTI-360
     pub(crate) capture: PathBuf,
     #[command(flatten)]
     pub(crate) connection: Connection,
     #[command(flatten)]
     pub(crate) plan: PlanOptions,
-    /// Backend of the job; auto takes the one that most workers have
+    /// Backend of the job
     #[arg(long, value_enum, default_value = "auto")]
     pub(crate) backend: Backend,
     /// Wait for the job to end, show its progress, and exit with its result

@@ -22,7 +22,8 @@ pub(crate) struct EvalArgs {
     /// Backend to render the views on
     #[arg(long, value_enum, default_value = "auto")]
     pub(crate) backend: Backend,
-    /// Folder for the contact sheet and the figures; by default `eval` beside the model
+    /// Folder for the contact sheet and the figures; by default OUT/eval for a folder that `plat train` wrote, NAME-eval beside a
+    /// file NAME.ply or NAME.spz
     #[arg(long, value_name = "DIR")]
     pub(crate) out: Option<PathBuf>,
     /// Store of the photos; by default the model's own if it exists, else a temporary one
