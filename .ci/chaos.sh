@@ -43,7 +43,7 @@ docker image ls --format '{{.Repository}}:{{.Tag}} {{.Size}}'
 step "what the images can do"
 # A real street where the data is; else a made one.
 capture=../shared/data/street_lund
-[[ -d $capture ]] || { capture="$scratch/city"; "$PLAT" synth --out "$capture" --area-km2 0.05 --views 24 --size 160x120 --quiet; }
+[[ -d $capture ]] || { capture="$scratch/city"; "$PLAT" synth --out "$capture" --area-km2 0.05 --views 24 --size 640x480 --quiet; }
 capture=$(realpath "$capture")
 docker run --rm --network none plat --version
 few=(--blocks whole --steps 20 --downscale 4 --quiet)

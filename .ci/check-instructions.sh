@@ -7,7 +7,8 @@ cd "$(dirname "${BASH_SOURCE[0]}")/.."
 recorded=bench/instructions.json
 
 command -v valgrind || { apt-get update -qq && apt-get install -qq --yes --no-install-recommends valgrind; }
-cargo build --release --locked -p train --example fixed_steps
+# Without the GPU's code, which takes longest to build and is not counted.
+cargo build --release --locked -p train --example fixed_steps --no-default-features
 program="${CARGO_TARGET_DIR:-target}/release/examples/fixed_steps"
 
 scratch=$(mktemp -d)

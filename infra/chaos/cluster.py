@@ -19,6 +19,10 @@ class StepFailed(Exception):
     """A step of the test itself failed, not the behaviour under test."""
 
 
+class TooLate(StepFailed):
+    """The job ended before the fault."""
+
+
 def run(*words, check=True, env=None, data=None, timeout=180):
     """Runs a command and returns its standard output as bytes."""
     try:

@@ -18,11 +18,13 @@ import time
 from datetime import datetime
 from pathlib import Path
 
-from cluster import PROJECT, USER, Cluster, StepFailed, disconnect, docker, kill, reconnect
+from cluster import PROJECT, USER, Cluster, StepFailed, TooLate, disconnect, docker, kill, reconnect
 
-PLAN = ["--blocks", "tree", "--levels", "1", "--steps", "900", "--downscale", "4", "--backend", "cpu"]
+PLAN = ["--blocks", "tree", "--levels", "1", "--steps", "1800", "--downscale", "4", "--backend", "cpu"]
 LEASE_SECONDS = 2
 CHECKPOINT_SECONDS = 1
+# How often a case is tried whose job ends before the fault, as on a machine where docker is slow.
+TRIES = 3
 # A job that takes longer than this counts as hung, seconds.
 JOB_TIMEOUT = 180
 
@@ -117,7 +119,7 @@ def busy_worker(cluster, chance):
         workers = [worker for worker in map(cluster.worker_of, tasks) if worker]
         if workers:
             return chance.choice(workers)
-    raise StepFailed("no worker has a task")
+    raise TooLate("no worker has a task")
 
 
 def takeover_seconds(cluster, candidates):
@@ -144,7 +146,7 @@ def wait_for(cluster, job, done):
     """Waits until this many tasks are done and the job still runs; returns the status."""
     while True:
         if job.poll() is not None:
-            raise StepFailed(f"the job ended before the fault: {job.stderr.read().decode()[-500:]}")
+            raise TooLate(f"the job ended before the fault: {job.stderr.read().decode()[-500:]}")
         try:
             status = cluster.ask("status", "1", within=1)
         except StepFailed:
@@ -165,11 +167,11 @@ def finish(job, about):
     return job.returncode
 
 
-def run_case(cluster, case, seed, wanted):
+def run_case(cluster, case, seed, wanted, tries=1):
     """Runs one case; returns its line of results."""
     chance = random.Random(f"{case} {seed}")
     about = {"case": case, "seed": seed}
-    out = f"{case}-{seed}"
+    out = f"{case}-{seed}" + (f"-{tries}" if tries > 1 else "")
     cluster.start(f"file:///shared/{out}" if case == "fill-disk" else f"s3://plat/{out}")
     began = time.monotonic()
     job = cluster.submit(out, PLAN)
@@ -190,6 +192,16 @@ def run_case(cluster, case, seed, wanted):
     about["seconds"] = round(time.monotonic() - began, 1)
     about["identical"] = hashlib.sha256(cluster.model(out) or b"").digest() == wanted
     return about
+
+
+def in_time(run):
+    """The result of a case, run again if its job ended too early."""
+    for tries in range(1, TRIES):
+        try:
+            return run(tries)
+        except TooLate:
+            pass
+    return run(TRIES)
 
 
 def recover(cluster, out, about):
@@ -253,7 +265,7 @@ def main():
             for seed in chosen.seeds:
                 for case in chosen.cases:
                     try:
-                        line = run_case(cluster, case, seed, wanted)
+                        line = in_time(lambda tries: run_case(cluster, case, seed, wanted, tries))
                     except StepFailed as error:
                         line = {"case": case, "seed": seed, "identical": False, "said": str(error)}
                     report(line, chosen.out)
