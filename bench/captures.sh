@@ -2,9 +2,11 @@
 # The captures' lines of bench/results: each trained whole and as a tree of one level, three seeds, one thread, nothing pruned.
 # Takes the folder of the captures, and the names of those to train (all where none is named). Ten minutes on one core.
 set -euo pipefail
-data=$(realpath "${1:?the folder of the captures}")
+repository=$(realpath "$(dirname "${BASH_SOURCE[0]}")/..")
+# Lines of results name the command, so that its paths must not be those of one machine.
+data=$(realpath --relative-to="$repository" "${1:?the folder of the captures}")
 shift
-cd "$(dirname "${BASH_SOURCE[0]}")/.."
+cd "$repository"
 plat=${PLAT:-target/release/plat}
 
 # Name on the chart, folder, downscale, steps, splats, steps between looks.
