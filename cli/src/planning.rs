@@ -43,7 +43,7 @@ pub(crate) fn describe(plan: &Plan) -> String {
         count => format!(" and {count} evaluation task{}", if count == 1 { "" } else { "s" }),
     };
     let mut text = format!(
-        "{:?} plan of {} level{}, {} task{}{evaluation}, root {:.1} m: about {:.0} CPU seconds and {} MB a task\n",
+        "{:?} plan of {} level{}, {} task{}{evaluation}, root {:.1} m: about {:.0} ({:.0} to {:.0}) CPU seconds and {} MB a task\n",
         plan.settings.mode,
         plan.levels + 1,
         if plan.levels == 0 { "" } else { "s" },
@@ -51,6 +51,8 @@ pub(crate) fn describe(plan: &Plan) -> String {
         if plan.tasks.len() == 1 { "" } else { "s" },
         plan.ground.edge_metres,
         estimate.cpu_seconds,
+        estimate.cpu_seconds_range[0],
+        estimate.cpu_seconds_range[1],
         estimate.memory_bytes >> 20,
     );
     for level in 0..=plan.levels {

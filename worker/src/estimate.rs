@@ -30,6 +30,8 @@ const RENDER_COST: f64 = 0.5;
 const PRUNED_SHARE: f64 = 0.65;
 /// Splats that a child inherits from its parent, relative to the child's budget.
 const INHERITED_SHARE: f64 = 0.4;
+/// Outcome over estimate on the bench's captures: smallest and largest of 33 runs (docs/decisions/0054).
+const OUTCOME_RANGE: [f64; 2] = [0.75, 1.6];
 /// Floats of a splat of SH degree 0 to 3 in a merged PLY: position, normal, colour, opacity, scale and rotation.
 const PLY_FLOATS: [u64; 4] = [17, 26, 41, 62];
 
@@ -38,6 +40,9 @@ const PLY_FLOATS: [u64; 4] = [17, 26, 41, 62];
 pub struct Estimate {
     /// CPU seconds of all tasks on the CPU backend.
     pub cpu_seconds: f64,
+    /// Within which the outcomes of the bench's captures lay: a plan does not know how much splats overlap, nor how detailed the
+    /// photos are.
+    pub cpu_seconds_range: [f64; 2],
     /// Memory of the process during the largest task, bytes.
     pub memory_bytes: u64,
     /// Largest size of the merged model, bytes (pruning leaves fewer splats).
@@ -51,8 +56,10 @@ impl Estimate {
         let leaf = |task: &&Task| !parents.contains(&task.block);
         let splats: u64 = plan.tasks.iter().filter(leaf).map(|task| u64::from(task.budget)).sum();
         let cpu_seconds: f64 = plan.tasks.iter().map(|task| cpu_seconds(plan, task, leaf(&task))).sum();
+        let cpu_seconds = cpu_seconds / relative_speed;
         Self {
-            cpu_seconds: cpu_seconds / relative_speed,
+            cpu_seconds,
+            cpu_seconds_range: OUTCOME_RANGE.map(|ratio| ratio * cpu_seconds),
             memory_bytes: plan.tasks.iter().map(|task| task.memory_bytes).max().unwrap_or(0),
             bytes: splats * 4 * PLY_FLOATS[usize::from(plan.settings.sh_degree.min(3))],
         }
