@@ -10,7 +10,7 @@ use crate::clock;
 
 /// CPU seconds of one measured step on the machine of the estimate's constants (an EPYC core with AVX-512), known to a fifth
 /// (docs/decisions/0054).
-const REFERENCE_STEP_SECONDS: f64 = 6.0e-3;
+const REFERENCE_STEP_SECONDS: f64 = 5.0e-3;
 /// Width and height of the measured window, pixels.
 const SIZE: [u32; 2] = [256, 144];
 /// Measured splats.
@@ -20,9 +20,9 @@ const WARM_UP_STEPS: u32 = 4;
 /// Measured steps.
 const STEPS: u32 = 16;
 /// Runs, of which the fastest counts: other programs only ever slow a run down.
-const RUNS: usize = 2;
+const RUNS: usize = 5;
 
-/// Speed of training on this machine's CPU, relative to the machine of the estimate's constants. Takes about a quarter of a CPU
+/// Speed of training on this machine's CPU, relative to the machine of the estimate's constants. Takes about half a CPU
 /// second the first time, and is remembered.
 pub fn relative_speed() -> f64 {
     static SPEED: OnceLock<f64> = OnceLock::new();

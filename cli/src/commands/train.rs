@@ -108,7 +108,7 @@ pub(crate) fn train(args: &TrainArgs, output: &Output) -> Result<Trained, Failur
     let clock = Stopwatch::start();
     let prepared = prepare(args, &clock, output)?;
     let finished = train_plan(args, &prepared, clock, output)?;
-    // Between the clocks, as it takes a quarter of a CPU second.
+    // Between the clocks, as it takes half a CPU second.
     let predicted = Estimate::of(&prepared.plan, relative_speed());
 
     let clock = Stopwatch::start();
