@@ -91,7 +91,8 @@ impl Execute for PlanExecutor {
     ) -> Result<ArtefactId, ExecuteError> {
         let mut stopwatch = Stopwatch::start();
         let TrainerContext { store, options, shared, backend } = &self.context;
-        let fetch_span = tracing::info_span!("fetch").entered();
+        let fetch_span = tracing::info_span!("fetch");
+        let fetching = fetch_span.enter();
         let plan = self.plan(order.plan)?;
         if plan.backend != backend.name() {
             let (planned, own) = (&plan.backend, backend.name());
@@ -103,8 +104,8 @@ impl Execute for PlanExecutor {
         let window_bytes = options.cache_bytes - 2 * self.remote_bytes;
         let reader = WindowReader::with_shared_tiles(tiles, capture.clone(), store.clone(), window_bytes);
         let cache = options.resume.then(|| ResultCache::of(order)).filter(|_| shared.time_limit.is_none());
-        drop(fetch_span);
-        let job = Assignment { order, plan: &plan, capture: &capture, cache: cache.as_ref() };
+        drop(fetching);
+        let job = Assignment { order, plan: &plan, capture: &capture, cache: cache.as_ref(), fetch_span };
         match task {
             PlannedTask::Train(task) => self.train(&job, task, reader, &mut stopwatch, report),
             PlannedTask::Evaluate(task) => self.evaluate(&job, task, &reader, &stopwatch, report),
@@ -119,6 +120,8 @@ struct Assignment<'a> {
     capture: &'a Arc<Capture>,
     /// `None` if nothing is resumed.
     cache: Option<&'a ResultCache>,
+    /// Entered again while the inputs are fetched.
+    fetch_span: tracing::Span,
 }
 
 impl PlanExecutor {
@@ -131,9 +134,9 @@ impl PlanExecutor {
         stopwatch: &mut Stopwatch,
         report: &mut (dyn FnMut(Report) -> Flow + Send),
     ) -> Result<ArtefactId, ExecuteError> {
-        let &Assignment { order, plan, capture, cache } = job;
+        let &Assignment { order, plan, capture, cache, ref fetch_span } = job;
         let TrainerContext { store, shared, .. } = &self.context;
-        let fetch_span = tracing::info_span!("fetch").entered();
+        let fetching = fetch_span.enter();
         let reader = if plan.settings.depth_weight > 0.0 { reader.with_sparse_depth() } else { reader };
         let (mut results, mut given) = (BTreeMap::new(), TrainingInfo::default());
         self.for_each_input(plan, PlannedTask::Train(task), order, report, |block, splats, training| {
@@ -150,7 +153,7 @@ impl PlanExecutor {
             Some(id) => Some(Exposures::from_frame(&store.get(id)?).map_err(ExecuteError::work)?),
             None => None,
         };
-        drop(fetch_span);
+        drop(fetching);
         let (given_exposures, given_residual) = (exposures.as_ref(), given.residual);
         let block = Block {
             context: &self.context,
@@ -197,8 +200,10 @@ impl PlanExecutor {
             return Ok(artefact);
         }
         let (mut parts, leaves) = (Vec::new(), plan.leaves());
-        self.for_each_input(plan, PlannedTask::Evaluate(task), order, report, |block, splats, _| {
-            parts.push((block, leaves.keep(&splats, &plan.ground, block)));
+        job.fetch_span.in_scope(|| {
+            self.for_each_input(plan, PlannedTask::Evaluate(task), order, report, |block, splats, _| {
+                parts.push((block, leaves.keep(&splats, &plan.ground, block)));
+            })
         })?;
         let span = tracing::info_span!("evaluate", views = task.views.len());
         let figures = self.pool.install(|| {
