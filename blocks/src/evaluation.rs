@@ -4,11 +4,15 @@ use scene::Capture;
 
 use crate::budgets::{BASE_BYTES, BYTES_PER_FROZEN_COLUMN, BYTES_PER_FROZEN_PROJECTED, COLUMNS};
 use crate::cost::HALO_AREA;
-use crate::plan::{EvalTask, PlanSettings, Task};
+use crate::plan::{EvalTask, MAX_EVAL_TASKS, PlanSettings, Task};
 
-/// Pixels of the views of one task, about. Each task reads the whole model, so tasks must not be too small; too large
-/// ones leave workers without work.
+/// Least pixels of the views of one task, about. Larger tasks would leave workers without work.
 const TASK_PIXELS: u64 = 8 << 20;
+/// Further pixels for each splat. A task reads the whole model, which takes as long as measuring half a pixel for each
+/// splat; so reading is at most an eighth of a task.
+const PIXELS_PER_SPLAT: u64 = 4;
+/// Results that a worker fetches at a time, each with its halo.
+const FETCHED_BLOCKS: u64 = 8;
 /// Bytes per pixel of the largest view: photo and render as floats, and the planes of SSIM and SSIMULACRA2.
 const BYTES_PER_PIXEL: u64 = 220;
 
@@ -16,17 +20,20 @@ const BYTES_PER_PIXEL: u64 = 220;
 pub(crate) fn eval_tasks(capture: &Capture, tasks: &[Task], settings: &PlanSettings) -> Vec<EvalTask> {
     let columns = COLUMNS[usize::from(settings.sh_degree.min(3))];
     let largest = tasks.iter().map(|task| u64::from(task.budget)).max().unwrap_or(0);
-    // The merged model, and one block with its halo while the model is put together.
-    let model = u64::from(settings.budget) * (BYTES_PER_FROZEN_COLUMN * columns + BYTES_PER_FROZEN_PROJECTED)
-        + (largest as f64 * HALO_AREA) as u64 * BYTES_PER_FROZEN_COLUMN * columns;
+    let budget = u64::from(settings.budget);
+    // The merged model, and the blocks that are being fetched while it is put together.
+    let fetched = (FETCHED_BLOCKS + 1).min(tasks.len() as u64) * (largest as f64 * HALO_AREA) as u64;
+    let model = budget * (BYTES_PER_FROZEN_COLUMN * columns + BYTES_PER_FROZEN_PROJECTED)
+        + fetched * BYTES_PER_FROZEN_COLUMN * columns;
+    let held_out = || (capture.views.iter().enumerate()).filter(|(i, _)| Capture::is_test(*i, settings.test_every));
+    let all_pixels: u64 = held_out().map(|(_, view)| view.camera.full().area()).sum();
+    // A task may stay up to one view short of its pixels, so a task may take twice its share.
+    let task_pixels = (TASK_PIXELS + PIXELS_PER_SPLAT * budget).max(2 * all_pixels / MAX_EVAL_TASKS as u64 + 1);
     let mut planned: Vec<EvalTask> = Vec::new();
-    for (index, view) in capture.views.iter().enumerate() {
-        if !Capture::is_test(index, settings.test_every) {
-            continue;
-        }
+    for (index, view) in held_out() {
         let pixels = view.camera.full().area();
         let memory_bytes = BASE_BYTES + model + pixels * BYTES_PER_PIXEL;
-        match planned.last_mut().filter(|task| task.pixels + pixels <= TASK_PIXELS) {
+        match planned.last_mut().filter(|task| task.pixels + pixels <= task_pixels) {
             Some(task) => {
                 task.views.push(index as u32);
                 task.pixels += pixels;
@@ -47,10 +54,22 @@ mod tests {
     fn every_held_out_view_is_measured_once() {
         let capture = street(700, 100);
         let settings = PlanSettings { test_every: 8, ..PlanSettings::default() };
+        let settings = PlanSettings { budget: 1000, ..settings };
         let tasks = eval_tasks(&capture, &[], &settings);
         let views: Vec<u32> = tasks.iter().flat_map(|task| task.views.clone()).collect();
         assert_eq!(views, (0..700).step_by(8).collect::<Vec<u32>>());
-        assert!(tasks.len() > 1 && tasks.iter().all(|task| task.pixels <= TASK_PIXELS && task.memory_bytes > 0));
+        assert!(tasks.len() > 1 && tasks.iter().all(|task| task.pixels < TASK_PIXELS + 4001 && task.memory_bytes > 0));
+        // A large model is read by few tasks.
+        let large = PlanSettings { budget: 20_000_000, ..settings.clone() };
+        assert_eq!(eval_tasks(&capture, &[], &large).len(), 1);
+        // Photos of 12 megapixels, each larger than a task would be.
+        let mut wide = capture.clone();
+        for view in &mut wide.views {
+            (view.camera.pinhole.width, view.camera.pinhole.height) = (4000, 3000);
+        }
+        let all = PlanSettings { test_every: 1, ..settings.clone() };
+        let tasks = eval_tasks(&wide, &[], &all);
+        assert!((MAX_EVAL_TASKS / 4..=MAX_EVAL_TASKS).contains(&tasks.len()), "{}", tasks.len());
         assert!(eval_tasks(&capture, &[], &PlanSettings { test_every: 0, ..settings }).is_empty());
     }
 }

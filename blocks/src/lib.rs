@@ -2,8 +2,9 @@
 //!
 //! The ground plane is a quadtree of blocks ([`Ground`]). One half-open ownership rule assigns every place to a block.
 //! [`cut()`] and [`merge()`] share it, so `merge(cut(s)) == s`. [`plan()`] turns a capture into an immutable, hashed
-//! list of tasks. A training task states which block trains on which windows of which views, against which frozen context
-//! and within which budgets; an evaluation task states on which views the merged model is measured. [`lint()`] checks a plan, [`draw()`] draws it as an SVG.
+//! list of tasks. A training task states which block trains on which windows of which views, against which frozen
+//! context and within which budgets; an evaluation task states on which views the merged model is measured. [`lint()`]
+//! checks a plan, [`draw()`] draws it as an SVG.
 //!
 //! Architecture invariant: this crate does no I/O, reads no clock, starts no thread and uses no GPU. All functions are
 //! pure, and equal inputs give equal bytes.

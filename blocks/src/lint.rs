@@ -61,6 +61,14 @@ pub fn lint(plan: &Plan, capture: &Capture) -> Vec<Finding> {
         earlier.insert(task.block);
     }
     plan.eval_tasks.iter().for_each(|task| check_evaluation(plan, task, capture, &mut findings));
+    let (limit, largest) =
+        (plan.settings.memory_limit_bytes, plan.eval_tasks.iter().map(|task| task.memory_bytes).max());
+    if let Some(bytes) = largest.filter(|bytes| *bytes > limit) {
+        let [bytes, limit] = [bytes, limit].map(|bytes| bytes.div_ceil(1 << 20));
+        let advice = "lower --budget, or leave --evaluate and use plat eval";
+        findings
+            .error(None, format!("evaluating the merged model needs {bytes} MiB, the limit is {limit} MiB; {advice}"));
+    }
     let finest: u64 = plan.leaves().blocks().iter().filter_map(|&b| plan.task(b)).map(|t| u64::from(t.budget)).sum();
     let deepest: u64 = plan.tasks.iter().filter(|t| t.block.level == plan.levels).map(|t| u64::from(t.budget)).sum();
     let (budget, parts) = (u64::from(plan.settings.budget), plan.tasks.len() as u64);
@@ -188,7 +196,7 @@ fn check_budgets(plan: &Plan, task: &Task, findings: &mut Findings) {
     }
 }
 
-/// Checks that the views of an evaluation exist and are held out, and that the whole model fits in memory.
+/// Checks that the views of an evaluation exist and are held out.
 fn check_evaluation(plan: &Plan, task: &EvalTask, capture: &Capture, findings: &mut Findings) {
     for &view in &task.views {
         if view as usize >= capture.views.len() {
@@ -196,13 +204,6 @@ fn check_evaluation(plan: &Plan, task: &EvalTask, capture: &Capture, findings: &
         } else if !Capture::is_test(view as usize, plan.settings.test_every) {
             findings.error(None, format!("evaluates training view {view}"));
         }
-    }
-    let (bytes, limit) = (task.memory_bytes, plan.settings.memory_limit_bytes);
-    if bytes > limit {
-        let [bytes, limit] = [bytes, limit].map(|bytes| bytes.div_ceil(1 << 20));
-        let advice = "lower --budget, or leave --evaluate and use plat eval";
-        findings
-            .error(None, format!("evaluating the merged model needs {bytes} MiB, the limit is {limit} MiB; {advice}"));
     }
 }
 

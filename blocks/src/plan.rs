@@ -23,6 +23,12 @@ pub const MAX_LEVELS: u8 = 16;
 /// The maximum of [`PlanSettings::views_per_step`].
 pub const MAX_VIEWS_PER_STEP: u32 = 16;
 
+/// The maximum number of evaluation tasks. Each depends on all blocks.
+pub(crate) const MAX_EVAL_TASKS: usize = 256;
+/// The maximum number of blocks of a plan with evaluation tasks: a grant names all results, 40 bytes each, in a message of
+/// at most 4 MiB.
+pub(crate) const MAX_EVALUATED_BLOCKS: usize = 1 << 16;
+
 /// The maximum width and height of a window, pixels.
 const MAX_SIDE: u32 = 1 << 24;
 
@@ -298,6 +304,14 @@ impl Plan {
         let measured = self.eval_tasks.iter().flat_map(|task| &task.views);
         if !measured.is_sorted_by(|a, b| a < b) || self.eval_tasks.iter().any(|task| task.views.is_empty()) {
             return bad("has evaluation tasks without views, or with views twice or out of order".into());
+        }
+        let has_too_many = self.eval_tasks.len() > MAX_EVAL_TASKS || self.tasks.len() > MAX_EVALUATED_BLOCKS;
+        if !self.eval_tasks.is_empty() && has_too_many {
+            return bad(format!(
+                "has {} evaluation tasks on {} blocks; at most {MAX_EVAL_TASKS} on {MAX_EVALUATED_BLOCKS} are supported",
+                self.eval_tasks.len(),
+                self.tasks.len()
+            ));
         }
         if self.tasks.is_empty() || !self.tasks.is_sorted_by(|a, b| training_order(a.block) < training_order(b.block)) {
             return bad("has no tasks, or its tasks are out of order".into());

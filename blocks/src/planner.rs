@@ -6,7 +6,7 @@ use crate::budgets::{self, DetailShares};
 use crate::evaluation::eval_tasks;
 use crate::ground::{Ground, quantile};
 use crate::layout::{Layout, level_rho_metres};
-use crate::plan::{MAX_LEVELS, MAX_VIEWS_PER_STEP, Mode, Plan, PlanError, PlanSettings, VERSION};
+use crate::plan::{MAX_EVALUATED_BLOCKS, MAX_LEVELS, MAX_VIEWS_PER_STEP, Mode, Plan, PlanError, PlanSettings, VERSION};
 use crate::visibility::{Observations, is_usable};
 
 /// The finest resolution is this quantile of depth / focal length over all observations. With the median, half of the
@@ -58,6 +58,10 @@ pub fn plan(
     let shares = DetailShares::of(capture, &observations, &ground, levels, finest_metres);
     let whole = layout.lay_out(Mode::Whole, 0, finest_metres)?.1.remove(0);
     budgets::set_all(&mut tasks, whole, &shares, capture, &ground, settings);
+    if settings.evaluate && tasks.len() > MAX_EVALUATED_BLOCKS {
+        let problem = format!("{} blocks are too many to evaluate in the job", tasks.len());
+        return Err(PlanError::Setting { setting: "--evaluate", problem, advice: "leave it, and use plat eval" });
+    }
     let eval_tasks = if settings.evaluate { eval_tasks(capture, &tasks, settings) } else { Vec::new() };
     Ok(Plan {
         version: VERSION,

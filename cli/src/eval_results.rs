@@ -46,6 +46,15 @@ pub(crate) fn collect(
     Ok(Some(evaluated))
 }
 
+/// Adds to the failure of an evaluation that the model was written.
+pub(crate) fn model_is_kept(failure: Failure, out: &Path) -> Failure {
+    let kept = |line: String| format!("{line}; the model is complete in {}, and plat eval measures it", out.display());
+    match failure {
+        Failure::Input(line) => Failure::Input(kept(line)),
+        Failure::Work(line) => Failure::Work(kept(line)),
+    }
+}
+
 /// The views that evaluation tasks measured, by the tasks' results.
 fn views_of(results: &[ArtefactId], store: &BlockingStore) -> Result<Vec<ViewFigures>, Failure> {
     let mut views = Vec::new();

@@ -107,9 +107,13 @@ impl<'a> LiveStatus<'a> {
     }
 }
 
-/// A task's block, or its number if the block is not known.
+/// A task's block; its number if it evaluates, or if the blocks are not known.
 pub(crate) fn name_of(blocks: &[BlockId], task: u32) -> String {
-    blocks.get(task as usize).map_or(format!("task {task}"), |block| format!("block {block}"))
+    match blocks.get(task as usize) {
+        Some(block) => format!("block {block}"),
+        None if blocks.is_empty() => format!("task {task}"),
+        None => format!("evaluation task {task}"),
+    }
 }
 
 fn count(results: &Results, wanted: TaskState) -> usize {

@@ -59,7 +59,7 @@ impl Remote {
         self.runtime.block_on(shared_store(&about.store_url))
     }
 
-    /// The blocks of a job's tasks, in the plan's order.
+    /// The blocks of a job's training tasks, in the plan's order.
     pub(crate) fn blocks(&mut self, job: u64) -> Result<Vec<BlockId>, Failure> {
         let reply = self.call(async |client: &mut Client| client.blocks(proto::BlocksRequest { job }).await)?;
         let columns = reply.level.into_iter().zip(reply.x).zip(reply.y);

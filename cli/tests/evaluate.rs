@@ -2,8 +2,9 @@
 
 mod common;
 
-use common::{done, plat, refused};
+use common::{done, plat, refused, stopped};
 use serde_json::Value;
+use store::Store;
 
 #[test]
 fn evaluation_tasks_give_the_figures_of_plat_eval_and_change_no_model() {
@@ -39,4 +40,45 @@ fn evaluation_tasks_give_the_figures_of_plat_eval_and_change_no_model() {
     let plan = plat(at, &["plan", "city", "--evaluate"]);
     assert!(String::from_utf8(plan.stdout).unwrap().contains(" and 1 evaluation task, "));
     refused(at, &["train", "city", "--out", "x", "--evaluate", "--test-every", "0"], "no view is held out");
+}
+
+#[test]
+fn plans_of_every_mode_are_evaluated() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    common::city(at, 20, 64, 48);
+    for blocks in ["whole", "flat"] {
+        let job =
+            ["train", "city", "--steps", "60", "--budget", "600", "--levels", "1", "--minutes", "5", "--evaluate"];
+        let levels = if blocks == "whole" { &job[..6] } else { &job[..8] };
+        let report = done(at, &[levels, &job[8..], &["--blocks", blocks, "--out", blocks]].concat());
+        let measured = done(at, &["eval", blocks, "city", "--out", "eval"]);
+        assert!(report["psnr"].is_f64() && report["psnr"] == measured["psnr"], "{blocks}: {report}");
+    }
+    refused(at, &["bench", "pareto", "city", "--evaluate", "--out", "x"], "--evaluate");
+}
+
+#[test]
+fn a_failed_evaluation_leaves_the_model() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    common::city(at, 20, 64, 48);
+    let job = ["train", "city", "--steps", "60", "--budget", "600", "--levels", "1", "--store", "store", "--out"];
+    let plain = done(at, &[&job[..], &["plain"]].concat());
+    // Damages the photo of the first held-out view.
+    let store = Store::open(&at.join("store").display().to_string()).unwrap().blocking();
+    let capture = dataset::ingest::load_capture(&store, plain["capture"].as_str().unwrap().parse().unwrap()).unwrap();
+    let name = capture.views[0].mips[0].to_string();
+    let file = at.join("store/artefacts").join(&name[..2]).join(&name);
+    std::fs::write(&file, b"damaged").unwrap();
+
+    let line = stopped(
+        &mut common::command(at, &[&job[..], &["measured", "--evaluate", "--quiet"]].concat()),
+        1,
+        "the model is complete in measured, and plat eval measures it",
+    );
+    assert!(line.contains("task ") && line.contains("failed in attempt"), "{line}");
+    let bytes = |path: &str| std::fs::read(at.join(path)).unwrap();
+    assert!(bytes("plain/merged.ply") == bytes("measured/merged.ply"));
+    assert!(at.join("measured/report.json").is_file() && !at.join("measured/eval/report.json").exists());
 }

@@ -55,6 +55,13 @@ impl Results {
         self.tasks.iter().map(|task| proto::artefact_id(&task.artefact).map_err(of_status)).collect()
     }
 
+    /// The results of the first `count` tasks, if they are done.
+    pub fn first(&self, count: usize) -> Option<Vec<ArtefactId>> {
+        let is_done = |task: &&proto::TaskChanged| task.state() == TaskState::Done;
+        let of = |task: &proto::TaskChanged| proto::artefact_id(&task.artefact).ok();
+        self.tasks.get(..count)?.iter().map(|task| Some(task).filter(is_done).and_then(of)).collect()
+    }
+
     /// The first task that failed, its error, and how many others were not run because of it.
     pub fn failure(&self) -> LocalError {
         let count = |wanted: TaskState| self.tasks.iter().filter(|task| task.state() == wanted).count();

@@ -29,6 +29,10 @@ fuzz_target!(|bytes: &[u8]| {
             plan.ground.halo(task.block);
             assert!(plan.task(task.block).is_some());
         }
+        for (index, task) in (0..).zip(plan.all_tasks()) {
+            assert_eq!(plan.planned(index), Some(task));
+            plan.inputs(task);
+        }
     }
     if let Ok((capture, _)) = frame::decode::<Capture>(CAPTURE, &sealed(CAPTURE, bytes, bytes.len()))
         && capture.check().is_ok()

@@ -34,7 +34,7 @@ def calm(cluster, job, chance, about):
 
 
 def kill_worker(cluster, job, chance, about):
-    worker = busy_worker(cluster, chance)
+    worker = busy_worker(cluster, job, chance)
     kill(worker)
     about["lost_seconds_at_most"] = unsaved_seconds(cluster, time.time())
 
@@ -46,7 +46,7 @@ def kill_leader(cluster, job, chance, about):
 
 
 def cut_worker(cluster, job, chance, about):
-    worker = busy_worker(cluster, chance)
+    worker = busy_worker(cluster, job, chance)
     disconnect(worker)
     time.sleep(outage_seconds(chance))
     reconnect(worker)
@@ -60,7 +60,7 @@ def cut_leader(cluster, job, chance, about):
 
 
 def pause_worker(cluster, job, chance, about):
-    worker = busy_worker(cluster, chance)
+    worker = busy_worker(cluster, job, chance)
     docker("pause", worker)
     time.sleep(outage_seconds(chance))
     docker("unpause", worker)
@@ -111,7 +111,7 @@ def outage_seconds(chance):
     return LEASE_SECONDS + chance.uniform(0.5, 4)
 
 
-def busy_worker(cluster, chance):
+def busy_worker(cluster, job, chance):
     """A worker that executes a task."""
     until = time.monotonic() + 20
     while time.monotonic() < until:
@@ -119,7 +119,7 @@ def busy_worker(cluster, chance):
         workers = [worker for worker in map(cluster.worker_of, tasks) if worker]
         if workers:
             return chance.choice(workers)
-    raise TooLate("no worker has a task")
+    raise (TooLate if job.poll() == 0 else StepFailed)("no worker has a task")
 
 
 def takeover_seconds(cluster, candidates):
@@ -146,7 +146,7 @@ def wait_for(cluster, job, done):
     """Waits until this many tasks are done and the job still runs; returns the status."""
     while True:
         if job.poll() is not None:
-            raise TooLate(f"the job ended before the fault: {job.stderr.read().decode()[-500:]}")
+            raise (TooLate if job.returncode == 0 else StepFailed)(f"the job ended before the fault: {job.stderr.read().decode()[-500:]}")
         try:
             status = cluster.ask("status", "1", within=1)
         except StepFailed:
@@ -190,6 +190,8 @@ def run_case(cluster, case, seed, wanted, tries=1):
     if code != 0 and case == "corrupt":
         about["recovery"] = recover(cluster, out, about)
     about["seconds"] = round(time.monotonic() - began, 1)
+    if tries > 1:
+        about["tries"] = tries
     about["identical"] = hashlib.sha256(cluster.model(out) or b"").digest() == wanted
     return about
 

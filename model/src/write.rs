@@ -15,14 +15,14 @@ use crate::manifest::{BlockEntry, Manifest, VERSION};
 use crate::ply_comments;
 use crate::read::read_block;
 
-/// Creates the model folder under `out` and writes the plan. First removes an older model's manifest, merged file and report,
-/// so that an interrupted write never passes for a model.
+/// Creates the model folder under `out` and writes the plan. First removes an older model's manifest, merged file and reports,
+/// so that an interrupted write never passes for a model, nor old figures for those of this model.
 pub(crate) fn begin(out: &Path, plan: &Plan) -> Result<PathBuf, ModelError> {
     let folder = out.join("model");
     if folder.join(MANIFEST_FILE).exists() {
         fs::remove_dir_all(&folder).map_err(cannot("replaced", &folder))?;
     }
-    for file in [MERGED_FILE, "report.json"].map(|name| out.join(name)) {
+    for file in [MERGED_FILE, "report.json", "eval/report.json", "eval/sheet.png"].map(|name| out.join(name)) {
         if file.exists() {
             fs::remove_file(&file).map_err(cannot("replaced", &file))?;
         }

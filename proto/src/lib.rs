@@ -33,7 +33,7 @@ pub const VERSION: u32 = 2;
 /// The oldest protocol version that a coordinator still serves. (The first version did not send its number.)
 pub const MIN_VERSION: u32 = 2;
 /// The largest message that either side accepts, in bytes. The largest in regular use is a grant: 40 bytes for each block of its
-/// context.
+/// context, or for each block of a model that is evaluated.
 pub const MESSAGE_BYTES_LIMIT: usize = 4 << 20;
 /// The longest name of a worker or of a backend, in bytes.
 pub const NAME_BYTES_LIMIT: usize = 128;

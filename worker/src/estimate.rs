@@ -40,7 +40,7 @@ const PLY_FLOATS: [u64; 4] = [17, 26, 41, 62];
 /// Estimated time, memory and size of a plan.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Estimate {
-    /// CPU seconds of all tasks on the CPU backend.
+    /// CPU seconds of all training tasks on the CPU backend.
     pub cpu_seconds: f64,
     /// Within which the outcomes of the bench's captures lay: a plan does not know how much splats overlap, nor how detailed the
     /// photos are.
@@ -65,7 +65,7 @@ impl Estimate {
             cpu_seconds,
             relative_speed,
             cpu_seconds_range: OUTCOME_RANGE.map(|ratio| ratio * cpu_seconds),
-            memory_bytes: plan.tasks.iter().map(|task| task.memory_bytes).max().unwrap_or(0),
+            memory_bytes: plan.all_tasks().map(|task| task.memory_bytes()).max().unwrap_or(0),
             bytes: splats * 4 * PLY_FLOATS[usize::from(plan.settings.sh_degree.min(3))],
         }
     }

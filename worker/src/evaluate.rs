@@ -9,24 +9,29 @@ use scene::Splats;
 use train::Backend;
 
 use crate::clock::Stopwatch;
+use crate::memory_budget::MemoryBudget;
 use crate::task::{ExecuteError, Flow, Report};
 
 /// The figures of the task's views. Equal models and photos give equal figures, as `plat eval` does.
 ///
 /// # Errors
-/// Photos that cannot be read, a renderer that fails, or a report that was answered with [`Flow::Stop`].
+/// Photos that cannot be read, a renderer that fails, memory above the budget, or a report that was answered with
+/// [`Flow::Stop`].
+#[allow(clippy::too_many_arguments, reason = "each is used once; a struct would only repeat their names")]
 pub(crate) fn evaluate(
     plan: &Plan,
     task: &EvalTask,
     model: &Splats,
     reader: &WindowReader,
     backend: &Backend,
+    mut memory: Option<MemoryBudget>,
     stopwatch: &Stopwatch,
     report: &mut (dyn FnMut(Report) -> Flow + Send),
 ) -> Result<Vec<ViewFigures>, ExecuteError> {
     let options =
         Options { antialiased: plan.settings.antialiased, sh_degree: model.sh_degree(), ..Options::default() };
     let steps = task.views.len() as u64;
+    let mut overrun = None;
     let goes_on = |done: usize| {
         let report = report(Report {
             step: done as u64,
@@ -38,10 +43,15 @@ pub(crate) fn evaluate(
             psnr: None,
             merged_splats: None,
         });
-        report == Flow::Continue
+        overrun = memory.as_mut().filter(|_| (done as u64) < steps).and_then(MemoryBudget::overrun);
+        report == Flow::Continue && overrun.is_none()
     };
     let figures = eval::figures_of_views(model, &options, reader, &task.views, backend, goes_on);
     let figures = figures.map_err(failure)?;
+    if let Some(resident) = overrun {
+        let message = format!("evaluation: the worker takes {} MiB, above its --memory", resident.div_ceil(1 << 20));
+        return Err(ExecuteError::of(FailureKind::OutOfMemory, message));
+    }
     // The last view's report needs no answer: the task is finished anyway.
     if figures.len() < task.views.len() {
         return Err(ExecuteError::work("stopped before all views were measured"));

@@ -25,6 +25,7 @@ use train::Backend;
 use crate::block::Block;
 use crate::clock::Stopwatch;
 use crate::evaluate::evaluate;
+use crate::memory_budget::memory_budget;
 use crate::merged_eval::{MergedEvaluator, evaluates_after};
 use crate::recompute::recompute;
 use crate::result_cache::ResultCache;
@@ -90,7 +91,7 @@ impl Execute for PlanExecutor {
         report: &mut (dyn FnMut(Report) -> Flow + Send),
     ) -> Result<ArtefactId, ExecuteError> {
         let mut stopwatch = Stopwatch::start();
-        let TrainerContext { store, options, shared, backend } = &self.context;
+        let TrainerContext { options, shared, backend, .. } = &self.context;
         let fetch_span = tracing::info_span!("fetch");
         let fetching = fetch_span.enter();
         let plan = self.plan(order.plan)?;
@@ -101,14 +102,12 @@ impl Execute for PlanExecutor {
         }
         let task = plan.planned(order.task).ok_or_else(|| ExecuteError::work("the plan has no such task"))?;
         let (capture, tiles) = self.capture(plan.capture)?;
-        let window_bytes = options.cache_bytes - 2 * self.remote_bytes;
-        let reader = WindowReader::with_shared_tiles(tiles, capture.clone(), store.clone(), window_bytes);
         let cache = options.resume.then(|| ResultCache::of(order)).filter(|_| shared.time_limit.is_none());
         drop(fetching);
-        let job = Assignment { order, plan: &plan, capture: &capture, cache: cache.as_ref(), fetch_span };
+        let job = Assignment { order, plan: &plan, capture: &capture, tiles, cache: cache.as_ref(), fetch_span };
         match task {
-            PlannedTask::Train(task) => self.train(&job, task, reader, &mut stopwatch, report),
-            PlannedTask::Evaluate(task) => self.evaluate(&job, task, &reader, &stopwatch, report),
+            PlannedTask::Train(task) => self.train(&job, task, &mut stopwatch, report),
+            PlannedTask::Evaluate(task) => self.evaluate(&job, task, &stopwatch, report),
         }
     }
 }
@@ -118,10 +117,18 @@ struct Assignment<'a> {
     order: &'a TaskOrder,
     plan: &'a Plan,
     capture: &'a Arc<Capture>,
+    tiles: Arc<SharedTileCache>,
     /// `None` if nothing is resumed.
     cache: Option<&'a ResultCache>,
     /// Entered again while the inputs are fetched.
     fetch_span: tracing::Span,
+}
+
+impl Assignment<'_> {
+    /// A reader of the capture's windows that keeps this many bytes of them.
+    fn reader(&self, store: &BlockingStore, cache_bytes: usize) -> WindowReader {
+        WindowReader::with_shared_tiles(self.tiles.clone(), self.capture.clone(), store.clone(), cache_bytes)
+    }
 }
 
 impl PlanExecutor {
@@ -130,13 +137,13 @@ impl PlanExecutor {
         &self,
         job: &Assignment,
         task: &Task,
-        reader: WindowReader,
         stopwatch: &mut Stopwatch,
         report: &mut (dyn FnMut(Report) -> Flow + Send),
     ) -> Result<ArtefactId, ExecuteError> {
-        let &Assignment { order, plan, capture, cache, ref fetch_span } = job;
-        let TrainerContext { store, shared, .. } = &self.context;
-        let fetching = fetch_span.enter();
+        let &Assignment { order, plan, capture, cache, .. } = job;
+        let TrainerContext { store, shared, options, .. } = &self.context;
+        let fetching = job.fetch_span.enter();
+        let reader = job.reader(store, options.cache_bytes - 2 * self.remote_bytes);
         let reader = if plan.settings.depth_weight > 0.0 { reader.with_sparse_depth() } else { reader };
         let (mut results, mut given) = (BTreeMap::new(), TrainingInfo::default());
         self.for_each_input(plan, PlannedTask::Train(task), order, report, |block, splats, training| {
@@ -188,12 +195,13 @@ impl PlanExecutor {
         &self,
         job: &Assignment,
         task: &EvalTask,
-        reader: &WindowReader,
         stopwatch: &Stopwatch,
         report: &mut (dyn FnMut(Report) -> Flow + Send),
     ) -> Result<ArtefactId, ExecuteError> {
         let &Assignment { order, plan, cache, .. } = job;
-        let TrainerContext { store, shared, backend, .. } = &self.context;
+        let TrainerContext { store, shared, backend, options } = &self.context;
+        // Each photo is read once.
+        let reader = job.reader(store, 0);
         let decode = |bytes: &[u8]| eval::figures_from_frame(bytes).ok();
         if let Some((artefact, _)) = cache.and_then(|cache| cache.result(store, decode)) {
             shared.resumed.fetch_add(1, Ordering::Relaxed);
@@ -209,11 +217,14 @@ impl PlanExecutor {
         let figures = self.pool.install(|| {
             span.in_scope(|| {
                 let model = blocks::merge(parts);
-                evaluate(plan, task, &model, reader, backend, stopwatch, report)
+                let budget = memory_budget(options.memory_bytes);
+                evaluate(plan, task, &model, &reader, backend, budget, stopwatch, report)
             })
         });
         shared.metrics.count_reads(reader.stats());
-        let artefact = store.put(eval::figures_to_frame(&figures?))?;
+        let figures = figures?;
+        let _keep_span = tracing::info_span!("keep").entered();
+        let artefact = store.put(eval::figures_to_frame(&figures))?;
         if let Some(cache) = cache {
             cache.put_result(store, artefact);
         }
@@ -332,6 +343,12 @@ impl PlanExecutor {
                 };
                 let (splats, training) = frame::decode_result(&bytes).map_err(ExecuteError::work)?;
                 take(block, splats, training);
+            }
+            // A training task reads a few blocks, an evaluation all of them.
+            if let PlannedTask::Evaluate(_) = task
+                && report(Report { steps: task.steps(), loss: f64::NAN, ..Report::default() }) == Flow::Stop
+            {
+                return Err(ExecuteError::work("stopped while reading the model, as requested"));
             }
         }
         Ok(())

@@ -11,6 +11,11 @@ pub fn total_bytes() -> Option<u64> {
     Some(system.total_memory().min(container)).filter(|bytes| *bytes > 0)
 }
 
+/// The budget of a worker's task of `--memory` bytes; none without that option.
+pub(crate) fn memory_budget(memory_bytes: u64) -> Option<MemoryBudget> {
+    (memory_bytes > 0).then(|| MemoryBudget::new(memory_bytes)).flatten()
+}
+
 /// A limit on this process's resident memory. Nothing enforces it: the caller polls [`MemoryBudget::overrun`].
 pub(crate) struct MemoryBudget {
     limit: u64,

@@ -8,7 +8,7 @@ use train::{Backend, Flow, Job, Recipe, TrainView, WindowSource};
 
 use crate::clock;
 
-/// CPU seconds of one measured step on the machine of the estimate's constants (an EPYC core with AVX-512), known to a fifth
+/// CPU seconds of one measured step on the machine of the estimate's constants (an EPYC core with AVX-512), known to a tenth
 /// (docs/decisions/0054).
 const REFERENCE_STEP_SECONDS: f64 = 5.0e-3;
 /// Width and height of the measured window, pixels.

@@ -20,7 +20,7 @@ pub struct TaskOrder {
     pub task: u32,
     /// The attempt's number, from 1. No result may depend on it.
     pub attempt: u32,
-    /// The results of the tasks that it depends on (parent and context), by their index in the plan.
+    /// The results of the tasks that it depends on, by their index in the plan.
     pub inputs: BTreeMap<u32, ArtefactId>,
     /// Factor on the learning rates in thousandths: less than [`FULL_RATE`] if an earlier attempt diverged.
     pub rate_permille: u32,
@@ -29,9 +29,9 @@ pub struct TaskOrder {
 /// Progress of a task: one line of metrics.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Report {
-    /// Optimiser steps done.
+    /// Optimiser steps done; of an evaluation, views.
     pub step: u64,
-    /// Optimiser steps in all.
+    /// Optimiser steps or views in all.
     pub steps: u64,
     /// The loss at this step; left out if it is not finite.
     pub loss: f64,

@@ -13,7 +13,7 @@ use train::{Backend, Job, Recipe, TrainError, TrainView};
 use crate::block::Block;
 use crate::clock::Stopwatch;
 use crate::initial_splats::InitialSplats;
-use crate::memory_budget::MemoryBudget;
+use crate::memory_budget::{MemoryBudget, memory_budget};
 use crate::merged_eval::{MergedEvaluator, evaluates_after};
 use crate::recipe::recipe_of;
 use crate::refine;
@@ -328,8 +328,7 @@ impl<'a> Progress<'a> {
     /// Sets the number of steps, and starts the memory budget from what is resident now.
     fn begin(&mut self, steps: u32) {
         self.steps = steps;
-        let memory_bytes = self.block.context.options.memory_bytes;
-        self.memory = (memory_bytes > 0).then(|| MemoryBudget::new(memory_bytes)).flatten();
+        self.memory = memory_budget(self.block.context.options.memory_bytes);
     }
 
     /// Evaluates the merged model with these splats of the block: PSNR in dB and number of splats. Does not count as training time.

@@ -61,7 +61,7 @@ impl Job {
         let Self { job, state, tasks, done, leased, ready, waiting, .. } = self;
         let failed = self.failed + self.quarantined;
         format!(
-            "{job:>5}  {state:<10} {done} of {tasks} done, {leased} being trained, {ready} ready, {waiting} waiting, {failed} failed"
+            "{job:>5}  {state:<10} {done} of {tasks} done, {leased} running, {ready} ready, {waiting} waiting, {failed} failed"
         )
     }
 }

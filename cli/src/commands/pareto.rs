@@ -44,6 +44,9 @@ struct Swept<'a> {
 
 pub(crate) fn run(args: &ParetoArgs, output: &Output) -> Result<(), Failure> {
     let lpips = args.lpips.as_deref().map(Lpips::load).transpose()?;
+    if args.sweep.train.plan.evaluate {
+        return Err(BadInput::new("--evaluate", "measures what each run is measured on anyway", "leave it").into());
+    }
     let runs = runs(args)?;
     let file = args.results.join(RUNS);
     let mut existing = if file.exists() { read(&file)? } else { Vec::new() };

@@ -6,7 +6,7 @@
 use blocks::Plan;
 use dataset::ingest::Ingested;
 use model::save_json;
-use proto::Client;
+use proto::{Client, Outcome};
 use scene::{ArtefactId, BadInput};
 use serde::Serialize;
 use telemetry::traced;
@@ -88,26 +88,38 @@ pub(crate) fn run(args: &SubmitArgs, output: &Output) -> Result<(), Failure> {
             return Err(Failure::Work(format!("stopped waiting after Ctrl-C; job {} goes on: {advice}", job.job)));
         };
         submitted.job_seconds = Some(accepted.wall_seconds());
-        result_of(job.job, outcome, &results)?;
+        let ended = result_of(job.job, outcome, &results);
+        // A model whose evaluation failed is a model.
+        let trained = results.first(plan.tasks.len()).filter(|_| outcome == Outcome::Incomplete);
         text = format!("job {} is done: {} tasks", job.job, job.tasks);
-        if let Some(out) = &args.out {
-            let results = results.all()?;
-            save_json(&out.join("plan.json"), &plan)?;
-            let (store, downscale) = (store.blocking(), args.plan.downscale);
-            let written = model::write(out, &plan, &results, &store, capture.geo_origin, downscale)?;
-            (submitted.splats, submitted.bytes) = (Some(written.splats), Some(written.bytes));
-            let about = Record {
-                scene: captures::name_of(&args.capture),
-                downscale,
-                backend: plan.backend.clone(),
-                splats: written.splats,
-                ..Record::new("eval")
-            };
-            let evaluated = eval_results::collect(&plan, &results, &store, about, out)?;
-            submitted.psnr = evaluated.and_then(|evaluated| evaluated.record.psnr);
-            let psnr = submitted.psnr.map_or(String::new(), |psnr| format!(", {psnr:.2} dB held out"));
-            let (splats, blocks, file) = (written.splats, plan.tasks.len(), out.join("merged.ply"));
-            text = format!("{splats} splats in {blocks} blocks{psnr}\n{}", file.display());
+        match &args.out {
+            None => ended?,
+            Some(out) => {
+                let (results, failed) = match (ended, trained) {
+                    (Ok(()), _) => (results.all()?, None),
+                    (Err(failure), Some(trained)) => (trained, Some(failure)),
+                    (Err(failure), None) => return Err(failure),
+                };
+                save_json(&out.join("plan.json"), &plan)?;
+                let (store, downscale) = (store.blocking(), args.plan.downscale);
+                let written = model::write(out, &plan, &results, &store, capture.geo_origin, downscale)?;
+                if let Some(failure) = failed {
+                    return Err(eval_results::model_is_kept(failure, out));
+                }
+                (submitted.splats, submitted.bytes) = (Some(written.splats), Some(written.bytes));
+                let about = Record {
+                    scene: captures::name_of(&args.capture),
+                    downscale,
+                    backend: plan.backend.clone(),
+                    splats: written.splats,
+                    ..Record::new("eval")
+                };
+                let evaluated = eval_results::collect(&plan, &results, &store, about, out)?;
+                submitted.psnr = evaluated.and_then(|evaluated| evaluated.record.psnr);
+                let psnr = submitted.psnr.map_or(String::new(), |psnr| format!(", {psnr:.2} dB held out"));
+                let (splats, blocks, file) = (written.splats, plan.tasks.len(), out.join("merged.ply"));
+                text = format!("{splats} splats in {blocks} blocks{psnr}\n{}", file.display());
+            }
         }
         submitted.wall_seconds = Some(clock.wall_seconds());
         if let Some(out) = &args.out {

@@ -7,10 +7,11 @@ use std::sync::atomic::Ordering;
 
 use bench::CurvePoint;
 use blocks::Plan;
-use coordinator::{LocalError, run_local};
+use coordinator::{LocalError, Results, run_local};
 use dataset::ingest::Ingested;
 use model::save_json;
 use proto::Access;
+use proto::watch_event::Event as Update;
 use scene::{ArtefactId, BadInput, Capture};
 use serde::Serialize;
 use store::Store;
@@ -94,8 +95,10 @@ struct Prepared {
 
 /// What the job left in its store.
 struct Finished {
-    /// Of the plan's tasks.
+    /// Of the plan's tasks, or of the training tasks if evaluation failed.
     results: Vec<ArtefactId>,
+    /// Why evaluation tasks failed.
+    evaluation_failed: Option<Failure>,
     totals: Totals,
     resumed: u32,
     settled: u32,
@@ -138,7 +141,10 @@ pub(crate) fn train(args: &TrainArgs, output: &Output) -> Result<Trained, Failur
         seed: Some(args.plan.seed),
         ..Record::new("train")
     };
-    if let Some(evaluated) = eval_results::collect(&plan, &finished.results, &store, record.clone(), &args.out)? {
+    let failed = finished.evaluation_failed;
+    if failed.is_none()
+        && let Some(evaluated) = eval_results::collect(&plan, &finished.results, &store, record.clone(), &args.out)?
+    {
         record.set_quality(&evaluated.record);
     }
     let report = Report {
@@ -155,6 +161,9 @@ pub(crate) fn train(args: &TrainArgs, output: &Output) -> Result<Trained, Failur
         predicted,
     };
     save_json(&args.out.join("report.json"), &report)?;
+    if let Some(failure) = failed {
+        return Err(eval_results::model_is_kept(failure, &args.out));
+    }
     Ok(Trained { capture, report, curve: totals.curve })
 }
 
@@ -185,8 +194,8 @@ fn prepare(args: &TrainArgs, clock: &Stopwatch, output: &Output) -> Result<Prepa
 fn train_plan(args: &TrainArgs, prepared: &Prepared, clock: Stopwatch, output: &Output) -> Result<Finished, Failure> {
     let Prepared { plan, plan_id, backend, store, .. } = prepared;
     if plan.settings.test_every > 0 && !is_evaluated(plan) {
-        let advice = if plan.settings.evaluate { "--evaluate does so" } else { "plat eval does so" };
-        output.note(format!("the model is too large to be measured during training; afterwards {advice}"));
+        let by = if plan.settings.evaluate { "tasks of the job measure" } else { "plat eval measures" };
+        output.note(format!("the model is too large to be measured during training; {by} it afterwards"));
     }
     let progress = output.progress("training", plan.tasks.iter().map(|task| u64::from(task.steps)).sum());
     let mut log = MetricsLog::create(&args.out.join("metrics.jsonl"), plan, args.workers, clock.clone(), &progress)?;
@@ -204,10 +213,10 @@ fn train_plan(args: &TrainArgs, prepared: &Prepared, clock: Stopwatch, output: &
     let trainers =
         (0..args.workers).map(|_| PlanExecutor::new(metered.blocking(), options, shared.clone(), backend.clone()));
     let trainers = trainers.map(|trainer| trainer.map(Arc::new)).collect::<Result<_, _>>().map_err(Failure::Work)?;
-    let outcome = run_job(trainers, &plan.backend, store, *plan_id, &mut log, output);
+    let outcome = run_job(trainers, plan, store, *plan_id, &mut log, output);
     let totals = log.close()?;
     drop(progress);
-    let results = outcome?;
+    let (results, evaluation_failed) = outcome?;
     let resumed = shared.resumed.load(Ordering::Relaxed);
     if resumed > 0 {
         let tasks = plan.len();
@@ -219,6 +228,7 @@ fn train_plan(args: &TrainArgs, prepared: &Prepared, clock: Stopwatch, output: &
     }
     Ok(Finished {
         results,
+        evaluation_failed,
         totals,
         resumed,
         settled: shared.settled.load(Ordering::Relaxed),
@@ -267,19 +277,21 @@ fn threads_of(args: &TrainArgs) -> u32 {
 /// Attempts of a task of a local job while its store fails, over three seconds.
 const LOCAL_STORE_ATTEMPTS: u32 = 3;
 
-/// Runs a coordinator and its workers in this process until the job ends. Ctrl-C cancels the job.
+/// Runs a coordinator and its workers in this process until the job ends. Ctrl-C cancels the job. Returns the results of all tasks; if
+/// only evaluation tasks failed, those of the training tasks and the failure.
 fn run_job(
     trainers: Vec<Arc<PlanExecutor>>,
-    backend: &str,
+    plan: &Plan,
     store: &Store,
-    plan: ArtefactId,
+    plan_id: ArtefactId,
     log: &mut MetricsLog,
     output: &Output,
-) -> Result<Vec<ArtefactId>, Failure> {
+) -> Result<(Vec<ArtefactId>, Option<Failure>), Failure> {
+    let mut seen = Results::new(plan.len() as u32);
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build();
     let runtime = runtime.map_err(|error| Failure::Work(format!("cannot start threads: {error}")))?;
     let start_worker = |coordinator_url, number: usize, shutdown| {
-        let (worker_id, backend) = (format!("local-{number}"), backend.to_owned());
+        let (worker_id, backend) = (format!("local-{number}"), plan.backend.clone());
         let access = Access::default();
         let options = worker::Options { coordinator_url, access, worker_id, backend, memory_bytes: 0 };
         worker::run(options, trainers[number].clone(), shutdown)
@@ -291,18 +303,28 @@ fn run_job(
         let mut hosting = coordinator::Options::new(store.clone());
         // A full disk is reported soon instead of retried for long. Finished tasks are kept.
         hosting.settings.infrastructure_failures_limit = LOCAL_STORE_ATTEMPTS;
-        let on_update = |update: &_| log.update(update);
-        let result = run_local(hosting, plan, trainers.len(), start_worker, on_update, stop).await;
+        let on_update = |update: &Update| {
+            if let Update::Changed(changed) = update {
+                // An unknown task ends the job with an error.
+                let _ = seen.update(changed.clone());
+            }
+            log.update(update);
+        };
+        let result = run_local(hosting, plan_id, trainers.len(), start_worker, on_update, stop).await;
         interrupted.abort();
         result
     });
-    result.map_err(|error| match error {
-        LocalError::Cancelled => Failure::Work(format!(
+    match result {
+        Ok(results) => Ok((results, None)),
+        Err(LocalError::Cancelled) => Err(Failure::Work(format!(
             "stopped by Ctrl-C; photos and finished blocks are kept in {}; the same command resumes from them",
             store.url()
-        )),
-        other => other.into(),
-    })
+        ))),
+        Err(error) => match seen.first(plan.tasks.len()) {
+            Some(trained) => Ok((trained, Some(error.into()))),
+            None => Err(error.into()),
+        },
+    }
 }
 
 /// Cancels the job at the first Ctrl-C and ends the program at the second.

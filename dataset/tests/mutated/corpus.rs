@@ -239,7 +239,7 @@ impl Corpus {
         self.plain("scalar.npy", npy::write_f32(&data, &[1.0]), &npy_codec());
 
         self.put("capture", frame::encode(ingest::CAPTURE, &source.capture, &[]), &capture_codec(), Seal::Frame, PLAIN);
-        let settings = blocks::PlanSettings { levels: Some(2), budget: 1000, ..Default::default() };
+        let settings = blocks::PlanSettings { levels: Some(2), budget: 1000, evaluate: true, ..Default::default() };
         let id = scene::ArtefactId::of(b"city");
         let plan = blocks::plan(&source.capture, id, &settings, "cpu").expect("a city can be planned");
         self.put("plan", plan.to_frame(), &plan_codec(source.capture.clone()), Seal::Frame, PLAIN);
