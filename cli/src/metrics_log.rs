@@ -1,5 +1,6 @@
 //! Writes the updates of a job to `metrics.jsonl`, shows progress, and adds up times.
 
+use std::collections::BTreeMap;
 use std::fs::File;
 use std::path::{Path, PathBuf};
 
@@ -13,7 +14,7 @@ use store::file::{SaveError, append};
 
 use crate::clock::Stopwatch;
 use crate::failure::{Failure, cannot};
-use crate::output::Progress;
+use crate::output::Stages;
 
 /// A line of `metrics.jsonl`.
 #[derive(Debug, Serialize)]
@@ -55,7 +56,7 @@ pub(crate) struct Totals {
 ///
 /// Logged times run from the start of the command: work before the job, finished tasks, and the current task, without evaluation. With
 /// several workers tasks overlap and share one CPU clock; then the times are those of the process at the update, with evaluation.
-pub(crate) struct MetricsLog<'a> {
+pub(crate) struct MetricsLog {
     path: PathBuf,
     file: File,
     /// Block and planned steps of each task.
@@ -66,24 +67,24 @@ pub(crate) struct MetricsLog<'a> {
     clock: Stopwatch,
     /// CPU and wall seconds before the job and of failed attempts.
     before: (f64, f64),
-    progress: &'a Progress,
+    progress: Stages,
     totals: Totals,
     done: usize,
-    /// Number of evaluation tasks, and how many are done.
-    evaluations: (usize, usize),
+    /// Number of held-out views that evaluation tasks measure, and how many each task has measured.
+    views: (usize, BTreeMap<usize, u64>),
     /// CPU and wall seconds when the first evaluation task began. Evaluation does not count.
     trained_at: Option<(f64, f64)>,
     failed: Option<Failure>,
 }
 
-impl<'a> MetricsLog<'a> {
+impl MetricsLog {
     /// Creates the file for the job of this plan. `clock` has run since the start of the command.
     pub(crate) fn create(
         path: &Path,
         plan: &Plan,
         workers: u32,
         clock: Stopwatch,
-        progress: &'a Progress,
+        progress: Stages,
     ) -> Result<Self, Failure> {
         Ok(Self {
             path: path.to_path_buf(),
@@ -96,7 +97,7 @@ impl<'a> MetricsLog<'a> {
             progress,
             totals: Totals::default(),
             done: 0,
-            evaluations: (plan.eval_tasks.len(), 0),
+            views: (plan.eval_tasks.iter().map(|task| task.views.len()).sum(), BTreeMap::new()),
             trained_at: None,
             failed: None,
         })
@@ -133,22 +134,25 @@ impl<'a> MetricsLog<'a> {
 
     /// Evaluation tasks begin after training.
     fn evaluation_changed(&mut self, changed: &TaskChanged) {
-        let (all, done) = &mut self.evaluations;
         match changed.state() {
             TaskState::Leased if self.trained_at.is_none() => self.trained_at = Some(self.clocks()),
-            TaskState::Done => {
-                *done += 1;
-                self.progress.note(format!("evaluation {done} of {all} done"));
-            }
             TaskState::Failed | TaskState::Quarantined => {
                 self.progress.note(format!("evaluation failed: {}", proto::one_line(&changed.message)));
             }
-            TaskState::Waiting | TaskState::Ready | TaskState::Leased => {}
+            TaskState::Waiting | TaskState::Ready | TaskState::Leased | TaskState::Done => {}
         }
     }
 
+    /// Shows how many views are measured. Evaluation is not logged: its figures are those of the finished model.
+    fn evaluation_reported(&mut self, task: usize, report: &proto::Report) {
+        let (all, measured) = &mut self.views;
+        measured.insert(task, report.step);
+        let done: u64 = measured.values().sum();
+        self.progress.at("evaluating", done, *all as u64, "");
+    }
+
     fn report(&mut self, task: usize, attempt: u32, report: &proto::Report) {
-        let Some(spent) = self.tasks.get_mut(task) else { return };
+        let Some(spent) = self.tasks.get_mut(task) else { return self.evaluation_reported(task, report) };
         if spent.attempt != attempt {
             self.before.0 += spent.cpu_seconds;
             self.before.1 += spent.wall_seconds;
@@ -181,7 +185,9 @@ impl<'a> MetricsLog<'a> {
         }
         let psnr = self.totals.last_psnr.map_or(String::new(), |psnr| format!(", {psnr:.2} dB"));
         let message = format!("block {}, {} splats{psnr}", line.task, report.splats);
-        self.progress.at(self.tasks.iter().map(|spent| spent.step).sum(), message);
+        let done = self.tasks.iter().map(|spent| spent.step).sum();
+        let all = self.planned.iter().map(|(_, steps)| u64::from(*steps)).sum();
+        self.progress.at("training", done, all, &message);
     }
 
     /// CPU and wall seconds since the start of the command.

@@ -162,6 +162,15 @@ impl Stages {
             progress.at(done, message);
         }
     }
+
+    /// Prints a line above the bar.
+    pub(crate) fn note(&self, line: impl Display) {
+        let now = self.now.lock().unwrap_or_else(PoisonError::into_inner);
+        match now.as_ref() {
+            Some((_, progress)) => progress.note(line),
+            None => self.output.note(line),
+        }
+    }
 }
 
 /// Prints text on stdout. A closed pipe (`plat … | head`) is not an error, a full disk is.

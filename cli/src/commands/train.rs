@@ -197,8 +197,8 @@ fn train_plan(args: &TrainArgs, prepared: &Prepared, clock: Stopwatch, output: &
         let by = if plan.settings.evaluate { "tasks of the job measure" } else { "plat eval measures" };
         output.note(format!("the model is too large to be measured during training; {by} it afterwards"));
     }
-    let progress = output.progress("training", plan.tasks.iter().map(|task| u64::from(task.steps)).sum());
-    let mut log = MetricsLog::create(&args.out.join("metrics.jsonl"), plan, args.workers, clock.clone(), &progress)?;
+    let metrics = args.out.join("metrics.jsonl");
+    let mut log = MetricsLog::create(&metrics, plan, args.workers, clock.clone(), output.stages())?;
     let time_limit = args.minutes.map(|minutes| time_limit_of(minutes, clock, plan, args.workers));
     let shared = Arc::new(Shared { time_limit, ..Shared::default() });
     let metered = store.metered();
@@ -215,7 +215,6 @@ fn train_plan(args: &TrainArgs, prepared: &Prepared, clock: Stopwatch, output: &
     let trainers = trainers.map(|trainer| trainer.map(Arc::new)).collect::<Result<_, _>>().map_err(Failure::Work)?;
     let outcome = run_job(trainers, plan, store, *plan_id, &mut log, output);
     let totals = log.close()?;
-    drop(progress);
     let (results, evaluation_failed) = outcome?;
     let resumed = shared.resumed.load(Ordering::Relaxed);
     if resumed > 0 {
