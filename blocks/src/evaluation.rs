@@ -11,8 +11,8 @@ const TASK_PIXELS: u64 = 8 << 20;
 /// Further pixels for each splat. A task reads the whole model, which takes as long as measuring half a pixel for each
 /// splat; so reading is at most an eighth of a task.
 const PIXELS_PER_SPLAT: u64 = 4;
-/// Results that a worker fetches at a time, each with its halo.
-const FETCHED_BLOCKS: u64 = 8;
+/// Results that a worker fetches at a time. Encoded they take less memory than as splats.
+pub const CONCURRENT_FETCHES: usize = 8;
 /// Bytes per pixel of the largest view: photo and render as floats, and the planes of SSIM and SSIMULACRA2.
 const BYTES_PER_PIXEL: u64 = 220;
 
@@ -22,7 +22,7 @@ pub(crate) fn eval_tasks(capture: &Capture, tasks: &[Task], settings: &PlanSetti
     let largest = tasks.iter().map(|task| u64::from(task.budget)).max().unwrap_or(0);
     let budget = u64::from(settings.budget);
     // The merged model, and the blocks that are being fetched while it is put together.
-    let fetched = (FETCHED_BLOCKS + 1).min(tasks.len() as u64) * (largest as f64 * HALO_AREA) as u64;
+    let fetched = (CONCURRENT_FETCHES + 1).min(tasks.len()) as u64 * (largest as f64 * HALO_AREA) as u64;
     let model = budget * (BYTES_PER_FROZEN_COLUMN * columns + BYTES_PER_FROZEN_PROJECTED)
         + fetched * BYTES_PER_FROZEN_COLUMN * columns;
     let held_out = || (capture.views.iter().enumerate()).filter(|(i, _)| Capture::is_test(*i, settings.test_every));
@@ -53,8 +53,7 @@ mod tests {
     #[test]
     fn every_held_out_view_is_measured_once() {
         let capture = street(700, 100);
-        let settings = PlanSettings { test_every: 8, ..PlanSettings::default() };
-        let settings = PlanSettings { budget: 1000, ..settings };
+        let settings = PlanSettings { test_every: 8, budget: 1000, ..PlanSettings::default() };
         let tasks = eval_tasks(&capture, &[], &settings);
         let views: Vec<u32> = tasks.iter().flat_map(|task| task.views.clone()).collect();
         assert_eq!(views, (0..700).step_by(8).collect::<Vec<u32>>());

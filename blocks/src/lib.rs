@@ -33,6 +33,7 @@ pub use budgets::initial_splats;
 pub use cost::{StepCost, trained_splats};
 pub use cut::{cut, keep_core, merge, merge_cut};
 pub use draw::draw;
+pub use evaluation::CONCURRENT_FETCHES;
 pub use ground::{Ground, Square};
 pub use lint::{Finding, Severity, lint};
 pub use lod::{Cut, context_of, sweep_of};

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use blocks::Plan;
-use eval::{ViewFigures, mean};
+use eval::ViewFigures;
 use model::save_json;
 use scene::ArtefactId;
 use store::BlockingStore;
@@ -28,17 +28,8 @@ pub(crate) fn collect(
         return Ok(None);
     }
     let views = views_of(results.get(plan.tasks.len()..).unwrap_or_default(), store)?;
-    let of = |figure: fn(&ViewFigures) -> Option<f64>| mean(views.iter().map(figure));
-    let record = Record {
-        psnr: of(|view| view.psnr),
-        cc_psnr: of(|view| view.cc_psnr),
-        ssim: of(|view| Some(view.ssim)),
-        perceptual: of(|view| view.perceptual),
-        wall_seconds: None,
-        cpu_seconds: None,
-        command: "eval",
-        ..about
-    };
+    let mut record = Record { wall_seconds: None, cpu_seconds: None, command: "eval", ..about };
+    record.set_figures(&views);
     let evaluated = Evaluated { record, sheet: None, views, cuts: Vec::new(), seams: None };
     let folder = out.join("eval");
     make_folder(&folder)?;

@@ -1,6 +1,7 @@
 //! The figures of a run: the base of `report.json`, of the object of `--json`, and of bench's result lines.
 
 use bench::{CurvePoint, ResultLine};
+use eval::{ViewFigures, mean};
 use serde::Serialize;
 
 /// The figures of a run under the names of DESIGN section 8; those that were not measured are null.
@@ -50,6 +51,14 @@ impl Record {
     /// A record of this program on this machine.
     pub(crate) fn new(command: &'static str) -> Self {
         Self { command, commit: commit(), machine: bench::machine(), ..Self::default() }
+    }
+
+    /// Sets the quality figures to the means over these views.
+    pub(crate) fn set_figures(&mut self, views: &[ViewFigures]) {
+        let of = |figure: fn(&ViewFigures) -> Option<f64>| mean(views.iter().map(figure));
+        (self.psnr, self.cc_psnr) = (of(|view| view.psnr), of(|view| view.cc_psnr));
+        (self.ssim, self.perceptual) = (of(|view| Some(view.ssim)), of(|view| view.perceptual));
+        self.lpips = of(|view| view.lpips);
     }
 
     /// Copies the quality figures from an evaluation of the model.

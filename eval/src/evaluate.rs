@@ -10,7 +10,7 @@ use train::Backend;
 
 use crate::cuts::{CutFigures, CutMeter};
 use crate::details::Details;
-use crate::figures::{Comparison, ViewFigures, clamped, mean};
+use crate::figures::{Comparison, ViewFigures, clamped};
 use crate::images::{colour_image, photo_image, write_png};
 use crate::seams::{SeamFrames, SeamMeter, SeamReport};
 use crate::sheet::{SheetRow, contact_sheet};
@@ -53,13 +53,6 @@ pub struct Evaluation {
     pub cuts: Vec<CutFigures>,
     /// Figures near the seams.
     pub seams: Option<SeamReport>,
-}
-
-impl Evaluation {
-    /// Mean of one figure over the views that have it.
-    pub fn mean(&self, figure: impl Fn(&ViewFigures) -> Option<f64>) -> Option<f64> {
-        mean(self.views.iter().map(figure))
-    }
 }
 
 /// Renders every held-out view once and measures it; writes the contact sheet `sheet.png` and, with seams, their pictures.

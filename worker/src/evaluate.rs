@@ -12,22 +12,27 @@ use crate::clock::Stopwatch;
 use crate::memory_budget::MemoryBudget;
 use crate::task::{ExecuteError, Flow, Report};
 
+/// A merged model, and the held-out views that a task measures it on.
+pub(crate) struct Evaluation<'a> {
+    pub(crate) plan: &'a Plan,
+    pub(crate) task: &'a EvalTask,
+    pub(crate) model: &'a Splats,
+    pub(crate) reader: &'a WindowReader,
+    pub(crate) backend: &'a Backend,
+}
+
 /// The figures of the task's views. Equal models and photos give equal figures, as `plat eval` does.
 ///
 /// # Errors
 /// Photos that cannot be read, a renderer that fails, memory above the budget, or a report that was answered with
 /// [`Flow::Stop`].
-#[allow(clippy::too_many_arguments, reason = "each is used once; a struct would only repeat their names")]
 pub(crate) fn evaluate(
-    plan: &Plan,
-    task: &EvalTask,
-    model: &Splats,
-    reader: &WindowReader,
-    backend: &Backend,
+    evaluation: &Evaluation,
     mut memory: Option<MemoryBudget>,
     stopwatch: &Stopwatch,
     report: &mut (dyn FnMut(Report) -> Flow + Send),
 ) -> Result<Vec<ViewFigures>, ExecuteError> {
+    let Evaluation { plan, task, model, reader, backend } = evaluation;
     let options =
         Options { antialiased: plan.settings.antialiased, sh_degree: model.sh_degree(), ..Options::default() };
     let steps = task.views.len() as u64;

@@ -12,7 +12,7 @@ use std::collections::BTreeMap;
 use std::sync::atomic::Ordering;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use blocks::{EvalTask, Plan, PlannedTask, Task};
+use blocks::{CONCURRENT_FETCHES, EvalTask, Plan, PlannedTask, Task};
 use bytes::Bytes;
 use dataset::byte_lru::ByteLru;
 use dataset::ingest::IngestError;
@@ -24,7 +24,7 @@ use train::Backend;
 
 use crate::block::Block;
 use crate::clock::Stopwatch;
-use crate::evaluate::evaluate;
+use crate::evaluate::{Evaluation, evaluate};
 use crate::memory_budget::memory_budget;
 use crate::merged_eval::{MergedEvaluator, evaluates_after};
 use crate::recompute::recompute;
@@ -35,8 +35,6 @@ use crate::trainer_context::{Shared, TrainerContext, TrainerOptions};
 
 /// With a remote store, task results and photo tiles each take this fraction of the cache: 1/4.
 const REMOTE_CACHE_FRACTION: usize = 4;
-/// Results that are fetched concurrently. Encoded they take less memory than as splats.
-const CONCURRENT_FETCHES: usize = 8;
 
 /// Carries out the tasks of plans on one backend.
 pub struct PlanExecutor {
@@ -217,8 +215,8 @@ impl PlanExecutor {
         let figures = self.pool.install(|| {
             span.in_scope(|| {
                 let model = blocks::merge(parts);
-                let budget = memory_budget(options.memory_bytes);
-                evaluate(plan, task, &model, &reader, backend, budget, stopwatch, report)
+                let evaluation = Evaluation { plan, task, model: &model, reader: &reader, backend };
+                evaluate(&evaluation, memory_budget(options.memory_bytes), stopwatch, report)
             })
         });
         shared.metrics.count_reads(reader.stats());

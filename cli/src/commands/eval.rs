@@ -70,22 +70,18 @@ pub(crate) fn measure_trained(
 fn evaluated(request: &Request, output: &Output) -> Result<Evaluated, Failure> {
     let evaluation = eval::evaluate(request, &OutputObserver::new(output))?;
     let seconds = evaluation.render_seconds;
-    let record = Record {
+    let mut record = Record {
         backend: evaluation.backend.clone(),
         workers: 1,
         threads: rayon::current_num_threads() as u32,
         wall_seconds: Some(seconds.wall),
         cpu_seconds: Some(seconds.cpu),
-        psnr: evaluation.mean(|view| view.psnr),
-        cc_psnr: evaluation.mean(|view| view.cc_psnr),
-        ssim: evaluation.mean(|view| Some(view.ssim)),
-        perceptual: evaluation.mean(|view| view.perceptual),
-        lpips: evaluation.mean(|view| view.lpips),
         splats: request.model.splats.len() as u64,
         fps: Some(evaluation.views.len() as f64 / seconds.wall.max(1e-9)),
         peak_memory_bytes: clock::peak_memory_bytes(),
         ..Record::new("eval")
     };
+    record.set_figures(&evaluation.views);
     let Evaluation { views, sheet, cuts, seams, .. } = evaluation;
     Ok(Evaluated { record, sheet: Some(sheet), views, cuts, seams })
 }

@@ -3,12 +3,16 @@
 //! With `--wait` it follows the job to its end. With `--out` it also writes the model, with the bytes that `plat train` gives for the
 //! same plan.
 
+use std::path::Path;
+
 use blocks::Plan;
+use coordinator::Results;
 use dataset::ingest::Ingested;
 use model::save_json;
 use proto::{Client, Outcome};
-use scene::{ArtefactId, BadInput};
+use scene::{ArtefactId, BadInput, GeoOrigin};
 use serde::Serialize;
+use store::BlockingStore;
 use telemetry::traced;
 use tracing::field::Empty;
 
@@ -88,37 +92,12 @@ pub(crate) fn run(args: &SubmitArgs, output: &Output) -> Result<(), Failure> {
             return Err(Failure::Work(format!("stopped waiting after Ctrl-C; job {} goes on: {advice}", job.job)));
         };
         submitted.job_seconds = Some(accepted.wall_seconds());
-        let ended = result_of(job.job, outcome, &results);
-        // A model whose evaluation failed is a model.
-        let trained = results.first(plan.tasks.len()).filter(|_| outcome == Outcome::Incomplete);
         text = format!("job {} is done: {} tasks", job.job, job.tasks);
         match &args.out {
-            None => ended?,
+            None => result_of(job.job, outcome, &results)?,
             Some(out) => {
-                let (results, failed) = match (ended, trained) {
-                    (Ok(()), _) => (results.all()?, None),
-                    (Err(failure), Some(trained)) => (trained, Some(failure)),
-                    (Err(failure), None) => return Err(failure),
-                };
-                save_json(&out.join("plan.json"), &plan)?;
-                let (store, downscale) = (store.blocking(), args.plan.downscale);
-                let written = model::write(out, &plan, &results, &store, capture.geo_origin, downscale)?;
-                if let Some(failure) = failed {
-                    return Err(eval_results::model_is_kept(failure, out));
-                }
-                (submitted.splats, submitted.bytes) = (Some(written.splats), Some(written.bytes));
-                let about = Record {
-                    scene: captures::name_of(&args.capture),
-                    downscale,
-                    backend: plan.backend.clone(),
-                    splats: written.splats,
-                    ..Record::new("eval")
-                };
-                let evaluated = eval_results::collect(&plan, &results, &store, about, out)?;
-                submitted.psnr = evaluated.and_then(|evaluated| evaluated.record.psnr);
-                let psnr = submitted.psnr.map_or(String::new(), |psnr| format!(", {psnr:.2} dB held out"));
-                let (splats, blocks, file) = (written.splats, plan.tasks.len(), out.join("merged.ply"));
-                text = format!("{splats} splats in {blocks} blocks{psnr}\n{}", file.display());
+                let finished = Finished { args, plan: &plan, store: &store.blocking(), geo_origin: capture.geo_origin };
+                text = finished.write(out, (outcome, &results), &mut submitted)?;
             }
         }
         submitted.wall_seconds = Some(clock.wall_seconds());
@@ -127,6 +106,47 @@ pub(crate) fn run(args: &SubmitArgs, output: &Output) -> Result<(), Failure> {
         }
     }
     output.result(&submitted, &text)
+}
+
+/// A job that has ended, whose model is to be written.
+struct Finished<'a> {
+    args: &'a SubmitArgs,
+    plan: &'a Plan,
+    store: &'a BlockingStore,
+    geo_origin: Option<GeoOrigin>,
+}
+
+impl Finished<'_> {
+    /// Writes plan, model and figures under `out`; returns what to print. A model whose evaluation failed is written before the failure
+    /// is returned.
+    fn write(
+        &self,
+        out: &Path,
+        (outcome, results): (Outcome, &Results),
+        submitted: &mut Submitted,
+    ) -> Result<String, Failure> {
+        let Self { args, plan, store, geo_origin } = *self;
+        let trained = results.first(plan.tasks.len()).filter(|_| outcome == Outcome::Incomplete);
+        let (results, failed) = match (result_of(submitted.job, outcome, results), trained) {
+            (Ok(()), _) => (results.all()?, None),
+            (Err(failure), Some(trained)) => (trained, Some(failure)),
+            (Err(failure), None) => return Err(failure),
+        };
+        save_json(&out.join("plan.json"), plan)?;
+        let downscale = args.plan.downscale;
+        let written = model::write(out, plan, &results, store, geo_origin, downscale)?;
+        if let Some(failure) = failed {
+            return Err(eval_results::model_is_kept(failure, out));
+        }
+        (submitted.splats, submitted.bytes) = (Some(written.splats), Some(written.bytes));
+        let (scene, backend) = (captures::name_of(&args.capture), plan.backend.clone());
+        let about = Record { scene, downscale, backend, splats: written.splats, ..Record::new("eval") };
+        let evaluated = eval_results::collect(plan, &results, store, about, out)?;
+        submitted.psnr = evaluated.and_then(|evaluated| evaluated.record.psnr);
+        let psnr = submitted.psnr.map_or(String::new(), |psnr| format!(", {psnr:.2} dB held out"));
+        let (splats, blocks, file) = (written.splats, plan.tasks.len(), out.join("merged.ply"));
+        Ok(format!("{splats} splats in {blocks} blocks{psnr}\n{}", file.display()))
+    }
 }
 
 /// The backend for the plan: of those that fit `--backend`, the one that most workers have. Without a worker it is this machine's CPU;
