@@ -8,8 +8,8 @@ use crate::plan::{EvalTask, MAX_EVAL_TASKS, PlanSettings, Task};
 
 /// Least pixels of the views of one task, about. Larger tasks would leave workers without work.
 const TASK_PIXELS: u64 = 8 << 20;
-/// Further pixels for each splat. A task reads the whole model, which takes as long as measuring half a pixel for each
-/// splat; so reading is at most an eighth of a task.
+/// Further pixels for each splat. A task reads the whole model, which takes as long as measuring two thirds of a pixel for
+/// each splat (docs/decisions/0055); so reading is at most a seventh of a task.
 const PIXELS_PER_SPLAT: u64 = 4;
 /// Results that a worker fetches at a time. Encoded they take less memory than as splats.
 pub const CONCURRENT_FETCHES: usize = 8;
