@@ -37,7 +37,7 @@ pub(crate) fn look_at(eye: DVec3, target: DVec3, up: DVec3) -> Camera {
 /// A capture of these cameras and points. With `tracks`, each point has a track of all views it projects into.
 pub(crate) fn capture(cameras: &[Camera], positions: Vec<DVec3>, tracks: bool) -> Capture {
     let views: Vec<View> = (cameras.iter().enumerate())
-        .map(|(i, &camera)| View { name: format!("{i:05}.jpg"), camera, mips: Vec::new(), masked: false })
+        .map(|(i, &camera)| View { name: format!("{i:05}.jpg"), camera, mips: Vec::new(), masked: false, depth: None })
         .collect();
     let mut points = SparsePoints { colours: vec![[120, 90, 60]; positions.len()], positions, ..Default::default() };
     if tracks {

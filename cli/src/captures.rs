@@ -10,6 +10,7 @@ use model::Model;
 use scene::{BadInput, Camera, Capture, Pinhole};
 use store::BlockingStore;
 
+use crate::args::PlanOptions;
 use crate::failure::Failure;
 use crate::observer::OutputObserver;
 use crate::output::Output;
@@ -17,9 +18,18 @@ use crate::output::Output;
 /// Names of unused images that are printed.
 const MAX_LEFT_OUT: usize = 3;
 
-/// Opens a capture and notes the images that are left out.
+/// Opens a capture's photos and cameras, and notes the images that are left out.
 pub(crate) fn open(path: &Path, output: &Output) -> Result<Source, BadInput> {
-    let source = dataset::open::open(path, &OpenOptions::default())?;
+    open_with(path, &OpenOptions::default(), output)
+}
+
+/// Opens a capture to plan it with these options: also its lidar, from which initial points and target depths come.
+pub(crate) fn open_to_plan(path: &Path, options: &PlanOptions, output: &Output) -> Result<Source, BadInput> {
+    open_with(path, &OpenOptions { lidar: !options.no_lidar, ..OpenOptions::default() }, output)
+}
+
+fn open_with(path: &Path, options: &OpenOptions, output: &Output) -> Result<Source, BadInput> {
+    let source = dataset::open::open(path, options)?;
     for (name, reason) in source.left_out.iter().take(MAX_LEFT_OUT) {
         output.note(format!("left out {name}: {reason}"));
     }

@@ -1,6 +1,7 @@
 //! Plans a capture, checks the plan, and describes it.
 
 use blocks::{Plan, Severity};
+use dataset::open::Source;
 use scene::{ArtefactId, BadInput, Capture, frame};
 use worker::estimate::Estimate;
 use worker::speed::relative_speed;
@@ -11,14 +12,15 @@ use crate::failure::Failure;
 use crate::output::Output;
 
 /// Plans an opened capture for the CPU; returns the capture at the size that it was planned for.
-pub(crate) fn plan_of(capture: &Capture, options: &PlanOptions) -> Result<(Capture, Plan), Failure> {
-    let capture = captures::shrunk(capture, options.downscale)?;
+pub(crate) fn plan_of(source: &Source, options: &PlanOptions) -> Result<(Capture, Plan), Failure> {
+    let capture = captures::shrunk(&source.capture, options.downscale)?;
     let id = ArtefactId::of(&frame::encode(dataset::ingest::CAPTURE, &capture, &[]));
-    if options.depth_weight > 0.0 && capture.points.seen_by.is_empty() {
-        let problem = "the capture does not say which photos observed its sparse points, so it has no target depths";
+    let settings = options.settings(&capture, source.is_measured());
+    if settings.depth_weight > 0.0 && !source.is_measured() && capture.points.seen_by.is_empty() {
+        let problem = "the capture has no lidar, and does not say which photos observed its sparse points: there are no \
+                       target depths";
         return Err(BadInput::new("--depth-weight", problem, "leave it").into());
     }
-    let settings = options.settings(&capture);
     let plan = blocks::plan(&capture, id, &settings, &train::Backend::Cpu.name())?;
     Ok((capture, plan))
 }

@@ -5,6 +5,8 @@
 //! resumes. A thread holds one photo at a time: peak memory depends on the size of photos and the number of threads, not on the
 //! number of photos.
 
+mod depths;
+
 use std::fs::File;
 use std::io::Read;
 use std::path::Path;
@@ -16,13 +18,14 @@ use scene::{ArtefactId, BadInput, Camera, CameraModel, Capture, Pinhole, Pixels,
 use serde::{Deserialize, Serialize};
 use store::{BlockingStore, StoreError};
 
+use self::depths::Lidar;
 use crate::open::{Photo, Source};
 use crate::photo::DecodedPhoto;
 use crate::undistortion::Undistorter;
 use crate::{mip_tiles, mips, photo};
 
 /// An ingested capture in the store.
-pub const CAPTURE: Kind = Kind(*b"capt", 1);
+pub const CAPTURE: Kind = Kind(*b"capt", 2);
 /// The ingest record of a photo.
 const RECORD: Kind = Kind(*b"memo", 1);
 /// Part of the hash of a photo. Raise it with each change of decoding, undistortion, downscaling, mips or their format.
@@ -46,6 +49,8 @@ pub struct Ingested {
     pub id: ArtefactId,
     /// Number of photos decoded; the others had an ingest record.
     pub decoded: usize,
+    /// Number of depths that lidar or depth maps measured, in all views.
+    pub depth_samples: usize,
 }
 
 /// Why an ingest stopped.
@@ -77,36 +82,59 @@ pub fn ingest(
     if photos.len() != source.capture.views.len() {
         return Err(BadInput::new("the capture", "does not have one photo per view", "open it again").into());
     }
-    let job = Job { store, downscale: options.downscale, next: AtomicUsize::new(0), failed: AtomicBool::new(false) };
+    let job = Job { store, downscale: options.downscale };
     let done = Mutex::new(0);
-    let run = || {
-        let (mut views, mut undistorter) = (Vec::new(), None);
-        while let Some(i) = job.take(photos.len()) {
-            let view = job.view(&source.capture.views[i], &photos[i], &mut undistorter);
-            job.failed.fetch_or(view.is_err(), Ordering::Relaxed);
-            views.push((i, view));
-            let mut done = done.lock().unwrap_or_else(PoisonError::into_inner);
-            *done += 1;
-            progress(*done, photos.len());
-        }
-        views
-    };
-    let mut views = std::thread::scope(|scope| {
-        let threads: Vec<_> = (1..options.threads.min(photos.len())).map(|_| scope.spawn(run)).collect();
-        let mut views = run();
-        for thread in threads {
-            views.extend(thread.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)));
-        }
-        views
-    });
-    // Threads take photos in order, so the first photo that cannot be used is among those taken, whichever thread fails first.
-    views.sort_by_key(|(i, _)| *i);
-    let views: Vec<(View, bool)> = views.into_iter().map(|(_, view)| view).collect::<Result<_, _>>()?;
+    let views = in_threads(options.threads, photos.len(), |i, undistorter| {
+        let view = job.view(&source.capture.views[i], &photos[i], undistorter)?;
+        let mut done = done.lock().unwrap_or_else(PoisonError::into_inner);
+        *done += 1;
+        progress(*done, photos.len());
+        Ok::<_, IngestError>(view)
+    })?;
     let decoded = views.iter().filter(|(_, decoded)| *decoded).count();
     let views = views.into_iter().map(|(view, _)| view).collect();
-    let capture = Capture { views, points: source.capture.points.clone(), geo_origin: source.capture.geo_origin };
+    let mut capture = Capture { views, points: source.capture.points.clone(), geo_origin: source.capture.geo_origin };
+    let lidar = Lidar::new(source);
+    let concerned: Vec<usize> = (0..photos.len()).filter(|&view| lidar.concerns(view)).collect();
+    let measured = in_threads(options.threads, concerned.len(), |i, _: &mut ()| {
+        let view = concerned[i];
+        Ok::<_, IngestError>((view, lidar.measure(&capture, view, store)?))
+    })?;
+    let depth_samples = depths::enter(&mut capture, measured);
     let id = store.put(frame::encode(CAPTURE, &capture, &[]))?;
-    Ok(Ingested { capture, id, decoded })
+    Ok(Ingested { capture, id, decoded, depth_samples })
+}
+
+/// The results of `work` for 0 to `count` in order, computed by this many threads, each of which keeps a state.
+///
+/// # Errors
+/// The first one, by number. Threads take numbers in order, so it is among those taken, whichever thread fails first.
+fn in_threads<S: Default, T: Send, E: Send>(
+    threads: usize,
+    count: usize,
+    work: impl Fn(usize, &mut S) -> Result<T, E> + Sync,
+) -> Result<Vec<T>, E> {
+    let (next, failed) = (AtomicUsize::new(0), AtomicBool::new(false));
+    let take = || (!failed.load(Ordering::Relaxed)).then(|| next.fetch_add(1, Ordering::Relaxed));
+    let run = || {
+        let (mut results, mut state) = (Vec::new(), S::default());
+        while let Some(i) = take().filter(|&i| i < count) {
+            let result = work(i, &mut state);
+            failed.fetch_or(result.is_err(), Ordering::Relaxed);
+            results.push((i, result));
+        }
+        results
+    };
+    let mut results = std::thread::scope(|scope| {
+        let threads: Vec<_> = (1..threads.min(count)).map(|_| scope.spawn(run)).collect();
+        let mut results = run();
+        for thread in threads {
+            results.extend(thread.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)));
+        }
+        results
+    });
+    results.sort_by_key(|(i, _)| *i);
+    results.into_iter().map(|(_, result)| result).collect()
 }
 
 /// Loads an ingested capture.
@@ -125,8 +153,6 @@ pub fn load_capture(store: &BlockingStore, id: ArtefactId) -> Result<Capture, In
 struct Job<'a> {
     store: &'a BlockingStore,
     downscale: u32,
-    next: AtomicUsize,
-    failed: AtomicBool,
 }
 
 /// The undistorter of the last photo, by lens and size. Consecutive photos mostly share a lens.
@@ -141,13 +167,6 @@ struct IngestRecord {
 }
 
 impl Job<'_> {
-    fn take(&self, count: usize) -> Option<usize> {
-        if self.failed.load(Ordering::Relaxed) {
-            return None;
-        }
-        Some(self.next.fetch_add(1, Ordering::Relaxed)).filter(|&i| i < count)
-    }
-
     /// The view with its mips, and whether its photo was decoded.
     fn view(
         &self,
@@ -195,6 +214,7 @@ impl Job<'_> {
                 camera,
                 mips: record.mips.iter().map(|(id, _)| *id).collect(),
                 masked: record.masked,
+                depth: None,
             },
             decoded,
         ))

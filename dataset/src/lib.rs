@@ -5,7 +5,9 @@
 //! ids; crates above it do not know the files or the lenses of photos.
 
 pub mod byte_lru;
+pub mod depth_samples;
 pub mod ingest;
+pub mod lidar;
 pub mod mip_tiles;
 pub mod mips;
 pub mod open;

@@ -11,6 +11,7 @@ mod colmap;
 mod files;
 mod frustum_points;
 mod kitti360;
+mod lidar;
 mod masks;
 mod opensfm;
 mod parsed;
@@ -26,6 +27,8 @@ use scene::{BadInput, Camera, CameraModel, Capture, GeoOrigin, Pinhole, View};
 use self::files::{CaptureRoot, Found};
 pub use self::parsed::OpenOptions;
 use self::parsed::{ParsedCapture, PosedImage};
+use crate::lidar::Sweep;
+use crate::lidar::seeds::{Seeds, seeds};
 use crate::undistortion;
 
 /// The file behind a view.
@@ -55,6 +58,17 @@ pub struct Source {
     /// `colmap`, `transforms`, `opensfm` or `kitti360`, followed by ` without points` if its points were sampled from the
     /// overlap of its views.
     pub format: &'static str,
+    /// Lidar sweeps. The last [`seeds`](Self::seeds) points of the capture come from them.
+    pub sweeps: Vec<Sweep>,
+    /// For each of the points that come from lidar, the view that colours it.
+    pub seeds: Vec<u32>,
+}
+
+impl Source {
+    /// Whether lidar measured depths of its views.
+    pub fn is_measured(&self) -> bool {
+        self.sweeps.iter().any(|sweep| !sweep.views.is_empty())
+    }
 }
 
 /// Opens a capture: a folder, or the path of a `transforms.json` or `reconstruction.json`.
@@ -68,8 +82,11 @@ pub fn open(path: &Path, options: &OpenOptions) -> Result<Source, BadInput> {
     left_out.extend(unused);
     let views = views(&images, &photos)?;
     let mut points = points.with_view_indices(images.iter().map(|image| image.id));
+    let cameras: Vec<Camera> = views.iter().map(|view| view.camera).collect();
+    let sweeps = if options.lidar { lidar::find(&root, &views)? } else { Vec::new() };
+    let Seeds { points: measured, best_view: seeds } = seeds(&sweeps, &cameras, points.len())?;
+    points.append(measured);
     if points.is_empty() && !options.cameras_only {
-        let cameras: Vec<Camera> = views.iter().map(|view| view.camera).collect();
         points = frustum_points::sample(&cameras).ok_or_else(|| {
             let advice = "run structure from motion that writes points, as training starts from them";
             BadInput::new(files::show(path), "has no sparse points, and its views do not overlap", advice)
@@ -82,7 +99,7 @@ pub fn open(path: &Path, options: &OpenOptions) -> Result<Source, BadInput> {
         };
     }
     let capture = Capture { views, points, geo_origin: geo_origin(&root)?.or(origin) };
-    Ok(Source { capture, photos, left_out, format })
+    Ok(Source { capture, photos, left_out, format, sweeps, seeds })
 }
 
 /// Detects the format of a capture and parses it.
@@ -218,7 +235,7 @@ fn views(images: &[PosedImage], photos: &[Photo]) -> Result<Vec<View>, BadInput>
             BadInput::new(files::show(&photo.path), problem, "check the parameters of its camera")
         })?;
         let camera = Camera { pinhole, camera_from_world: image.camera_from_world };
-        Ok(View { name: image.name.clone(), camera, mips: Vec::new(), masked: photo.mask.is_some() })
+        Ok(View { name: image.name.clone(), camera, mips: Vec::new(), masked: photo.mask.is_some(), depth: None })
     };
     images.iter().zip(photos).map(view).collect()
 }

@@ -7,6 +7,7 @@
 
 mod locks;
 mod sparse_depth;
+mod target_depth;
 mod tile_cache;
 
 use std::collections::HashSet;
@@ -20,7 +21,7 @@ use scene::{Capture, CodecError, Pixels, Rect};
 use store::{BlockingStore, StoreError};
 
 use self::locks::lock;
-use self::sparse_depth::SparseDepth;
+use self::target_depth::{DepthError, TargetDepth};
 pub use self::tile_cache::SharedTileCache;
 use crate::byte_lru::ByteLru;
 use crate::mip_tiles::MipLayout;
@@ -117,17 +118,17 @@ impl WindowReader {
         Self { shared: Arc::new(shared), prefetch_queue: OnceLock::new() }
     }
 
-    /// A new reader like this one whose windows carry target depths: those of the capture's sparse points whose track
-    /// contains the view. A capture without tracks gives none.
+    /// A new reader like this one whose windows carry target depths: those measured by lidar or depth maps, and those of the
+    /// sparse points whose track contains the view.
     #[must_use]
-    pub fn with_sparse_depth(self) -> Self {
+    pub fn with_depth(self) -> Self {
         let Shared { capture, store, tiles, cache, .. } = &*self.shared;
         let windows = ByteLru::new(lock(cache).windows.limit());
         let shared = Shared {
             capture: Arc::clone(capture),
             store: store.clone(),
             tiles: Arc::clone(tiles),
-            depth: Some(SparseDepth::new(capture)),
+            depth: Some(TargetDepth::new(capture)),
             cache: Mutex::new(WindowCache { windows, pending: HashSet::new() }),
             finished: Condvar::new(),
             counters: Counters::default(),
@@ -220,7 +221,7 @@ struct Shared {
     store: BlockingStore,
     tiles: Arc<SharedTileCache>,
     /// Where windows carry target depths.
-    depth: Option<SparseDepth>,
+    depth: Option<TargetDepth>,
     cache: Mutex<WindowCache>,
     /// Notified when a prefetch ends, with or without an error.
     finished: Condvar,
@@ -278,7 +279,13 @@ impl Shared {
         }
         let tiles: Vec<Bytes> = tiles.into_iter().flatten().collect();
         let mut pixels = index.window(rect, &tiles).map_err(damaged)?;
-        pixels.depth = self.depth.as_ref().and_then(|depth| depth.plane(&self.capture, number, mip, rect));
+        if let Some(depth) = &self.depth {
+            let error = |error| match error {
+                DepthError::Damaged(error) => WindowError::Damaged { name: name(), mip, error },
+                DepthError::Store(error) => WindowError::Store { name: name(), mip, error },
+            };
+            pixels.depth = depth.plane(&self.capture, &self.store, number, mip, rect).map_err(error)?;
+        }
         self.tiles.insert_tiles((number, mip), missing.into_iter().map(|i| (ranges[i].start, tiles[i].clone())));
         Ok(Arc::new(pixels))
     }

@@ -29,6 +29,8 @@ pub struct View {
     pub mips: Vec<ArtefactId>,
     /// True if the view has a mask. Its mips then have a fourth channel: 255 = use, 0 = leave out.
     pub masked: bool,
+    /// Artefact of the depths that lidar or depth maps measured in this view, if any. `None` before ingest.
+    pub depth: Option<ArtefactId>,
 }
 
 /// Structure-from-motion points and their tracks.
@@ -60,6 +62,39 @@ impl SparsePoints {
     pub fn track(&self, i: usize) -> Option<&[u32]> {
         let (from, to) = (*self.track_start.get(i)?, *self.track_start.get(i + 1)?);
         self.seen_by.get(from as usize..to as usize)
+    }
+
+    /// Appends points. They keep their tracks only if the present points have tracks, or there are none: readers take
+    /// points without a track beside points with one as seen by no view.
+    pub fn append(&mut self, other: Self) {
+        let is_tracked = (self.is_empty() || !self.track_start.is_empty()) && !other.track_start.is_empty();
+        if is_tracked {
+            let start = self.seen_by.len() as u32;
+            let first = self.track_start.is_empty().then_some(0);
+            self.track_start.extend(first.into_iter().chain(other.track_start[1..].iter().map(|end| start + end)));
+            self.seen_by.extend(other.seen_by);
+        } else if !other.is_empty() {
+            (self.track_start, self.seen_by) = (Vec::new(), Vec::new());
+        }
+        self.positions.extend(other.positions);
+        self.colours.extend(other.colours);
+    }
+
+    /// The points for which `keep` holds, with their tracks.
+    pub fn filter(&self, keep: impl Fn(usize) -> bool) -> Self {
+        let mut kept = Self::default();
+        if !self.track_start.is_empty() {
+            kept.track_start.push(0);
+        }
+        for i in (0..self.len()).filter(|&i| keep(i)) {
+            kept.positions.push(self.positions[i]);
+            kept.colours.push(self.colours[i]);
+            if let Some(track) = self.track(i) {
+                kept.seen_by.extend_from_slice(track);
+                kept.track_start.push(kept.seen_by.len() as u32);
+            }
+        }
+        kept
     }
 }
 
@@ -126,7 +161,7 @@ mod tests {
     fn invalid_captures_are_refused() {
         let pinhole = Pinhole { width: 4, height: 3, fx: 5.0, fy: 5.0, cx: 2.0, cy: 1.5 };
         let camera = Camera { pinhole, camera_from_world: Rigid::IDENTITY };
-        let view = View { name: "a.png".into(), camera, mips: Vec::new(), masked: false };
+        let view = View { name: "a.png".into(), camera, mips: Vec::new(), masked: false, depth: None };
         let points = SparsePoints {
             positions: vec![DVec3::ZERO, DVec3::ONE],
             colours: vec![[1, 2, 3]; 2],

@@ -15,6 +15,7 @@ pub mod frame;
 pub mod ids;
 pub mod image;
 pub mod kitti360;
+pub mod lidar;
 pub mod npy;
 pub mod opensfm;
 pub mod ply;

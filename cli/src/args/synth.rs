@@ -115,7 +115,7 @@ with --lidar, for every place NAME (street-LEG-NUMBER) where a photo of the car 
   lidar/NAME.label       uint32 (SemanticKITTI): class, and the lower 16 bits of the instance << 16
   lidar/NAME.npy         float64 x 7, ground truth of each point: world position, range, intensity, seconds since the
                          middle of the turn, 1 if it was seen through glass
-  lidar/poses.jsonl      time and pose of each turn
+  lidar/poses.jsonl      each turn: time, pose, motion, and the photos taken during it; plat train reads it
 with --radar: radar/NAME.csv (readings, then their ground truth), radar/poses.jsonl
 with --mesh:  city.glb   glTF 2: a node for each actor (class, instance), a mesh for each asset, materials without patterns
 with --occupancy: occupancy/X_Y.npz for each block: semantic (uint8, 255 free) and instance (uint32) by z, y, x;

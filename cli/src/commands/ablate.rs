@@ -55,7 +55,7 @@ pub(crate) fn run(args: &AblateArgs, output: &Output) -> Result<(), Failure> {
     let source = captures::open(&args.capture, output)?;
     let folder = temporary_folder()?;
     let store = Store::open(&folder.path().display().to_string())?.blocking();
-    let (planned_for, plan) = plan_of(&source.capture, &plan_options(args, 0))?;
+    let (planned_for, plan) = plan_of(&source, &plan_options(args, 0))?;
     check_plan(&plan, &planned_for, output)?;
     let capture = Arc::new(ingest_photos(&source, &store, args.downscale, output)?.capture);
     let mut lines: Vec<Ablation> = Vec::new();
@@ -69,7 +69,7 @@ pub(crate) fn run(args: &AblateArgs, output: &Output) -> Result<(), Failure> {
     // With --to-gain the targets depend on the last run.
     let targets_are_known = !args.to.is_empty() && args.to_gain.is_none();
     for &seed in &args.seeds {
-        let (_, plan) = plan_of(&source.capture, &plan_options(args, seed))?;
+        let (_, plan) = plan_of(&source, &plan_options(args, seed))?;
         let training = OneBlockTraining {
             plan: &plan,
             capture: capture.clone(),
@@ -136,7 +136,8 @@ fn plan_options(args: &AblateArgs, seed: u64) -> PlanOptions {
         antialiased: false,
         exposure: false,
         label_blocks: false,
-        depth_weight: 0.0,
+        depth_weight: Auto(Some(0.0)),
+        no_lidar: true,
         evaluate: false,
         downscale: args.downscale,
     }

@@ -1,6 +1,6 @@
 //! `plat inspect`: what is in a capture, how it would be divided, and what training it would cost.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use blocks::Plan;
 use scene::{Capture, GeoOrigin};
@@ -26,6 +26,12 @@ struct Inspected {
     points: usize,
     /// Mean number of views per point; null without tracks.
     mean_track: Option<f64>,
+    /// Sweeps of the capture's lidar.
+    sweeps: usize,
+    /// Views taken during a sweep.
+    views_with_lidar: usize,
+    /// How many of the points come from lidar.
+    lidar_points: usize,
     left_out: Vec<(String, String)>,
     /// Along the ground's axes and up, 1st to 99th percentile of the points.
     extent_metres: [f64; 3],
@@ -38,8 +44,8 @@ struct Inspected {
 }
 
 pub(crate) fn run(args: &InspectArgs, output: &Output) -> Result<(), Failure> {
-    let source = captures::open(&args.capture, &Output::silent())?;
-    let planned = plan_of(&source.capture, &args.plan);
+    let source = captures::open_to_plan(&args.capture, &args.plan, &Output::silent())?;
+    let planned = plan_of(&source, &args.plan);
     let planned = planned.and_then(|(capture, plan)| {
         check_plan(&plan, &capture, output)?;
         Ok(plan)
@@ -62,6 +68,9 @@ pub(crate) fn run(args: &InspectArgs, output: &Output) -> Result<(), Failure> {
         masked: source.photos.iter().filter(|photo| photo.mask.is_some()).count(),
         points: points.len(),
         mean_track,
+        sweeps: source.sweeps.len(),
+        views_with_lidar: source.sweeps.iter().flat_map(|sweep| &sweep.views).collect::<BTreeSet<_>>().len(),
+        lidar_points: source.seeds.len(),
         left_out: source.left_out,
         extent_metres: extent_metres(capture),
         geo_origin: capture.geo_origin,
@@ -85,6 +94,10 @@ fn text(found: &Inspected, plan: Option<&Plan>) -> String {
         text += &format!(", each seen by {track:.1} views");
     }
     text += &format!(", over {x:.1} × {y:.1} m, {z:.1} m high\n");
+    if found.sweeps > 0 {
+        let (sweeps, views, points) = (found.sweeps, found.views_with_lidar, found.lidar_points);
+        text += &format!("{sweeps} sweeps of a lidar, taken with {views} of the views; {points} of the points come from them\n");
+    }
     text += &match found.geo_origin {
         Some(at) => format!(
             "origin at {:.6}° north, {:.6}° east, {:.1} m\n",

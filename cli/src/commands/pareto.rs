@@ -151,8 +151,8 @@ fn known(run: &Run, existing: &[ResultLine], output: &Output) -> Result<Option<R
     if !existing.iter().any(|line| alike(&line)) {
         return Ok(None);
     }
-    let source = captures::open(&run.train.capture, output)?;
-    let (_, plan) = plan_of(&source.capture, &run.train.plan)?;
+    let source = captures::open_to_plan(&run.train.capture, &run.train.plan, output)?;
+    let (_, plan) = plan_of(&source, &run.train.plan)?;
     let hash = Some(resolved(&run.train, &plan).1.to_string());
     Ok(existing.iter().rfind(|line| alike(line) && line.config_hash == hash).cloned())
 }

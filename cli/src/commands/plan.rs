@@ -29,8 +29,8 @@ struct Planned {
 }
 
 pub(crate) fn run(args: &PlanArgs, output: &Output) -> Result<(), Failure> {
-    let source = captures::open(&args.capture, output)?;
-    let (capture, plan) = plan_of(&source.capture, &args.plan)?;
+    let source = captures::open_to_plan(&args.capture, &args.plan, output)?;
+    let (capture, plan) = plan_of(&source, &args.plan)?;
     if let Some(path) = &args.out {
         save_json(path, &plan)?;
     }

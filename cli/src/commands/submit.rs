@@ -49,9 +49,9 @@ struct Submitted {
 pub(crate) fn run(args: &SubmitArgs, output: &Output) -> Result<(), Failure> {
     let clock = Stopwatch::start();
     let span = tracing::info_span!("submit", job = Empty, tasks = Empty, otel.kind = "client").entered();
-    let source = captures::open(&args.capture, output)?;
+    let source = captures::open_to_plan(&args.capture, &args.plan, output)?;
     // Plan and coordinator are checked before any photo is read.
-    let (planned_for, plan) = plan_of(&source.capture, &args.plan)?;
+    let (planned_for, plan) = plan_of(&source, &args.plan)?;
     let mut remote = Remote::open(&args.connection)?;
     let about = remote.call(async |client: &mut Client| client.about(proto::AboutRequest {}).await)?;
     let backend = backend_of(args, &about, output)?;

@@ -169,9 +169,9 @@ pub(crate) fn train(args: &TrainArgs, output: &Output) -> Result<Trained, Failur
 
 /// Plans and ingests the capture, and writes the configuration and the plan.
 fn prepare(args: &TrainArgs, clock: &Stopwatch, output: &Output) -> Result<Prepared, Failure> {
-    let source = captures::open(&args.capture, output)?;
+    let source = captures::open_to_plan(&args.capture, &args.plan, output)?;
     // The plan is checked before any photo is read.
-    let (planned_for, plan) = plan_of(&source.capture, &args.plan)?;
+    let (planned_for, plan) = plan_of(&source, &args.plan)?;
     let backend = backend_of(args)?;
     let plan = Plan { backend: backend.name(), ..plan };
     check_plan(&plan, &planned_for, output)?;
@@ -258,6 +258,7 @@ pub(crate) fn resolved(args: &TrainArgs, plan: &Plan) -> (String, ArtefactId) {
     let mut resolved = args.clone();
     resolved.plan.budget.0 = Some(plan.settings.budget);
     resolved.plan.steps.0 = Some(plan.settings.steps);
+    resolved.plan.depth_weight.0 = Some(plan.settings.depth_weight);
     resolved.threads.0 = Some(threads_of(args));
     config::resolved(&resolved)
 }

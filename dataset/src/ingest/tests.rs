@@ -27,11 +27,11 @@ fn source(folder: &Path, count: u32) -> Source {
         let photo = Photo { path: folder.join(&name), mask: None, model: model(), width: WIDTH, height: HEIGHT };
         let camera_from_world = Rigid { translation: [f64::from(i), 0.0, 0.0].into(), ..Rigid::IDENTITY };
         let camera = Camera { pinhole: ideal_pinhole(&model(), WIDTH, HEIGHT).unwrap(), camera_from_world };
-        (View { name, camera, mips: Vec::new(), masked: false }, photo)
+        (View { name, camera, mips: Vec::new(), masked: false, depth: None }, photo)
     };
     let (views, photos) = (0..count).map(photo).unzip();
     let capture = Capture { views, ..Capture::default() };
-    Source { capture, photos, left_out: Vec::new(), format: "test" }
+    Source { capture, photos, left_out: Vec::new(), format: "test", sweeps: Vec::new(), seeds: Vec::new() }
 }
 
 fn options(threads: usize, downscale: u32) -> IngestOptions {

@@ -12,6 +12,8 @@ pub struct OpenOptions {
     pub images: Option<String>,
     /// Reads cameras only: photos and points may be missing.
     pub cameras_only: bool,
+    /// Uses the capture's lidar: sweeps give target depths and initial points.
+    pub lidar: bool,
 }
 
 /// A capture as parsed from its files, before its photos are found.

@@ -35,6 +35,8 @@ pub(super) struct Station {
     pub(super) leg: usize,
     /// City time.
     pub(super) seconds: f64,
+    /// Names of the photos taken there.
+    pub(super) photos: Vec<String>,
 }
 
 /// All planned shots.
@@ -147,12 +149,17 @@ fn street_shots(city: &City, settings: &Settings, wanted: usize) -> Result<Plann
     stops.dedup();
     let positions: Vec<(usize, usize)> =
         legs.iter().enumerate().flat_map(|(leg, points)| (0..points.len()).map(move |i| (leg, i))).collect();
-    let station = |&(leg, i): &(usize, usize)| Station {
-        name: format!("street-{leg:04}-{i:05}"),
-        leg,
-        seconds: legs[leg][i].seconds,
+    let station = |&stop: &usize| {
+        let &(leg, i) = positions.get(stop)?;
+        let taken = kept.iter().filter(|&&shot| shot / cameras == stop);
+        Some(Station {
+            name: format!("street-{leg:04}-{i:05}"),
+            leg,
+            seconds: legs[leg][i].seconds,
+            photos: taken.map(|&shot| format!("street-{}", all[shot].name)).collect(),
+        })
     };
-    let stations = stops.iter().filter_map(|&stop| positions.get(stop)).map(station).collect();
+    let stations = stops.iter().filter_map(station).collect();
     Ok(PlannedShots { shots: kept.into_iter().map(|i| all[i].clone()).collect(), legs, stations })
 }
 

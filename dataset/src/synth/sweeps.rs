@@ -39,7 +39,8 @@ pub(super) fn write(
             save_points(folder, station, &returns)?;
             Ok::<_, SynthError>(returns.len())
         };
-        run_sensor("lidar", &lidar.mount, out, legs, stations, settings, progress, &lidar_sweep)?;
+        let turn_seconds = 1.0 / lidar.turns_per_second;
+        run_sensor("lidar", &lidar.mount, Some(turn_seconds), out, legs, stations, settings, progress, &lidar_sweep)?;
     }
     if settings.radar {
         let radar = Radar { seed, ..Radar::default() };
@@ -49,7 +50,7 @@ pub(super) fn write(
             save(&folder.join(format!("{}.csv", station.name)), radar_csv(&found).as_bytes())?;
             Ok(found.len())
         };
-        run_sensor("radar", &radar.mount, out, legs, stations, settings, progress, &radar_sweep)?;
+        run_sensor("radar", &radar.mount, None, out, legs, stations, settings, progress, &radar_sweep)?;
     }
     Ok(())
 }
@@ -61,6 +62,7 @@ type Measure<'a> = &'a (dyn Fn(&Station, &Rigid, &Motion, &Path) -> Result<usize
 fn run_sensor(
     sensor: &'static str,
     mount: &Mount,
+    turn_seconds: Option<f64>,
     out: &Path,
     legs: &[Vec<Waypoint>],
     stations: &[Station],
@@ -86,6 +88,8 @@ fn run_sensor(
             "velocity": motion.velocity,
             "spin": motion.spin,
             "readings": readings,
+            "photos": station.photos,
+            "turn_seconds": turn_seconds.unwrap_or(0.0),
         });
         Ok(Some(format!("{line}\n")))
     };

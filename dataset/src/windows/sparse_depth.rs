@@ -28,9 +28,9 @@ impl SparseDepth {
         Self { start, points }
     }
 
-    /// Depths in metres of the view's points in a window of a mip, 0 elsewhere. The nearest point of a pixel wins. `None`
-    /// if no point is in the window.
-    pub(super) fn plane(&self, capture: &Capture, view: u32, mip: u8, rect: Rect) -> Option<Vec<f32>> {
+    /// Depths in metres of the view's points in a window of a mip, 0 elsewhere. The nearest point of a pixel wins. Empty if
+    /// no point is in the window.
+    pub(super) fn plane(&self, capture: &Capture, view: u32, mip: u8, rect: Rect) -> Vec<f32> {
         let camera = capture.views[view as usize].camera.mip(mip).window(rect);
         let (width, height) = (f64::from(rect.width), f64::from(rect.height));
         let mut plane = Vec::new();
@@ -48,6 +48,6 @@ impl SparseDepth {
                 *nearest = depth as f32;
             }
         }
-        (!plane.is_empty()).then_some(plane)
+        plane
     }
 }

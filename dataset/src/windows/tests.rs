@@ -104,6 +104,7 @@ fn a_dropped_reader_discards_queued_prefetches_and_ends_its_threads() {
         camera,
         mips: mips.clone(),
         masked: false,
+        depth: None,
     });
     let capture = Arc::new(Capture { views: views.collect(), ..Capture::default() });
     let reader = WindowReader::new(capture, store.blocking(), 10 << 20);
@@ -136,7 +137,7 @@ fn windows_carry_the_depths_of_the_points_that_their_view_observed() {
         let camera_from_world = Rigid { translation: DVec3::new(x, 0.0, 0.0), ..Rigid::IDENTITY };
         Camera { pinhole, camera_from_world }
     };
-    let view = |x| View { name: format!("{x}"), camera: camera(x), mips: mips.clone(), masked: false };
+    let view = |x| View { name: format!("{x}"), camera: camera(x), mips: mips.clone(), masked: false, depth: None };
     // Views 0 and 1 observed the first two points, which share a pixel in view 0; view 1 the third, which is also in
     // view 0; view 0 the last, which is behind it.
     let points = SparsePoints {
@@ -156,7 +157,7 @@ fn windows_carry_the_depths_of_the_points_that_their_view_observed() {
     let reader = WindowReader::new(Arc::clone(&capture), store.clone(), 10 << 20);
     let rect = Rect { x: 20, y: 10, width: 70, height: 60 };
     assert_eq!(reader.window(0, 0, rect).unwrap().depth, None);
-    let reader = reader.with_sparse_depth();
+    let reader = reader.with_depth();
     let targets = |view: u32, mip: u8, rect: Rect| -> Vec<(u32, u32, f32)> {
         let plane = reader.window(view, mip, rect).unwrap().depth.clone().unwrap_or_default();
         let at = |i: usize| (rect.x + i as u32 % rect.width, rect.y + i as u32 / rect.width);

@@ -1,0 +1,72 @@
+//! Finds the sweeps of a lidar beside a capture of any format:
+//!
+//! ```text
+//! lidar/poses.jsonl      a line per sweep (see `scene::lidar`)
+//! lidar/NAME.bin         its points, four f32 each: x ahead, y left, z up in metres, intensity
+//! ```
+
+use std::collections::BTreeMap;
+
+use rayon::prelude::*;
+use scene::lidar::{self, SweepPose};
+use scene::{BadInput, View};
+
+use super::files::{self, CaptureRoot, Found};
+use crate::lidar::{PointFormat, Sweep};
+
+const POSES: &str = "lidar/poses.jsonl";
+/// The largest file of poses.
+const MAX_POSES_BYTES: u64 = 1 << 30;
+/// A sweep that does not name its photos was taken at the time of those within this distance of the sensor, metres.
+const OWN_METRES: f64 = 2.5;
+
+/// The capture's sweeps, in the file's order; none if it has no such file.
+pub(super) fn find(root: &CaptureRoot, views: &[View]) -> Result<Vec<Sweep>, BadInput> {
+    let Some(path) = root.file(POSES) else { return Ok(Vec::new()) };
+    let bad = |problem: String, advice: &str| BadInput::new(files::show(&path), problem, advice);
+    if path.metadata().is_ok_and(|data| data.len() > MAX_POSES_BYTES) {
+        return Err(bad("is too large for poses".into(), "correct or remove the file"));
+    }
+    let poses = lidar::read_poses(&files::read(&path)?).map_err(|e| bad(e.to_string(), "correct or remove the file"))?;
+    let index: BTreeMap<&str, u32> = views.iter().map(|view| stem(&view.name)).zip(0..).collect();
+    let sweep = |pose: &SweepPose| -> Result<Sweep, BadInput> {
+        let name = format!("lidar/{}.bin", pose.name);
+        let Found::File(points) = root.image(&name)? else {
+            return Err(bad(format!("names the sweep {name}, which is not there"), "put the file there"));
+        };
+        let origin = pose.world_from_sensor.translation;
+        let mut taken: Vec<u32> = match &pose.photos {
+            Some(photos) => photos.iter().filter_map(|name| index.get(stem(name)).copied()).collect(),
+            None => {
+                let is_near = |view: &View| view.camera.centre().distance(origin) <= OWN_METRES;
+                (0..).zip(views).filter(|(_, view)| is_near(view)).map(|(i, _)| i).collect()
+            }
+        };
+        taken.sort_unstable();
+        taken.dedup();
+        Ok(Sweep {
+            path: points,
+            format: PointFormat::Floats(4),
+            readings: pose.readings,
+            world_from_sensor: pose.world_from_sensor,
+            turn: pose.turn(),
+            views: taken,
+        })
+    };
+    let sweeps: Vec<_> = poses.par_iter().map(sweep).collect();
+    let sweeps = sweeps.into_iter().collect::<Result<Vec<_>, _>>()?;
+    if !sweeps.is_empty() && sweeps.iter().all(|sweep| sweep.views.is_empty()) {
+        let problem = "has no sweep that was taken with one of the capture's photos";
+        return Err(bad(problem.into(), "correct the names of photos in it, or remove the folder"));
+    }
+    Ok(sweeps)
+}
+
+/// The name of a photo without `images/` and extension.
+fn stem(name: &str) -> &str {
+    let name = name.strip_prefix("images/").unwrap_or(name);
+    match name.rsplit_once('.') {
+        Some((stem, extension)) if !extension.contains('/') => stem,
+        _ => name,
+    }
+}
