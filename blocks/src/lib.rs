@@ -26,6 +26,7 @@ pub mod seams;
 #[cfg(test)]
 mod testing;
 pub mod view_cut;
+mod view_kind;
 mod view_selection;
 mod visibility;
 
@@ -41,3 +42,4 @@ pub use plan::{EvalTask, MAX_VIEWS_PER_STEP, Mode, Plan, PlanError, PlanSettings
 pub use planner::plan;
 pub use seams::{Face, Seams};
 pub use view_cut::ViewTree;
+pub use view_kind::{ViewKind, view_kinds};
