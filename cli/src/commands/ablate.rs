@@ -138,6 +138,7 @@ fn plan_options(args: &AblateArgs, seed: u64) -> PlanOptions {
         label_blocks: false,
         depth_weight: 0.0,
         evaluate: false,
+        test_stretches: 0.0,
         downscale: args.downscale,
     }
 }
