@@ -9,6 +9,7 @@ use crate::coverage::PixelCoverage;
 use crate::ground::{Ground, quantile};
 use crate::lod::{context_of, finished_neighbours, training_order};
 use crate::plan::{MAX_LEVELS, Mode, PlanError, Task};
+use crate::split::Split;
 use crate::view_selection::{ViewSelection, full_views, select_level};
 use crate::visibility::Observations;
 
@@ -45,14 +46,13 @@ pub(crate) struct Layout<'a> {
     pub(crate) capture: &'a Capture,
     pub(crate) observations: &'a Observations,
     pub(crate) ground: &'a Ground,
-    pub(crate) test_every: u32,
+    pub(crate) split: &'a Split,
 }
 
 impl Layout<'_> {
     /// The blocks of a level that can be trained, with their views.
     fn trainable_blocks(&self, level: u8, rho_metres: f64) -> BTreeMap<BlockId, ViewSelection> {
-        let mut selections =
-            select_level(self.capture, self.observations, self.ground, level, rho_metres, self.test_every);
+        let mut selections = select_level(self.capture, self.observations, self.ground, level, rho_metres, self.split);
         selections.retain(|_, s| level == 0 || s.finer_views >= MIN_VIEWS && s.core_points >= MIN_POINTS);
         selections
     }
@@ -140,7 +140,7 @@ impl Layout<'_> {
                 // A resolution of 0 selects mip 0 for all views.
                 (root.test_views, root.views) = full_views(self.capture, self.observations, 0.0)
                     .into_iter()
-                    .partition(|u| Capture::is_test(u.view as usize, self.test_every));
+                    .partition(|u| self.split.is_held_out(u.view));
             }
             let mut of_level = self.tasks_from(mode, selections, &existing, rho_metres);
             existing.extend(of_level.iter().map(|task| task.block));

@@ -4,7 +4,8 @@
 //! [`cut()`] and [`merge()`] share it, so `merge(cut(s)) == s`. [`plan()`] turns a capture into an immutable, hashed
 //! list of tasks. A training task states which block trains on which windows of which views, against which frozen
 //! context and within which budgets; an evaluation task states on which views the merged model is measured. [`lint()`]
-//! checks a plan, [`draw()`] draws it as an SVG.
+//! checks a plan, [`draw()`] draws it as an SVG. [`densities()`] says where a capture has too few photos, [`Split`] which of them are
+//! held out.
 //!
 //! Architecture invariant: this crate does no I/O, reads no clock, starts no thread and uses no GPU. All functions are
 //! pure, and equal inputs give equal bytes.
@@ -14,25 +15,32 @@ mod budgets;
 mod cost;
 mod coverage;
 pub mod cut;
+pub mod density;
 pub mod draw;
+mod draw_density;
 mod evaluation;
 pub mod ground;
 mod layout;
 pub mod lint;
 pub mod lod;
+mod page;
 pub mod plan;
 pub mod planner;
 pub mod seams;
+mod split;
 #[cfg(test)]
 mod testing;
 pub mod view_cut;
+mod view_kind;
 mod view_selection;
 mod visibility;
 
 pub use budgets::initial_splats;
 pub use cost::{StepCost, trained_splats};
 pub use cut::{cut, keep_core, merge, merge_cut};
+pub use density::{Density, densities};
 pub use draw::draw;
+pub use draw_density::draw_density;
 pub use evaluation::CONCURRENT_FETCHES;
 pub use ground::{Ground, Square};
 pub use lint::{Finding, Severity, lint};
@@ -40,4 +48,6 @@ pub use lod::{Cut, context_of, sweep_of};
 pub use plan::{EvalTask, MAX_VIEWS_PER_STEP, Mode, Plan, PlanError, PlanSettings, PlannedTask, Task, ViewUse};
 pub use planner::plan;
 pub use seams::{Face, Seams};
+pub use split::{Part, Split};
 pub use view_cut::ViewTree;
+pub use view_kind::{ViewKind, view_kinds};

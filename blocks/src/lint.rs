@@ -8,6 +8,7 @@ use scene::{BlockId, Capture};
 use crate::layout::MIN_VIEWS;
 use crate::lod::training_order;
 use crate::plan::{EvalTask, Mode, Plan, Task, ViewUse};
+use crate::split::Split;
 use crate::visibility::max_mip;
 
 /// How bad a finding is.
@@ -53,14 +54,15 @@ pub fn lint(plan: &Plan, capture: &Capture) -> Vec<Finding> {
         findings.warning(None, message);
     }
     check_ownership(plan, capture, &mut findings);
+    let split = Split::of(plan, capture);
     let mut earlier: BTreeSet<BlockId> = BTreeSet::new();
     for task in &plan.tasks {
         check_order(plan, task, &earlier, &mut findings);
-        check_views(plan, task, capture, &mut findings);
+        check_views(task, capture, &split, &mut findings);
         check_budgets(plan, task, &mut findings);
         earlier.insert(task.block);
     }
-    plan.eval_tasks.iter().for_each(|task| check_evaluation(plan, task, capture, &mut findings));
+    plan.eval_tasks.iter().for_each(|task| check_evaluation(task, capture, &split, &mut findings));
     let (limit, largest) =
         (plan.settings.memory_limit_bytes, plan.eval_tasks.iter().map(|task| task.memory_bytes).max());
     if let Some(bytes) = largest.filter(|bytes| *bytes > limit) {
@@ -142,8 +144,8 @@ fn check_order(plan: &Plan, task: &Task, earlier: &BTreeSet<BlockId>, findings: 
 }
 
 /// Checks that training and held-out views are disjoint and exist, and that mips and windows are inside them.
-fn check_views(plan: &Plan, task: &Task, capture: &Capture, findings: &mut Findings) {
-    let is_test = |v: &ViewUse| Capture::is_test(v.view as usize, plan.settings.test_every);
+fn check_views(task: &Task, capture: &Capture, split: &Split, findings: &mut Findings) {
+    let is_test = |v: &ViewUse| split.is_held_out(v.view);
     if let Some(v) = task.views.iter().find(|v| is_test(v)) {
         findings.error(task.block, format!("trains on held-out view {}", v.view));
     }
@@ -197,11 +199,11 @@ fn check_budgets(plan: &Plan, task: &Task, findings: &mut Findings) {
 }
 
 /// Checks that the views of an evaluation exist and are held out.
-fn check_evaluation(plan: &Plan, task: &EvalTask, capture: &Capture, findings: &mut Findings) {
+fn check_evaluation(task: &EvalTask, capture: &Capture, split: &Split, findings: &mut Findings) {
     for &view in &task.views {
         if view as usize >= capture.views.len() {
             findings.error(None, format!("evaluates view {view}, the capture has {}", capture.views.len()));
-        } else if !Capture::is_test(view as usize, plan.settings.test_every) {
+        } else if !split.is_held_out(view) {
             findings.error(None, format!("evaluates training view {view}"));
         }
     }

@@ -14,7 +14,7 @@ use crate::ground::{Ground, HALO_SCALE};
 use crate::lod::{Cut, training_order};
 
 /// The format version of [`Plan`] that this program reads and writes.
-pub const VERSION: u32 = 7;
+pub const VERSION: u32 = 8;
 /// The frame kind of a plan.
 pub const PLAN: Kind = Kind(*b"plan", VERSION);
 /// The maximum depth of a plan: 65,536 blocks a side.
@@ -85,6 +85,8 @@ pub struct PlanSettings {
     pub depth_weight: f64,
     /// Whether tasks of the job measure the merged model on the held-out views after training.
     pub evaluate: bool,
+    /// Width of the stretches of streets of which about one in ten is held out as well, metres; see [`crate::Split`]. 0: none.
+    pub test_stretches: f64,
 }
 
 impl Default for PlanSettings {
@@ -106,6 +108,7 @@ impl Default for PlanSettings {
             label_blocks: false,
             depth_weight: 0.0,
             evaluate: false,
+            test_stretches: 0.0,
         }
     }
 }
@@ -278,11 +281,13 @@ impl Plan {
         if self.version != VERSION {
             return bad(format!("has version {}; this program reads version {VERSION}", self.version));
         }
-        let PlanSettings { sh_degree, views_per_step, depth_weight, .. } = self.settings;
+        let PlanSettings { sh_degree, views_per_step, depth_weight, test_stretches, .. } = self.settings;
         let is_batch = (1..=MAX_VIEWS_PER_STEP).contains(&views_per_step);
-        let is_weight = depth_weight.is_finite() && depth_weight >= 0.0;
-        if !self.ground.is_sane() || self.levels > MAX_LEVELS || sh_degree > 3 || !is_batch || !is_weight {
-            return bad("has a ground, depth, SH degree, number of views per step or weight out of range".into());
+        let are_positive = [depth_weight, test_stretches].iter().all(|value| value.is_finite() && *value >= 0.0);
+        if !self.ground.is_sane() || self.levels > MAX_LEVELS || sh_degree > 3 || !is_batch || !are_positive {
+            return bad(
+                "has a ground, depth, SH degree, number of views per step, weight or stretches out of range".into()
+            );
         }
         let sane = |rho: &f64| rho.is_finite() && *rho > 0.0;
         if self.rho_metres.len() != usize::from(self.levels) + 1 || !self.rho_metres.iter().all(sane) {

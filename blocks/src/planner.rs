@@ -7,12 +7,13 @@ use crate::evaluation::eval_tasks;
 use crate::ground::{Ground, quantile};
 use crate::layout::{Layout, level_rho_metres};
 use crate::plan::{MAX_EVALUATED_BLOCKS, MAX_LEVELS, MAX_VIEWS_PER_STEP, Mode, Plan, PlanError, PlanSettings, VERSION};
+use crate::split::{Part, Split};
 use crate::visibility::{Observations, is_usable};
 
 /// The finest resolution is this quantile of depth / focal length over all observations. With the median, half of the
 /// views of a street would use mip 1.
 const FINE_QUANTILE: f64 = 0.25;
-/// Plans the training of a capture on a backend. Held-out views ([`Capture::is_test`]) are never trained on. Equal
+/// Plans the training of a capture on a backend. Held-out views ([`Split`]) are never trained on. Equal
 /// inputs give equal plans.
 ///
 /// # Errors
@@ -25,7 +26,17 @@ pub fn plan(
 ) -> Result<Plan, PlanError> {
     check(settings)?;
     let finite = capture.points.positions.iter().filter(|p| p.is_finite()).count();
-    let test = |view: usize| Capture::is_test(view, settings.test_every);
+    let ground = Ground::of(capture);
+    let split = Split::new(capture, &ground, settings.test_every, settings.test_stretches);
+    let test = |view: usize| split.is_held_out(view as u32);
+    if settings.test_stretches > 0.0 && split.views(Part::Stretch).is_empty() {
+        let problem = format!("there are not two stretches of {} m with street views", settings.test_stretches);
+        return Err(PlanError::Setting {
+            setting: "--test-stretches",
+            problem,
+            advice: "give fewer metres, or leave it",
+        });
+    }
     let (views, all_test) = (capture.views.len(), (0..capture.views.len()).filter(|&v| test(v)).count());
     let usable_views: Vec<usize> = (0..views).filter(|&v| is_usable(&capture.views[v].camera)).collect();
     if usable_views.iter().all(|&v| test(v)) {
@@ -42,8 +53,7 @@ pub fn plan(
         return Err(PlanError::NoObservations { points: finite });
     }
 
-    let ground = Ground::of(capture);
-    let layout = Layout { capture, observations: &observations, ground: &ground, test_every: settings.test_every };
+    let layout = Layout { capture, observations: &observations, ground: &ground, split: &split };
     let levels = match (settings.mode, settings.levels) {
         (Mode::Whole, _) => 0,
         (_, Some(levels)) => levels,
@@ -62,7 +72,7 @@ pub fn plan(
         let problem = format!("{} blocks are too many to evaluate in the job", tasks.len());
         return Err(PlanError::Setting { setting: "--evaluate", problem, advice: "leave it, and use plat eval" });
     }
-    let eval_tasks = if settings.evaluate { eval_tasks(capture, &tasks, settings) } else { Vec::new() };
+    let eval_tasks = if settings.evaluate { eval_tasks(capture, &tasks, &split, settings) } else { Vec::new() };
     Ok(Plan {
         version: VERSION,
         capture: capture_id,
@@ -94,7 +104,11 @@ fn check(settings: &PlanSettings) -> Result<(), PlanError> {
     if !(0.0..1.0).contains(&settings.residual) {
         return bad("--residual", format!("{} is out of range", settings.residual), "give 0 to 1, such as 0.4");
     }
-    if settings.evaluate && settings.test_every == 0 {
+    if !(settings.test_stretches >= 0.0 && settings.test_stretches.is_finite()) {
+        let problem = format!("{} is out of range", settings.test_stretches);
+        return bad("--test-stretches", problem, "give metres from 0");
+    }
+    if settings.evaluate && settings.test_every == 0 && settings.test_stretches == 0.0 {
         let problem = "no view is held out to measure the model on";
         return bad("--evaluate", problem.into(), "omit it, or give --test-every a number from 1");
     }

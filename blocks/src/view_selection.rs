@@ -13,6 +13,7 @@ use scene::{BlockId, Capture, Rect};
 use crate::block_box::BlockBox;
 use crate::ground::{Ground, quantile};
 use crate::plan::ViewUse;
+use crate::split::Split;
 use crate::visibility::{Observation, Observations, footprint_metres, is_usable, mip_for};
 
 /// A view needs at least this many observations of a block; fewer give no reliable depth and bounds.
@@ -55,14 +56,13 @@ pub(crate) fn select_level(
     ground: &Ground,
     level: u8,
     rho_metres: f64,
-    test_every: u32,
+    split: &Split,
 ) -> BTreeMap<BlockId, ViewSelection> {
     let mut selections = count_points(capture, ground, level);
     if level == 0 {
         if let Some(root) = selections.get_mut(&BlockId::ROOT) {
             let uses = full_views(capture, observations, rho_metres);
-            (root.test_views, root.views) =
-                uses.into_iter().partition(|u| Capture::is_test(u.view as usize, test_every));
+            (root.test_views, root.views) = uses.into_iter().partition(|u| split.is_held_out(u.view));
         }
         return selections;
     }
@@ -89,7 +89,7 @@ pub(crate) fn select_level(
             .collect();
         let block_box = BlockBox::new(capture, ground, block, run.iter().map(|s| observations.all[s.3 as usize].point));
         let (test, train): (Vec<BlockView>, Vec<BlockView>) =
-            views.into_iter().partition(|s| Capture::is_test(s.view as usize, test_every));
+            views.into_iter().partition(|s| split.is_held_out(s.view));
         if let Some(selection) = selections.get_mut(&block) {
             let pick = |views| -> (Vec<ViewUse>, usize) {
                 let uses = choose(views, observations, rho_metres);
@@ -209,7 +209,8 @@ mod tests {
     use crate::testing::{aerial, capture, street};
 
     fn levels_of(capture: &Capture, level: u8, rho: f64) -> BTreeMap<BlockId, ViewSelection> {
-        select_level(capture, &Observations::of(capture), &Ground::of(capture), level, rho, 8)
+        let (observations, ground) = (Observations::of(capture), Ground::of(capture));
+        select_level(capture, &observations, &ground, level, rho, &Split::new(capture, &ground, 8, 0.0))
     }
 
     #[test]

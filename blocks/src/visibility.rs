@@ -94,6 +94,15 @@ impl Observations {
         }
         observations
     }
+
+    /// Of every view the points that it observes, ascending.
+    pub(crate) fn points_by_view(&self) -> Vec<Vec<u32>> {
+        let mut points: Vec<Vec<u32>> = self.per_view.iter().map(|&n| Vec::with_capacity(n as usize)).collect();
+        for s in &self.all {
+            points[s.view as usize].push(s.point);
+        }
+        points
+    }
 }
 
 /// The mip whose pixel is closest to `rho_metres` wide at this depth, on a log scale; limited to the mips that exist.

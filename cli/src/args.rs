@@ -28,7 +28,7 @@ pub(crate) use cluster::{
 pub(crate) use model::{EvalArgs, ExportArgs, Format, PruneArgs, PruneCapture, RenderArgs};
 pub(crate) use plan::{Blocks, PlanOptions, RESIDUAL};
 pub(crate) use sweep::Named;
-pub(crate) use synth::SynthArgs;
+pub(crate) use synth::{Rig, SynthArgs};
 pub(crate) use values::{Auto, Backend, Size};
 
 /// Trains Gaussian-splat models of whole cities from photos with poses.
@@ -122,6 +122,9 @@ pub(crate) struct DoctorArgs {
 pub(crate) struct InspectArgs {
     /// Folder of the capture: COLMAP, transforms.json, OpenSfM or KITTI-360
     pub(crate) capture: PathBuf,
+    /// Draw where too few photos see the ground from nearby, over cameras and points
+    #[arg(long, value_name = "FILE")]
+    pub(crate) svg: Option<PathBuf>,
     #[command(flatten)]
     pub(crate) plan: PlanOptions,
 }

@@ -2,9 +2,9 @@
 
 use std::path::PathBuf;
 
-use eval::ViewFigures;
 use eval::cuts::CutFigures;
 use eval::seams::SeamReport;
+use eval::{ByKind, Group, Summary, ViewFigures};
 use serde::Serialize;
 
 use crate::run_record::Record;
@@ -17,7 +17,17 @@ pub(crate) struct Evaluated {
     /// The contact sheet; tasks of a job draw none.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) sheet: Option<PathBuf>,
+    /// By view; those in held-out stretches are in `stretches`.
     pub(crate) views: Vec<ViewFigures>,
+    /// Of these views, if both kinds are among them.
+    #[serde(flatten)]
+    pub(crate) by_kind: ByKind,
+    /// With `--test-stretches`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(crate) stretches: Option<Group>,
+    /// With `--trained`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(crate) trained_on: Option<Group>,
     /// With `--level` or `--budget`.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub(crate) cuts: Vec<CutFigures>,
@@ -40,6 +50,12 @@ pub(crate) fn text(evaluated: &Evaluated) -> String {
         text += &line(&view.view, [view.psnr, view.cc_psnr, Some(view.ssim), view.perceptual, view.lpips]);
     }
     text += &line("mean", [record.psnr, record.cc_psnr, record.ssim, record.perceptual, record.lpips]);
+    for (name, summary) in summaries(evaluated) {
+        let Summary { views, psnr, cc_psnr, ssim, ssimulacra2, lpips, worst_psnr, worst_cc_gap } = summary;
+        let [worst, gap] = [worst_psnr, worst_cc_gap].map(|value| figure(value, 2));
+        let name = format!("{name}: {views} views, worst {worst} dB, up to {gap} dB below cc-PSNR");
+        text += &line(&name, [psnr, cc_psnr, ssim, ssimulacra2, lpips]);
+    }
     text += &format!("rendered on {}\n", record.backend);
     if !evaluated.cuts.is_empty() {
         text += &format!("\n{}\n", cuts(&evaluated.cuts));
@@ -48,6 +64,21 @@ pub(crate) fn text(evaluated: &Evaluated) -> String {
         text += &format!("\n{}\n\n", seams(report));
     }
     text + &evaluated.sheet.as_ref().map_or(String::new(), |sheet| sheet.display().to_string())
+}
+
+/// Means of groups of views with their names.
+fn summaries(evaluated: &Evaluated) -> Vec<(String, Summary)> {
+    let by_kind = |of: &str, ByKind { aerial, street }: ByKind| {
+        let named = [("aerial", aerial), ("street", street)];
+        named.into_iter().filter_map(|(kind, summary)| Some((format!("{of}{kind}"), summary?))).collect::<Vec<_>>()
+    };
+    let mut all = by_kind("", evaluated.by_kind);
+    for (name, group) in [("stretches", &evaluated.stretches), ("trained on", &evaluated.trained_on)] {
+        let Some(group) = group else { continue };
+        all.push((name.to_owned(), group.all));
+        all.extend(by_kind(&format!("{name}, "), group.by_kind));
+    }
+    all
 }
 
 fn figure(value: Option<f64>, digits: usize) -> String {

@@ -2,10 +2,10 @@
 
 use std::path::Path;
 
-use blocks::Plan;
-use eval::ViewFigures;
+use blocks::{Part, Plan, Split, view_kinds};
+use eval::{ByKind, Group, ViewFigures};
 use model::save_json;
-use scene::ArtefactId;
+use scene::{ArtefactId, Capture};
 use store::BlockingStore;
 
 use crate::eval_report::Evaluated;
@@ -18,7 +18,7 @@ use crate::run_record::Record;
 /// # Errors
 /// A store that fails, a damaged result, a file that cannot be written.
 pub(crate) fn collect(
-    plan: &Plan,
+    (plan, capture): (&Plan, &Capture),
     results: &[ArtefactId],
     store: &BlockingStore,
     about: Record,
@@ -27,10 +27,24 @@ pub(crate) fn collect(
     if plan.eval_tasks.is_empty() {
         return Ok(None);
     }
-    let views = views_of(results.get(plan.tasks.len()..).unwrap_or_default(), store)?;
+    let figures = views_of(results.get(plan.tasks.len()..).unwrap_or_default(), store)?;
+    let (kinds, split) = (view_kinds(capture), Split::of(plan, capture));
+    let measured = plan.eval_tasks.iter().flat_map(|task| &task.views).copied().zip(figures);
+    type Measured = (Vec<u32>, Vec<ViewFigures>);
+    let (stretches, test): (Vec<_>, Vec<_>) = measured.partition(|(view, _)| split.part(*view) == Part::Stretch);
+    let [(test, views), (stretches, in_stretches)]: [Measured; 2] = [test, stretches].map(|of| of.into_iter().unzip());
     let mut record = Record { wall_seconds: None, cpu_seconds: None, command: "eval", ..about };
     record.set_figures(&views);
-    let evaluated = Evaluated { record, sheet: None, views, cuts: Vec::new(), seams: None };
+    let evaluated = Evaluated {
+        record,
+        sheet: None,
+        by_kind: ByKind::of(&views, &test, &kinds),
+        views,
+        stretches: Group::of(in_stretches, &stretches, &kinds),
+        trained_on: None,
+        cuts: Vec::new(),
+        seams: None,
+    };
     let folder = out.join("eval");
     make_folder(&folder)?;
     save_json(&folder.join("report.json"), &evaluated)?;

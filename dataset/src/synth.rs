@@ -43,7 +43,7 @@ use city::trace::World;
 use scene::BadInput;
 
 pub use gallery::gallery;
-pub use settings::{Progress, Settings, Summary, SynthError, VoxelRegion};
+pub use settings::{CarRig, Driven, Progress, Settings, Summary, SynthError, VoxelRegion};
 use settings::{SUBJECT, unsupported};
 use shots::PlannedShots;
 
@@ -56,7 +56,7 @@ pub fn write(out: &Path, settings: &Settings, progress: Progress) -> Result<Summ
     manifest::begin(out, settings)?;
     let city = City::generate(&settings.city)?;
     let world = World::new(&city).map_err(|e| unsupported(&e))?;
-    let PlannedShots { shots, legs, stations } = shots::plan(&world, settings)?;
+    let PlannedShots { shots, legs, stations, driven } = shots::plan(&world, settings)?;
     let mut shots = faults::degrade_shots(shots, &settings.faults);
     if shots.is_empty() {
         return Err(BadInput::new(SUBJECT, "has no view left", "ask for more views or milder faults").into());
@@ -85,6 +85,7 @@ pub fn write(out: &Path, settings: &Settings, progress: Progress) -> Result<Summ
         actors: city.actors.len(),
         moving: city.actors.iter().filter(|actor| actor.trajectory.is_some()).count(),
         triangles: meshes.map(|mesh| mesh.triangles.len()).sum(),
+        driven,
     };
     manifest::complete(out, settings, &city, &summary)?;
     Ok(summary)

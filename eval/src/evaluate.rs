@@ -3,6 +3,7 @@
 use std::borrow::Cow;
 use std::path::{Path, PathBuf};
 
+use blocks::{Part, view_kinds};
 use model::{Model, Tree};
 use render::{Frame, Options};
 use scene::{BadInput, Camera, Splats};
@@ -14,6 +15,7 @@ use crate::figures::{Comparison, ViewFigures, clamped};
 use crate::images::{colour_image, photo_image, write_png};
 use crate::seams::{SeamFrames, SeamMeter, SeamReport};
 use crate::sheet::{SheetRow, contact_sheet};
+use crate::summary::{ByKind, Group};
 use crate::surface::without_backdrop;
 use crate::{EvalError, Lpips, Observer, Photos, Renderer, Seconds};
 
@@ -36,6 +38,8 @@ pub struct Request<'a> {
     pub lpips: Option<&'a Lpips>,
     /// Folder for contact sheets and pictures; created if need be.
     pub out: &'a Path,
+    /// How many views that were trained on to measure as well, evenly chosen.
+    pub trained: usize,
 }
 
 /// Results of an evaluation.
@@ -45,8 +49,14 @@ pub struct Evaluation {
     pub backend: String,
     /// Time of rendering the model's held-out views.
     pub render_seconds: Seconds,
-    /// By held-out view.
+    /// By held-out view; those in held-out stretches are apart.
     pub views: Vec<ViewFigures>,
+    /// Of these.
+    pub by_kind: ByKind,
+    /// Of the views in held-out stretches.
+    pub stretches: Option<Group>,
+    /// Of views that were trained on.
+    pub trained_on: Option<Group>,
     /// The contact sheet.
     pub sheet: PathBuf,
     /// In the order of the request.
@@ -55,14 +65,15 @@ pub struct Evaluation {
     pub seams: Option<SeamReport>,
 }
 
-/// Renders every held-out view once and measures it; writes the contact sheet `sheet.png` and, with seams, their pictures.
+/// Renders every held-out view once and measures it, cuts and seams only on views outside held-out stretches; writes the contact sheet `sheet.png` and, with seams, their pictures.
 /// Views are rendered without exposures.
 ///
 /// # Errors
 /// A capture without held-out views, photos that cannot be read, a renderer that fails, pictures that cannot be written.
 pub fn evaluate(request: &Request, observer: &dyn Observer) -> Result<Evaluation, EvalError> {
-    let Request { model, details, photos, backend, lpips, out } = *request;
-    let held_out = photos.views(true);
+    let Request { model, details, photos, backend, lpips, out, .. } = *request;
+    let [test, stretches, trained] = [Part::Test, Part::Stretch, Part::Trained].map(|part| photos.split.views(part));
+    let held_out = [test.as_slice(), &stretches].concat();
     if held_out.is_empty() {
         let advice = "give a number from 1 to that of the views";
         return Err(BadInput::new("--test-every", "holds out no view", advice).into());
@@ -83,6 +94,8 @@ pub fn evaluate(request: &Request, observer: &dyn Observer) -> Result<Evaluation
         .map(|scene| SeamMeter::new(scene.tree, &scene.finest, other.is_some(), details.seam_metres, &photos.capture));
 
     let shown_every = held_out.len().div_ceil(MAX_SHEET_ROWS);
+    let trained = evenly(&trained, request.trained);
+    let total = (held_out.len() + trained.len()) as u64;
     let (mut views, mut rows, mut render_seconds) = (Vec::new(), Vec::new(), Seconds::default());
     for (i, &index) in held_out.iter().enumerate() {
         let view = &photos.capture.views[index as usize];
@@ -102,9 +115,14 @@ pub fn evaluate(request: &Request, observer: &dyn Observer) -> Result<Evaluation
                 perceptual: figures.perceptual,
             });
         }
+        views.push(figures);
+        observer.progress("evaluating", i as u64 + 1, total, "");
+        if i >= test.len() {
+            continue;
+        }
         let own_frame = own.as_ref().map(|own| own.foreground(&mut renderer, &view.camera)).transpose()?;
         if let (Some(cuts), Some(foreground)) = (&mut cuts, &own_frame) {
-            cuts.add_view(index, &figures, foreground, &mut renderer)?;
+            cuts.add_view(index, &views[i], foreground, &mut renderer)?;
         }
         if let Some(seams) = &mut seams {
             let other = other.as_ref().map(|other| other.frames(&mut renderer, &view.camera)).transpose()?;
@@ -115,20 +133,37 @@ pub fn evaluate(request: &Request, observer: &dyn Observer) -> Result<Evaluation
             };
             seams.add_view(view, &photo, &compared.truth, &frames, &mut renderer)?;
         }
-        views.push(figures);
-        observer.progress("evaluating", i as u64 + 1, held_out.len() as u64, "");
+    }
+    let mut trained_figures = Vec::new();
+    for (i, &index) in trained.iter().enumerate() {
+        let view = &photos.capture.views[index as usize];
+        let photo = reader.window(index, 0, view.camera.full())?;
+        let frame = renderer.render(&splats, &view.camera, &model.options())?;
+        trained_figures.push(Comparison::new(&view.name, &frame.colour, &photo).figures(lpips)?);
+        observer.progress("evaluating", (held_out.len() + i) as u64 + 1, total, "");
     }
 
+    let kinds = view_kinds(&photos.capture);
+    let in_stretches = views.split_off(test.len());
     let sheet = out.join("sheet.png");
     write_png(&sheet, &contact_sheet(&rows))?;
     Ok(Evaluation {
         backend: renderer.name(),
         render_seconds,
+        by_kind: ByKind::of(&views, &test, &kinds),
         views,
+        stretches: Group::of(in_stretches, &stretches, &kinds),
+        trained_on: Group::of(trained_figures, &trained, &kinds),
         sheet,
         cuts: cuts.map_or(Vec::new(), CutMeter::figures),
         seams: seams.map(|seams| seams.finish(&photos.capture, out, &mut renderer)).transpose()?,
     })
+}
+
+/// At most `count` of the views, evenly chosen.
+fn evenly(views: &[u32], count: usize) -> Vec<u32> {
+    let count = count.min(views.len());
+    (0..count).map(|i| views[(2 * i + 1) * views.len() / (2 * count)]).collect()
 }
 
 /// A tree's finest cut, with and without its backdrop.

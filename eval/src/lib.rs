@@ -21,6 +21,7 @@ mod photos;
 mod pruning;
 mod renderer;
 mod sheet;
+mod summary;
 mod surface;
 
 pub mod cuts;
@@ -39,3 +40,4 @@ pub use observer::{Observer, Seconds};
 pub use photos::{PhotoOptions, Photos};
 pub use pruning::Pruner;
 pub use renderer::{Renderer, Uploaded};
+pub use summary::{ByKind, Group, Summary};

@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use blocks::Split;
 use dataset::ingest::{IngestOptions, ingest};
 use dataset::open::Source;
 use dataset::windows::WindowReader;
@@ -21,6 +22,8 @@ pub struct PhotoOptions<'a> {
     pub downscale: Option<u32>,
     /// Every how many views one is held out.
     pub test_every: Option<u32>,
+    /// Width of the stretches of streets of which some are held out, metres; 0: none.
+    pub test_stretches: Option<f64>,
 }
 
 /// An ingested capture.
@@ -32,8 +35,8 @@ pub struct Photos {
     pub store: BlockingStore,
     /// Id of the ingested capture; `None` where the caller does not know it.
     pub id: Option<ArtefactId>,
-    /// Every how many views one is held out.
-    pub test_every: u32,
+    /// Which views are held out.
+    pub split: Split,
     /// Divisor of the photos' size.
     pub downscale: u32,
     /// A temporary store, deleted with this value.
@@ -42,8 +45,8 @@ pub struct Photos {
 
 impl Photos {
     /// Photos that were ingested before.
-    pub fn ingested(capture: Capture, store: BlockingStore, test_every: u32, downscale: u32) -> Self {
-        Self { capture: Arc::new(capture), store, id: None, test_every, downscale, _temporary: None }
+    pub fn ingested(capture: Capture, store: BlockingStore, split: Split, downscale: u32) -> Self {
+        Self { capture: Arc::new(capture), store, id: None, split, downscale, _temporary: None }
     }
 
     /// Ingests the photos of a capture.
@@ -62,11 +65,12 @@ impl Photos {
         let threads = std::thread::available_parallelism().map_or(1, usize::from);
         let report = |done: usize, total: usize| observer.progress("photos", done as u64, total as u64, "");
         let ingested = ingest(source, &store, &IngestOptions { downscale, threads }, &report)?;
+        let split = model.split(&ingested.capture, options.test_every, options.test_stretches);
         Ok(Self {
             capture: Arc::new(ingested.capture),
             store,
             id: Some(ingested.id),
-            test_every: options.test_every.unwrap_or(model.test_every()),
+            split,
             downscale,
             _temporary: temporary,
         })
@@ -75,12 +79,6 @@ impl Photos {
     /// A reader of the photos that keeps this many bytes of them decoded.
     pub(crate) fn reader(&self, cache_bytes: usize) -> WindowReader {
         WindowReader::new(self.capture.clone(), self.store.clone(), cache_bytes)
-    }
-
-    /// Indices of the views that are held out, or of those that are not.
-    pub(crate) fn views(&self, held_out: bool) -> Vec<u32> {
-        let views = 0..self.capture.views.len();
-        views.filter(|&i| Capture::is_test(i, self.test_every) == held_out).map(|i| i as u32).collect()
     }
 }
 

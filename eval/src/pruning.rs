@@ -1,5 +1,6 @@
 //! Prunes a model by the photos of a capture, and measures it before and after.
 
+use blocks::Part;
 use dataset::windows::WindowReader;
 use glam::Vec3;
 use model::{Model, read_tree};
@@ -40,14 +41,14 @@ impl<'a> Pruner<'a> {
         if model.exposures.is_some() && !has_own_photos {
             observer.note("the model was trained on other photos: its exposures are left out");
         }
-        let views = |held_out: bool| {
+        let views = |part: Part| {
             let window = |i: u32| {
                 let camera = photos.capture.views[i as usize].camera;
                 TrainView { view: i, mip: 0, rect: camera.full(), camera }
             };
-            photos.views(held_out).into_iter().map(window).collect()
+            photos.split.views(part).into_iter().map(window).collect()
         };
-        let (held_in, held_out) = (views(false), views(true));
+        let (held_in, held_out) = (views(Part::Trained), views(Part::Test));
         let exposures = model.exposures.as_ref().filter(|_| has_own_photos);
         Ok(Self { model, reader: photos.reader(CACHE_BYTES), held_in, held_out, exposures })
     }

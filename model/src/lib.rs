@@ -20,7 +20,8 @@ mod write;
 
 use std::path::{Path, PathBuf};
 
-use scene::{BadInput, Exposures, Splats, ply, spz};
+use blocks::{Ground, Split};
+use scene::{BadInput, Capture, Exposures, Splats, ply, spz};
 
 pub use error::ModelError;
 pub use files::save_json;
@@ -68,9 +69,14 @@ impl Model {
         })
     }
 
-    /// Every how many views one was held out of training; 0 = none. 8 where the training is unknown.
-    pub fn test_every(&self) -> u32 {
-        self.trained.as_ref().map_or(DEFAULT_TEST_EVERY, |(manifest, _)| manifest.test_every)
+    /// Which views of a capture are held out: as in the model's training, by default every 8th where that is unknown. What is given
+    /// overrides either.
+    pub fn split(&self, capture: &Capture, test_every: Option<u32>, stretch_metres: Option<f64>) -> Split {
+        let (ground, own_every, own_metres) = match &self.trained {
+            Some((manifest, _)) => (manifest.ground, manifest.test_every, manifest.test_stretches),
+            None => (Ground::of(capture), DEFAULT_TEST_EVERY, 0.0),
+        };
+        Split::new(capture, &ground, test_every.unwrap_or(own_every), stretch_metres.unwrap_or(own_metres))
     }
 
     /// The divisor of the photos' size in training. 1 where the training is unknown.

@@ -24,6 +24,9 @@ pub struct Manifest {
     pub ground: Ground,
     /// Every how many views one was held out; 0 = none.
     pub test_every: u32,
+    /// Width of the stretches of streets of which some were held out, metres; 0 = none.
+    #[serde(default)]
+    pub test_stretches: f64,
     /// Divisor of the photos' size.
     pub downscale: u32,
     /// Id of the file of the training views' exposures, if there is one.

@@ -97,6 +97,7 @@ pub fn write(
         geo_origin,
         ground: plan.ground,
         test_every: plan.settings.test_every,
+        test_stretches: plan.settings.test_stretches,
         downscale,
         exposures,
         splats: count as u64,

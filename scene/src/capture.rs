@@ -145,11 +145,6 @@ impl Capture {
         }
         Ok(())
     }
-
-    /// True for held-out views: every `test_every`-th in name order, starting with the first.
-    pub fn is_test(index: usize, test_every: u32) -> bool {
-        test_every > 0 && index.is_multiple_of(test_every as usize)
-    }
 }
 
 #[cfg(test)]

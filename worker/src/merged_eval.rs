@@ -7,12 +7,12 @@ use std::collections::BTreeMap;
 use std::convert::Infallible;
 use std::sync::{Mutex, PoisonError};
 
-use blocks::{Cut, Mode, Plan};
+use blocks::{Cut, Mode, Part, Plan, Split};
 use dataset::windows::WindowReader;
 use render::Options;
 use render::cpu::Renderer;
 use scene::splats::sh_coefficients;
-use scene::{ArtefactId, BlockId, Capture, Splats, column};
+use scene::{ArtefactId, BlockId, Splats, column};
 use store::BlockingStore;
 use train::{metrics, source};
 
@@ -118,12 +118,14 @@ impl MergedEvaluator {
         if !is_evaluated(plan) {
             return None;
         }
-        let held_out =
-            reader.capture().views.iter().enumerate().filter(|(i, _)| Capture::is_test(*i, plan.settings.test_every));
+        let capture = reader.capture();
+        // Stretches are left out, so that figures of runs with and without them compare.
+        let held_out = Split::of(plan, capture).views(Part::Test);
         let mip = |camera: &scene::Camera| {
             (0..31).find(|&mip| camera.mip(mip).full().area() <= MAX_PIXELS).unwrap_or_default()
         };
-        let views: Vec<_> = held_out.map(|(i, view)| (i as u32, mip(&view.camera))).collect();
+        let views: Vec<_> =
+            held_out.into_iter().map(|view| (view, mip(&capture.views[view as usize].camera))).collect();
         let reader = reader.with_store(store.store().metered().blocking(), CACHE_BYTES);
         let antialiased = plan.settings.antialiased;
         (!views.is_empty()).then(|| Self { reader, antialiased, views, renderer: Renderer::default() })

@@ -3,11 +3,13 @@
 //! | module | output |
 //! |---|---|
 //! | [`rig`] | [`Shot`]s of a car with six cameras along the streets |
+//! | [`drives`] | drives of such cars through whole streets, both directions, closely |
 //! | [`survey`] | [`Shot`]s of aerial blocks, surveillance cameras and free paths |
 //! | [`lidar`] | lidar sweeps: true and noisy ranges, intensities |
 //! | [`radar`] | radar detections with radial velocities, and ghosts |
 //! | [`inertial`] | GPS fixes, gyro and accelerometer readings, and the drift of reported poses |
 
+pub mod drives;
 pub mod inertial;
 pub mod lidar;
 pub mod radar;

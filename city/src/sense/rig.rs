@@ -85,11 +85,27 @@ impl Default for Rig {
     }
 }
 
+impl Rig {
+    /// One camera, which looks ahead: a dashboard camera.
+    pub fn front() -> Self {
+        let mount = Mount { name: "front".into(), offset: DVec3::new(0.8, 0.0, 1.65), yaw_degrees: 0.0 };
+        Self { cameras: vec![mount], ..Self::default() }
+    }
+}
+
 /// Drives every street of a city and lists the shots, in order of street, position and camera.
 ///
 /// # Errors
 /// [`SenseError`] for settings out of range, or more shots than [`super::MAX_READINGS`].
 pub fn drive(city: &City, rig: &Rig) -> Result<Vec<Shot>, SenseError> {
+    shots_of(&legs(city, rig)?, rig)
+}
+
+/// The shots of all cameras at every waypoint of these legs, in order of leg, waypoint and camera.
+///
+/// # Errors
+/// [`SenseError`] for settings out of range, or more shots than [`super::MAX_READINGS`].
+pub fn shots_of(legs: &[Vec<Waypoint>], rig: &Rig) -> Result<Vec<Shot>, SenseError> {
     let lens = pinhole(rig.width, rig.height, rig.field_degrees)?;
     check_range("rolling_shutter_seconds", rig.rolling_shutter_seconds, 0.0, 1.0)?;
     check_range("shutter_seconds", rig.shutter_seconds, 0.0, 1.0)?;
@@ -97,7 +113,6 @@ pub fn drive(city: &City, rig: &Rig) -> Result<Vec<Shot>, SenseError> {
     if !offsets {
         return Err(SenseError::Setting("a camera's mount"));
     }
-    let legs = legs(city, rig)?;
     check_count(legs.iter().map(|leg| leg.len() as f64).sum::<f64>() * rig.cameras.len() as f64)?;
     let mut shots = Vec::new();
     for (street, leg) in legs.iter().enumerate() {

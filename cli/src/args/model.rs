@@ -16,6 +16,12 @@ pub(crate) struct EvalArgs {
     /// Hold out every K-th view; by default as in the model's training, else 8
     #[arg(long, value_name = "K", value_parser = clap::value_parser!(u32).range(1..))]
     pub(crate) test_every: Option<u32>,
+    /// Hold out whole stretches of streets, METRES wide; by default as in the model's training, else none
+    #[arg(long, value_name = "METRES", value_parser = metres)]
+    pub(crate) test_stretches: Option<f64>,
+    /// Also measure N photos that were trained on, evenly chosen: what the model can show at best
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    pub(crate) trained: u32,
     /// Use photos at one N-th of their size; by default as in the model's training, else 1
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     pub(crate) downscale: Option<u32>,

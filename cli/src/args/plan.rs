@@ -5,7 +5,7 @@ use clap::{Args, ValueEnum};
 use scene::Capture;
 use serde::Serialize;
 
-use super::values::{Auto, decibels, residual, views_per_step, weight_or_auto};
+use super::values::{Auto, decibels, metres_or_none, residual, views_per_step, weight_or_auto};
 
 /// How the scene is divided.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum, Serialize)]
@@ -85,6 +85,10 @@ pub(crate) struct PlanOptions {
     /// Use photos at one N-th of their size
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
     pub(crate) downscale: u32,
+    /// Hold out whole stretches of streets as well: about one in ten of the squares of this side that street photos were taken in,
+    /// with all of their street photos. Reported beside the other held-out photos; 0 holds out none
+    #[arg(long, value_name = "METRES", value_parser = metres_or_none, default_value_t = 0.0)]
+    pub(crate) test_stretches: f64,
 }
 
 impl PlanOptions {
@@ -116,6 +120,7 @@ impl PlanOptions {
             label_blocks: self.label_blocks,
             depth_weight: self.depth_weight.0.unwrap_or(if is_measured { MEASURED_DEPTH_WEIGHT } else { 0.0 }),
             evaluate: self.evaluate,
+            test_stretches: self.test_stretches,
             ..PlanSettings::default()
         }
     }

@@ -4,11 +4,20 @@ use std::path::PathBuf;
 
 use city::faults::Fault;
 use city::{Layout, Traffic};
-use clap::Args;
+use clap::{Args, ValueEnum};
 use dataset::synth::VoxelRegion;
 use glam::DVec3;
 
 use super::values::{Size, metres};
+
+/// Cameras of a car.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum Rig {
+    /// Two ahead, two to the sides, two to the rear
+    Six,
+    /// One ahead
+    Front,
+}
 
 #[derive(Debug, Clone, Args)]
 #[command(after_long_help = SYNTH_HELP)]
@@ -22,7 +31,7 @@ pub(crate) struct SynthArgs {
     /// Area of the square city, km²: 0.005 to 25
     #[arg(long, value_name = "A", default_value_t = 0.2)]
     pub(crate) area_km2: f64,
-    /// Number of photos, spread evenly over the city
+    /// Number of photos, spread evenly over the city; with --spacing at most
     #[arg(long, value_name = "N", default_value_t = 400)]
     pub(crate) views: u32,
     /// Size of a photo, pixels
@@ -43,10 +52,17 @@ pub(crate) struct SynthArgs {
     /// Share of the photos taken from the air, straight down and in four oblique directions: 0 to 1
     #[arg(long, value_name = "SHARE", default_value_t = 0.5)]
     pub(crate) aerial: f64,
-    /// Share of the photos taken by fixed cameras on posts, ten each. Photos that are neither aerial nor fixed are taken by cars with
-    /// six cameras
+    /// Share of the photos taken by fixed cameras on posts, ten each. Photos that are neither aerial nor fixed are taken by cars
     #[arg(long, value_name = "SHARE", default_value_t = 0.0)]
     pub(crate) fixed: f64,
+    /// Take the cars' photos this far apart: cars drive whole streets, from the middle of the city outwards, in both directions, and
+    /// all cameras take a photo at every stop, as far as the photos suffice. Without it the photos are spread evenly over all
+    /// streets, and the cameras take turns
+    #[arg(long, value_name = "METRES", value_parser = metres)]
+    pub(crate) spacing: Option<f64>,
+    /// Cameras of a car: six, or one that looks ahead
+    #[arg(long, value_name = "RIG", value_enum, default_value_t = Rig::Six)]
+    pub(crate) rig: Rig,
     /// A capture fault and its strength, 0 to 1 (default 1). May be given more than once
     #[arg(long, value_name = "KIND[=STRENGTH]")]
     pub(crate) fault: Vec<Fault>,

@@ -86,6 +86,11 @@ pub(super) fn metres(text: &str) -> Result<f64, String> {
     value.ok_or_else(|| "give metres above 0, such as 2 or 0.5".into())
 }
 
+pub(super) fn metres_or_none(text: &str) -> Result<f64, String> {
+    let value = text.parse().ok().filter(|metres: &f64| *metres >= 0.0 && metres.is_finite());
+    value.ok_or_else(|| "give metres from 0, such as 50".into())
+}
+
 /// A level of the tree, or `all`.
 pub(super) fn levels(text: &str) -> Result<Levels, String> {
     match text {

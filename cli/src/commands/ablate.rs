@@ -139,6 +139,7 @@ fn plan_options(args: &AblateArgs, seed: u64) -> PlanOptions {
         depth_weight: Auto(Some(0.0)),
         no_lidar: true,
         evaluate: false,
+        test_stretches: 0.0,
         downscale: args.downscale,
     }
 }

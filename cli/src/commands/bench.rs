@@ -60,7 +60,8 @@ pub(crate) fn adaptive(args: &AdaptiveArgs, output: &Output) -> Result<(), Failu
         let out = args.out.join("eval").join(label.replace(' ', "_"));
         let mut record = trained.report.record.clone();
         let model = model::read(&train.out)?;
-        let photos = Photos::ingested(trained.capture, store, train.plan.test_every, train.plan.downscale);
+        let split = model.split(&trained.capture, None, None);
+        let photos = Photos::ingested(trained.capture, store, split, train.plan.downscale);
         let evaluated = measure_trained(&model, &photos, None, &out, output)?;
         record.scene = "half a bare plain".into();
         record.set_quality(&evaluated.record);

@@ -62,7 +62,8 @@ pub(crate) fn build(args: &DemoArgs, output: &Output) -> Result<Built, Failure> 
     let eval_folder = args.out.join("eval");
     let [birdseye, oblique] = ["birdseye.png", "oblique.png"].map(|name| args.out.join(name));
     render_overviews(&model, &trained.capture, &birdseye, &oblique)?;
-    let photos = Photos::ingested(trained.capture, store, train_args.plan.test_every, train_args.plan.downscale);
+    let split = model.split(&trained.capture, None, None);
+    let photos = Photos::ingested(trained.capture, store, split, train_args.plan.downscale);
     let evaluated = measure_trained(&model, &photos, None, &eval_folder, output)?;
 
     let mut report = trained.report;

@@ -34,7 +34,12 @@ pub(crate) fn measure(args: &EvalArgs, output: &Output) -> Result<Evaluated, Fai
     };
     let details = Details::read(&args.model, &options)?;
     let source = captures::open(&args.capture, output)?;
-    let photos = PhotoOptions { store: args.store.as_deref(), downscale: args.downscale, test_every: args.test_every };
+    let photos = PhotoOptions {
+        store: args.store.as_deref(),
+        downscale: args.downscale,
+        test_every: args.test_every,
+        test_stretches: args.test_stretches,
+    };
     let photos = captures::photos_of(&model, &source, &photos, output)?;
     let out = args.out.clone().unwrap_or_else(|| model.report_folder(&args.model, "eval"));
     let request = Request {
@@ -44,6 +49,7 @@ pub(crate) fn measure(args: &EvalArgs, output: &Output) -> Result<Evaluated, Fai
         backend: &backend,
         lpips: lpips.as_ref(),
         out: &out,
+        trained: args.trained as usize,
     };
     let mut evaluated = evaluated(&request, output)?;
     evaluated.record.scene = captures::name_of(&args.capture);
@@ -61,7 +67,7 @@ pub(crate) fn measure_trained(
     output: &Output,
 ) -> Result<Evaluated, Failure> {
     let (details, backend) = (Details::default(), train::Backend::Cpu);
-    let request = Request { model, details: &details, photos, backend: &backend, lpips, out };
+    let request = Request { model, details: &details, photos, backend: &backend, lpips, out, trained: 0 };
     let evaluated = evaluated(&request, output)?;
     save_json(&out.join("report.json"), &evaluated)?;
     Ok(evaluated)
@@ -70,6 +76,7 @@ pub(crate) fn measure_trained(
 fn evaluated(request: &Request, output: &Output) -> Result<Evaluated, Failure> {
     let evaluation = eval::evaluate(request, &OutputObserver::new(output))?;
     let seconds = evaluation.render_seconds;
+    let rendered = evaluation.views.len() + evaluation.stretches.as_ref().map_or(0, |group| group.all.views);
     let mut record = Record {
         backend: evaluation.backend.clone(),
         workers: 1,
@@ -77,11 +84,11 @@ fn evaluated(request: &Request, output: &Output) -> Result<Evaluated, Failure> {
         wall_seconds: Some(seconds.wall),
         cpu_seconds: Some(seconds.cpu),
         splats: request.model.splats.len() as u64,
-        fps: Some(evaluation.views.len() as f64 / seconds.wall.max(1e-9)),
+        fps: Some(rendered as f64 / seconds.wall.max(1e-9)),
         peak_memory_bytes: clock::peak_memory_bytes(),
         ..Record::new("eval")
     };
     record.set_figures(&evaluation.views);
-    let Evaluation { views, sheet, cuts, seams, .. } = evaluation;
-    Ok(Evaluated { record, sheet: Some(sheet), views, cuts, seams })
+    let Evaluation { views, by_kind, stretches, trained_on, sheet, cuts, seams, .. } = evaluation;
+    Ok(Evaluated { record, sheet: Some(sheet), views, by_kind, stretches, trained_on, cuts, seams })
 }

@@ -2,9 +2,11 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use blocks::Plan;
+use blocks::density::ENOUGH_PLACES;
+use blocks::{Density, Plan, ViewKind};
 use scene::{Capture, GeoOrigin};
 use serde::Serialize;
+use store::file::save;
 use worker::estimate::Estimate;
 use worker::speed::relative_speed;
 
@@ -13,6 +15,9 @@ use crate::captures;
 use crate::failure::Failure;
 use crate::output::Output;
 use crate::planning::{check_plan, describe, plan_of};
+
+/// Share of the ground whose photos may be too few without a warning: the rim of every capture is seen from one side.
+const THIN_SHARE: f64 = 0.1;
 
 #[derive(Serialize)]
 struct Inspected {
@@ -41,6 +46,22 @@ struct Inspected {
     estimate: Option<Estimate>,
     /// Why the capture cannot be trained; null if it can.
     problem: Option<String>,
+    /// By kind of view: `aerial`, `street`.
+    density: BTreeMap<&'static str, Shown>,
+    /// Where photos are too few for what is asked of them.
+    warnings: Vec<String>,
+}
+
+/// How densely views of one kind photograph the ground.
+#[derive(Serialize)]
+struct Shown {
+    views: usize,
+    /// Median distance of a photo to the next that looks the same way.
+    spacing_metres: Option<f64>,
+    cell_metres: f64,
+    cells: usize,
+    thin_cells: usize,
+    thin_share: f64,
 }
 
 pub(crate) fn run(args: &InspectArgs, output: &Output) -> Result<(), Failure> {
@@ -51,6 +72,10 @@ pub(crate) fn run(args: &InspectArgs, output: &Output) -> Result<(), Failure> {
         Ok(plan)
     });
     let capture = &source.capture;
+    let densities = blocks::densities(capture);
+    if let Some(path) = &args.svg {
+        save(path, blocks::draw_density(&densities, capture).as_bytes())?;
+    }
     let mut sizes = BTreeMap::new();
     for view in &capture.views {
         let k = &view.camera.pinhole;
@@ -78,6 +103,8 @@ pub(crate) fn run(args: &InspectArgs, output: &Output) -> Result<(), Failure> {
         tasks: planned.as_ref().ok().map(|plan| plan.tasks.len()),
         estimate: planned.as_ref().ok().map(|plan| Estimate::of(plan, relative_speed())),
         problem: planned.as_ref().err().map(Failure::to_string),
+        density: densities.iter().map(|density| (density.kind.name(), shown(density))).collect(),
+        warnings: densities.iter().filter_map(warning).collect(),
     };
     output.result(&inspected, &text(&inspected, planned.ok().as_ref()))
 }
@@ -105,6 +132,11 @@ fn text(found: &Inspected, plan: Option<&Plan>) -> String {
         ),
         None => "no geographic origin: lengths are in the capture's unit\n".into(),
     };
+    for (kind, shown) in &found.density {
+        let spacing = shown.spacing_metres.map_or(String::new(), |metres| format!(", {metres:.1} m apart"));
+        text += &format!("{} {kind} views{spacing}\n", shown.views);
+    }
+    found.warnings.iter().for_each(|warning| text += &format!("{warning}\n"));
     for (name, reason) in &found.left_out {
         text += &format!("left out {name}: {reason}\n");
     }
@@ -114,6 +146,33 @@ fn text(found: &Inspected, plan: Option<&Plan>) -> String {
         (None, None) => {}
     }
     text
+}
+
+fn shown(density: &Density) -> Shown {
+    Shown {
+        views: density.views,
+        spacing_metres: density.spacing_metres,
+        cell_metres: density.cell_metres,
+        cells: density.cells.len(),
+        thin_cells: density.thin_cells(),
+        thin_share: density.thin_share(),
+    }
+}
+
+/// One line about ground that too few photos see, if it is more than [`THIN_SHARE`] of the ground.
+fn warning(density: &Density) -> Option<String> {
+    let (kind, share) = (density.kind.name(), density.thin_share());
+    let advice = match density.kind {
+        ViewKind::Street => "expect blur at eye level; 1 to 3 m apart are usual",
+        ViewKind::Aerial => "expect blur from the air; photos usually overlap by 60 to 80 %",
+    };
+    let spacing = density.spacing_metres.map_or(String::new(), |metres| format!(" (they are {metres:.1} m apart)"));
+    (share > THIN_SHARE).then(|| {
+        format!(
+            "thin: {:.0} % of the ground near {kind} photos is seen by them from fewer than {ENOUGH_PLACES} near places{spacing}: {advice}",
+            100.0 * share
+        )
+    })
 }
 
 /// Extent of the points along the ground's axes and up, without outliers.

@@ -166,7 +166,8 @@ fn train_and_measure(run: &Run, lpips: Option<&Lpips>, output: &Output) -> Resul
     let out = run.train.out.join("eval");
     let mut record = report.record;
     let plan = &run.train.plan;
-    let photos = Photos::ingested(capture, store, plan.test_every, plan.downscale);
+    let split = model.split(&capture, None, None);
+    let photos = Photos::ingested(capture, store, split, plan.downscale);
     let evaluated = measure_trained(&model, &photos, lpips, &out, output)?;
     record.scene.clone_from(&run.scene);
     record.set_quality(&evaluated.record);

@@ -79,7 +79,8 @@ pub(crate) fn run(args: &PruneArgs, output: &Output) -> Result<(), Failure> {
 fn photos(model: &Model, capture: &Path, options: &PruneCapture, output: &Output) -> Result<Photos, Failure> {
     let source = captures::open(capture, output)?;
     let PruneCapture { test_every, downscale, store } = options;
-    let options = PhotoOptions { store: store.as_deref(), downscale: *downscale, test_every: *test_every };
+    let options =
+        PhotoOptions { store: store.as_deref(), downscale: *downscale, test_every: *test_every, test_stretches: None };
     captures::photos_of(model, &source, &options, output)
 }
 

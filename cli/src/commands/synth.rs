@@ -4,11 +4,11 @@ use std::path::PathBuf;
 
 use city::CitySettings;
 use city::faults::Fault;
-use dataset::synth::{self, Settings, Summary};
+use dataset::synth::{self, CarRig, Driven, Settings, Summary};
 use eval::write_png;
 use serde::Serialize;
 
-use crate::args::SynthArgs;
+use crate::args::{Rig, SynthArgs};
 use crate::failure::Failure;
 use crate::output::Output;
 
@@ -40,7 +40,7 @@ pub(crate) fn run(args: &SynthArgs, output: &Output) -> Result<(), Failure> {
     let summary = synth::write(&out, &settings, &progress)?;
     drop(stages);
     let text = format!(
-        "{} photos of {} objects, {} of them moving, in {} triangles; {} sparse points, each in {:.1} views\n\n\
+        "{} photos of {} objects, {} of them moving, in {} triangles; {} sparse points, each in {:.1} views\n{}\n\
          the capture         {} (plat train reads it)\n\
          its contents        {}",
         summary.views,
@@ -49,10 +49,22 @@ pub(crate) fn run(args: &SynthArgs, output: &Output) -> Result<(), Failure> {
         summary.triangles,
         summary.points,
         summary.mean_track,
+        summary.driven.as_ref().map_or(String::new(), drives),
         out.display(),
         out.join("manifest.json").display(),
     );
     output.result(&Shown { out, summary }, &text)
+}
+
+/// What the cars drove, in a line.
+fn drives(driven: &Driven) -> String {
+    format!(
+        "cars drove {:.0} m, {:.0} % of all streets in both directions, and stopped {} times, every {} m\n",
+        driven.metres,
+        100.0 * driven.share,
+        driven.stops,
+        driven.spacing_metres
+    )
 }
 
 fn settings(args: &SynthArgs) -> Settings {
@@ -76,5 +88,10 @@ fn settings(args: &SynthArgs) -> Settings {
         mesh: args.mesh,
         occupancy: args.occupancy,
         around: args.occupancy_around.clone(),
+        spacing: args.spacing,
+        rig: match args.rig {
+            Rig::Six => CarRig::Six,
+            Rig::Front => CarRig::Front,
+        },
     }
 }

@@ -9,6 +9,7 @@ use bench::CurvePoint;
 use blocks::Plan;
 use coordinator::{LocalError, Results, run_local};
 use dataset::ingest::Ingested;
+use eval::{ByKind, Group};
 use model::save_json;
 use proto::Access;
 use proto::watch_event::Event as Update;
@@ -64,6 +65,12 @@ pub(crate) struct Report {
     pub(crate) settled: u32,
     /// The plan's estimate.
     pub(crate) predicted: Estimate,
+    /// With `--evaluate`: of the held-out views, if both kinds are among them.
+    #[serde(flatten)]
+    pub(crate) by_kind: ByKind,
+    /// With `--evaluate` and `--test-stretches`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(crate) stretches: Option<Group>,
 }
 
 pub(crate) fn run(args: &TrainArgs, output: &Output) -> Result<(), Failure> {
@@ -142,10 +149,13 @@ pub(crate) fn train(args: &TrainArgs, output: &Output) -> Result<Trained, Failur
         ..Record::new("train")
     };
     let failed = finished.evaluation_failed;
+    let (mut by_kind, mut stretches) = (ByKind::default(), None);
     if failed.is_none()
-        && let Some(evaluated) = eval_results::collect(&plan, &finished.results, &store, record.clone(), &args.out)?
+        && let Some(evaluated) =
+            eval_results::collect((&plan, &capture), &finished.results, &store, record.clone(), &args.out)?
     {
         record.set_quality(&evaluated.record);
+        (by_kind, stretches) = (evaluated.by_kind, evaluated.stretches);
     }
     let report = Report {
         record,
@@ -159,6 +169,8 @@ pub(crate) fn train(args: &TrainArgs, output: &Output) -> Result<Trained, Failur
         resumed: finished.resumed,
         settled: finished.settled,
         predicted,
+        by_kind,
+        stretches,
     };
     save_json(&args.out.join("report.json"), &report)?;
     if let Some(failure) = failed {

@@ -3,6 +3,7 @@
 use city::CitySettings;
 use city::faults::Fault;
 use city::occupancy::Grid;
+use city::sense::rig::Rig;
 use glam::{DQuat, DVec3};
 use scene::{BadInput, Rigid};
 use serde::Serialize;
@@ -40,6 +41,37 @@ pub struct Settings {
     pub occupancy: Option<f64>,
     /// Regions of the occupancy grids, 1,000 at most. Empty covers the whole city.
     pub around: Vec<VoxelRegion>,
+    /// Metres between the stops of a car along its street, 0.1 to 100: cars then drive whole streets in both directions, as far as
+    /// the photos suffice. `None` spreads the photos evenly over all streets.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub spacing: Option<f64>,
+    /// Cameras of a car.
+    #[serde(skip_serializing_if = "CarRig::is_default")]
+    pub rig: CarRig,
+}
+
+/// Cameras of a car.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum CarRig {
+    /// Two ahead, two to the sides, two to the rear.
+    #[default]
+    Six,
+    /// One ahead.
+    Front,
+}
+
+impl CarRig {
+    fn is_default(&self) -> bool {
+        *self == Self::default()
+    }
+
+    pub(super) fn rig(self) -> Rig {
+        match self {
+            Self::Six => Rig::default(),
+            Self::Front => Rig::front(),
+        }
+    }
 }
 
 impl Default for Settings {
@@ -58,6 +90,8 @@ impl Default for Settings {
             mesh: false,
             occupancy: None,
             around: Vec::new(),
+            spacing: None,
+            rig: CarRig::Six,
         }
     }
 }
@@ -77,6 +111,9 @@ impl Settings {
             s if !(0.0..=1.0).contains(&s.aerial) => refuse("the share of aerial photos", "choose 0 to 1"),
             s if !(0.0..=1.0).contains(&s.fixed) => refuse("the share of fixed cameras", "choose 0 to 1"),
             s if s.aerial + s.fixed > 1.0 => refuse("the sum of both shares", "choose shares that sum to at most 1"),
+            s if s.spacing.is_some_and(|metres| !(0.1..=100.0).contains(&metres)) => {
+                refuse("the spacing of the cars' stops", "choose 0.1 to 100 metres")
+            }
             s if s.occupancy.is_some_and(|voxel| !(0.05..=10.0).contains(&voxel)) => {
                 refuse("the side of a voxel", "choose 0.05 to 10 metres")
             }
@@ -134,6 +171,24 @@ pub struct Summary {
     pub moving: usize,
     /// Triangles of the city; those of shared assets count once per actor.
     pub triangles: usize,
+    /// With [`Settings::spacing`]: what the cars drove.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub driven: Option<Driven>,
+}
+
+/// What the cars of a capture with [`Settings::spacing`] drove.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Driven {
+    /// Metres between stops along a street.
+    pub spacing_metres: f64,
+    /// Cameras of a car.
+    pub rig: CarRig,
+    /// Stops of all cars; every camera takes a photo at each.
+    pub stops: usize,
+    /// Length of the drives, metres; each direction counts.
+    pub metres: f64,
+    /// Share of the length of all streets in both directions, 0 to 1.
+    pub share: f64,
 }
 
 /// A synthetic capture that could not be written.

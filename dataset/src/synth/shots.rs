@@ -1,13 +1,15 @@
-//! Plans the shots: an aerial block, cars on all streets and fixed cameras on posts, each thinned evenly to its share.
+//! Plans the shots: an aerial block, cars and fixed cameras on posts. Cars are on all streets, thinned evenly to their share, or
+//! drive whole streets with a given spacing until their share is used up.
 
-use city::sense::rig::{Rig, drive, legs};
+use city::sense::drives::{Drives, drives};
+use city::sense::rig::{Rig, drive, legs, shots_of};
 use city::sense::survey::{Fixed, Survey, fixed, survey};
 use city::sense::{SenseError, Shot};
 use city::trace::World;
 use city::{City, Waypoint};
 use scene::BadInput;
 
-use super::settings::{Settings, unsupported};
+use super::settings::{Driven, Settings, unsupported};
 
 /// End of the city's traffic, seconds. Times of an aerial block that takes longer are compressed, as if several aircraft flew.
 const TRAFFIC_SECONDS: f64 = 600.0;
@@ -24,6 +26,8 @@ const MAX_OVERLAP: f64 = 0.95;
 const MARGIN_HEIGHT_SHARE: f64 = 0.5;
 /// Maximum of that distance as a share of the city's side.
 const MAX_MARGIN_SHARE: f64 = 0.25;
+/// Offset of a driving car to the right of its lane's middle, so that drives in both directions differ.
+const LANE_METRES: f64 = 0.6;
 /// Photos per fixed camera.
 const PHOTOS_PER_POST: u32 = 10;
 
@@ -39,7 +43,16 @@ pub(super) struct Station {
     pub(super) photos: Vec<String>,
 }
 
+impl Station {
+    /// The station at a waypoint (indices of the leg and within it) with the photos taken there.
+    fn of<'a>(legs: &[Vec<Waypoint>], (leg, i): (usize, usize), shots: impl Iterator<Item = &'a Shot>) -> Self {
+        let photos = shots.map(|shot| format!("street-{}", shot.name)).collect();
+        Self { name: format!("street-{leg:04}-{i:05}"), leg, seconds: legs[leg][i].seconds, photos }
+    }
+}
+
 /// All planned shots.
+#[derive(Default)]
 pub(super) struct PlannedShots {
     /// Names begin with the platform: `aerial-`, `street-`, `fixed-`.
     pub(super) shots: Vec<Shot>,
@@ -47,6 +60,8 @@ pub(super) struct PlannedShots {
     pub(super) legs: Vec<Vec<Waypoint>>,
     /// Stations along the legs.
     pub(super) stations: Vec<Station>,
+    /// With a given spacing.
+    pub(super) driven: Option<Driven>,
 }
 
 /// Plans the shots.
@@ -132,17 +147,41 @@ fn aim_at_stop(shot: &mut Shot, height: f64) {
     }
 }
 
-/// A car on every street, all at the same time.
+/// Photos of cars: with a given spacing along whole streets, otherwise evenly from all streets.
 fn street_shots(city: &City, settings: &Settings, wanted: usize) -> Result<PlannedShots, SenseError> {
-    if wanted == 0 {
-        return Ok(PlannedShots { shots: Vec::new(), legs: Vec::new(), stations: Vec::new() });
+    let rig = Rig { width: settings.width, height: settings.height, ..settings.rig.rig() };
+    match settings.spacing {
+        _ if wanted == 0 => Ok(PlannedShots::default()),
+        None => shots_of_fleet(city, rig, wanted),
+        Some(spacing_metres) => {
+            let rig = Rig { spacing_metres, lane_metres: LANE_METRES, ..rig };
+            let stops = (wanted / rig.cameras.len()).max(1);
+            let Drives { legs, driven_metres, street_metres } = drives(city, &rig, stops)?;
+            let at = |leg: usize| (0..legs[leg].len()).map(move |i| (leg, i));
+            let shots = shots_of(&legs, &rig)?;
+            // A chunk of shots, one per camera, for each waypoint in order.
+            let photos = shots.chunks(rig.cameras.len());
+            let stations = (0..legs.len()).flat_map(at).zip(photos);
+            let stations: Vec<Station> = stations.map(|(at, photos)| Station::of(&legs, at, photos.iter())).collect();
+            let driven = Driven {
+                spacing_metres,
+                rig: settings.rig,
+                stops: stations.len(),
+                metres: driven_metres,
+                share: driven_metres / street_metres.max(1e-9),
+            };
+            Ok(PlannedShots { shots, legs, stations, driven: Some(driven) })
+        }
     }
+}
+
+/// A car on every street, all at the same time.
+fn shots_of_fleet(city: &City, rig: Rig, wanted: usize) -> Result<PlannedShots, SenseError> {
     let metres: f64 = city.streets.iter().flat_map(|street| street.windows(2)).map(|p| p[0].distance(p[1])).sum();
-    let rig = Rig { width: settings.width, height: settings.height, fleet: true, ..Rig::default() };
     let cameras = rig.cameras.len();
     // Half of the spacing that gives the wanted number, so that thinning has a choice.
     let spacing = (0.5 * metres * cameras as f64 / wanted as f64).clamp(0.1, 25.0);
-    let rig = Rig { spacing_metres: spacing, ..rig };
+    let rig = Rig { spacing_metres: spacing, fleet: true, ..rig };
     let (all, legs) = (drive(city, &rig)?, legs(city, &rig)?);
     let kept = thinned(all.len(), cameras, wanted);
     let mut stops: Vec<usize> = kept.iter().map(|i| i / cameras).collect();
@@ -150,17 +189,12 @@ fn street_shots(city: &City, settings: &Settings, wanted: usize) -> Result<Plann
     let positions: Vec<(usize, usize)> =
         legs.iter().enumerate().flat_map(|(leg, points)| (0..points.len()).map(move |i| (leg, i))).collect();
     let station = |&stop: &usize| {
-        let &(leg, i) = positions.get(stop)?;
+        let &at = positions.get(stop)?;
         let taken = kept.iter().filter(|&&shot| shot / cameras == stop);
-        Some(Station {
-            name: format!("street-{leg:04}-{i:05}"),
-            leg,
-            seconds: legs[leg][i].seconds,
-            photos: taken.map(|&shot| format!("street-{}", all[shot].name)).collect(),
-        })
+        Some(Station::of(&legs, at, taken.map(|&shot| &all[shot])))
     };
     let stations = stops.iter().filter_map(station).collect();
-    Ok(PlannedShots { shots: kept.into_iter().map(|i| all[i].clone()).collect(), legs, stations })
+    Ok(PlannedShots { shots: kept.into_iter().map(|i| all[i].clone()).collect(), legs, stations, driven: None })
 }
 
 /// Fixed cameras on posts.
