@@ -138,6 +138,7 @@ pub(crate) fn settings(args: &DemoArgs) -> (Settings, TrainArgs) {
             exposure: false,
             label_blocks: false,
             depth_weight: 0.0,
+            test_stretches: 0.0,
             evaluate: false,
             test_every: 8,
             downscale: 1,
