@@ -18,8 +18,8 @@ use crate::visibility::{Observations, is_usable};
 pub const ENOUGH_PLACES: u32 = 3;
 /// A photo is near if it is at most this many times as far away as the nearest one.
 const NEAR: f64 = 2.0;
-/// Photos count as two places if they are this share of the nearest photo's distance apart (10°); so the cameras of a car count once.
-const PLACE_SHARE: f64 = 1.0 / 6.0;
+/// Photos count as two places if they are this share of the nearest photo's distance apart (14°); so the cameras of a car count once.
+const PLACE_SHARE: f64 = 0.25;
 /// Places are counted up to this number.
 const MAX_PLACES: usize = 9;
 /// Side of a cell in median distances between photos and the points that they observe.
@@ -194,7 +194,21 @@ mod tests {
             let side = if i % 2 == 0 { -7.0 } else { 7.0 };
             DVec3::new(noise(2 * i) * length, side, 9.0 * noise(2 * i + 1))
         };
-        capture(&cameras, (0..2000).map(place).collect(), true)
+        let mut drive = capture(&cameras, (0..2000).map(place).collect(), true);
+        // Points are recognised up to 30 m away.
+        let points = &mut drive.points;
+        let (mut track_start, mut seen_by) = (vec![0], Vec::new());
+        for (i, place) in points.positions.iter().enumerate() {
+            let track = points
+                .track(i)
+                .unwrap()
+                .iter()
+                .filter(|view| cameras[**view as usize].centre().distance(*place) < 30.0);
+            seen_by.extend(track);
+            track_start.push(seen_by.len() as u32);
+        }
+        (points.track_start, points.seen_by) = (track_start, seen_by);
+        drive
     }
 
     const SIX: [[f64; 3]; 6] = [
@@ -224,7 +238,8 @@ mod tests {
 
     #[test]
     fn widely_spaced_photos_leave_thin_ground() {
-        let [close, wide] = [2.0, 25.0].map(|spacing| densities(&drive(20, spacing, &SIX)).remove(0));
+        let [close, wide] =
+            [(100, 2.0), (20, 25.0)].map(|(stops, spacing)| densities(&drive(stops, spacing, &SIX)).remove(0));
         assert!(close.cells.len() > 10 && close.thin_share() < 0.2, "{}", close.thin_share());
         assert!(wide.cells.len() > 10 && wide.thin_share() > 0.5, "{}", wide.thin_share());
         assert!(densities(&aerial(8, 200.0, 4000))[0].thin_share() < 0.1);

@@ -364,6 +364,9 @@ fn settings_out_of_range_are_refused() {
         PlanSettings { budget: 0, ..PlanSettings::default() },
         PlanSettings { sh_degree: 4, ..PlanSettings::default() },
         PlanSettings { levels: Some(17), ..PlanSettings::default() },
+        PlanSettings { test_stretches: f64::NAN, ..PlanSettings::default() },
+        // An aerial survey has no street.
+        PlanSettings { test_stretches: 20.0, ..PlanSettings::default() },
     ] {
         let error = plan(&capture, ArtefactId::of(b""), &bad, "cpu").unwrap_err();
         assert!(matches!(error, PlanError::Setting { .. }), "{error}");

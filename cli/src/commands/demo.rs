@@ -139,6 +139,7 @@ pub(crate) fn settings(args: &DemoArgs) -> (Settings, TrainArgs) {
             label_blocks: false,
             depth_weight: Auto(Some(0.0)),
             no_lidar: true,
+            test_stretches: 0.0,
             evaluate: false,
             test_every: 8,
             downscale: 1,
