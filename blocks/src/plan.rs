@@ -14,7 +14,7 @@ use crate::ground::{Ground, HALO_SCALE};
 use crate::lod::{Cut, training_order};
 
 /// The format version of [`Plan`] that this program reads and writes.
-pub const VERSION: u32 = 7;
+pub const VERSION: u32 = 8;
 /// The frame kind of a plan.
 pub const PLAN: Kind = Kind(*b"plan", VERSION);
 /// The maximum depth of a plan: 65,536 blocks a side.
@@ -85,6 +85,8 @@ pub struct PlanSettings {
     pub depth_weight: f64,
     /// Whether tasks of the job measure the merged model on the held-out views after training.
     pub evaluate: bool,
+    /// Whether the root refines the poses of the training views, which all other blocks reuse unchanged.
+    pub refine_poses: bool,
 }
 
 impl Default for PlanSettings {
@@ -106,6 +108,7 @@ impl Default for PlanSettings {
             label_blocks: false,
             depth_weight: 0.0,
             evaluate: false,
+            refine_poses: false,
         }
     }
 }

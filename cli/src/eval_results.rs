@@ -30,7 +30,7 @@ pub(crate) fn collect(
     let views = views_of(results.get(plan.tasks.len()..).unwrap_or_default(), store)?;
     let mut record = Record { wall_seconds: None, cpu_seconds: None, command: "eval", ..about };
     record.set_figures(&views);
-    let evaluated = Evaluated { record, sheet: None, views, cuts: Vec::new(), seams: None };
+    let evaluated = Evaluated::new(record, views);
     let folder = out.join("eval");
     make_folder(&folder)?;
     save_json(&folder.join("report.json"), &evaluated)?;
@@ -72,6 +72,8 @@ mod tests {
             ssim: 0.5,
             perceptual: None,
             lpips: None,
+            psnr_refined: None,
+            psnr_fitted: psnr,
         };
         let tasks = [vec![view("a", Some(20.0)), view("b", None)], vec![view("c", Some(30.0))]];
         let ids: Vec<ArtefactId> = tasks.iter().map(|task| store.put(eval::figures_to_frame(task)).unwrap()).collect();

@@ -135,6 +135,7 @@ pub(crate) fn settings(args: &DemoArgs) -> (Settings, TrainArgs) {
             seed: 0,
             antialiased: false,
             exposure: false,
+            refine_poses: false,
             label_blocks: false,
             depth_weight: 0.0,
             evaluate: false,

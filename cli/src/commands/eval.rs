@@ -4,7 +4,7 @@
 
 use std::path::Path;
 
-use eval::{DetailOptions, Details, Evaluation, Lpips, PhotoOptions, Photos, Request};
+use eval::{DetailOptions, Details, Evaluation, Fits, Lpips, PhotoOptions, Photos, Request};
 use model::{Model, save_json};
 
 use crate::args::EvalArgs;
@@ -43,6 +43,10 @@ pub(crate) fn measure(args: &EvalArgs, output: &Output) -> Result<Evaluated, Fai
         photos: &photos,
         backend: &backend,
         lpips: lpips.as_ref(),
+        fits: Fits {
+            pose: args.refine_poses || model.poses.is_some(),
+            exposure: args.fit_exposure || model.exposures.is_some(),
+        },
         out: &out,
     };
     let mut evaluated = evaluated(&request, output)?;
@@ -61,7 +65,8 @@ pub(crate) fn measure_trained(
     output: &Output,
 ) -> Result<Evaluated, Failure> {
     let (details, backend) = (Details::default(), train::Backend::Cpu);
-    let request = Request { model, details: &details, photos, backend: &backend, lpips, out };
+    let fits = Fits { pose: model.poses.is_some(), exposure: model.exposures.is_some() };
+    let request = Request { model, details: &details, photos, backend: &backend, lpips, fits, out };
     let evaluated = evaluated(&request, output)?;
     save_json(&out.join("report.json"), &evaluated)?;
     Ok(evaluated)
@@ -83,5 +88,5 @@ fn evaluated(request: &Request, output: &Output) -> Result<Evaluated, Failure> {
     };
     record.set_figures(&evaluation.views);
     let Evaluation { views, sheet, cuts, seams, .. } = evaluation;
-    Ok(Evaluated { record, sheet: Some(sheet), views, cuts, seams })
+    Ok(Evaluated { sheet: Some(sheet), cuts, seams, ..Evaluated::new(record, views) })
 }

@@ -10,7 +10,7 @@ use coordinator::Results;
 use dataset::ingest::Ingested;
 use model::save_json;
 use proto::{Client, Outcome};
-use scene::{ArtefactId, BadInput, GeoOrigin};
+use scene::{ArtefactId, BadInput, Capture};
 use serde::Serialize;
 use store::BlockingStore;
 use telemetry::traced;
@@ -96,7 +96,7 @@ pub(crate) fn run(args: &SubmitArgs, output: &Output) -> Result<(), Failure> {
         match &args.out {
             None => result_of(job.job, outcome, &results)?,
             Some(out) => {
-                let finished = Finished { args, plan: &plan, store: &store.blocking(), geo_origin: capture.geo_origin };
+                let finished = Finished { args, plan: &plan, store: &store.blocking(), capture: &capture };
                 text = finished.write(out, (outcome, &results), &mut submitted)?;
             }
         }
@@ -113,7 +113,7 @@ struct Finished<'a> {
     args: &'a SubmitArgs,
     plan: &'a Plan,
     store: &'a BlockingStore,
-    geo_origin: Option<GeoOrigin>,
+    capture: &'a Capture,
 }
 
 impl Finished<'_> {
@@ -125,7 +125,7 @@ impl Finished<'_> {
         (outcome, results): (Outcome, &Results),
         submitted: &mut Submitted,
     ) -> Result<String, Failure> {
-        let Self { args, plan, store, geo_origin } = *self;
+        let Self { args, plan, store, capture } = *self;
         let trained = results.first(plan.tasks.len()).filter(|_| outcome == Outcome::Incomplete);
         let (results, failed) = match (result_of(submitted.job, outcome, results), trained) {
             (Ok(()), _) => (results.all()?, None),
@@ -134,7 +134,7 @@ impl Finished<'_> {
         };
         save_json(&out.join("plan.json"), plan)?;
         let downscale = args.plan.downscale;
-        let written = model::write(out, plan, &results, store, geo_origin, downscale)?;
+        let written = model::write(out, plan, &results, store, capture, downscale)?;
         if let Some(failure) = failed {
             return Err(eval_results::model_is_kept(failure, out));
         }

@@ -117,7 +117,7 @@ pub(crate) fn train(args: &TrainArgs, output: &Output) -> Result<Trained, Failur
     let clock = Stopwatch::start();
     let Prepared { capture, capture_id, plan, plan_id, config_hash, store, ingest_cpu_seconds, .. } = prepared;
     let (store, downscale) = (store.blocking(), args.plan.downscale);
-    let written = model::write(&args.out, &plan, &finished.results, &store, capture.geo_origin, downscale)?;
+    let written = model::write(&args.out, &plan, &finished.results, &store, &capture, downscale)?;
     let totals = finished.totals;
     let mut record = Record {
         scene: captures::name_of(&args.capture),

@@ -28,6 +28,7 @@ use crate::coarse_to_fine::Tally;
 use crate::error::TrainError;
 use crate::growth::DensificationStats;
 use crate::optimiser::{self, Adam};
+use crate::pose::GivenPoses;
 
 /// Steps in flight on the device while the host reads the next photo.
 const IN_FLIGHT: usize = 2;
@@ -83,6 +84,7 @@ impl GpuDevice {
         state: &State,
         lambda: f32,
         context: Option<&Splats>,
+        _given: &Arc<GivenPoses>,
     ) -> Result<Self, TrainError> {
         let g = &**gpu;
         let kernels = Kernels {
@@ -185,7 +187,9 @@ impl GpuDevice {
             false => UpstreamPlanes::default(),
         };
         self.renderer.backward(&mut encoder, &self.splats, planes)?;
-        self.update_splats(&mut encoder, options.sh_degree, rates, samples.len());
+        if let Some(rates) = rates {
+            self.update_splats(&mut encoder, options.sh_degree, rates, samples.len());
+        }
         self.in_flight.push_back(gpu.submit(encoder)?);
         match self.in_flight.len() > IN_FLIGHT {
             true => self.in_flight.pop_front().map_or(Ok(()), |index| gpu.wait_for(index)),
