@@ -2,9 +2,9 @@
 
 use std::path::PathBuf;
 
-use eval::{ViewFigures, mean};
 use eval::cuts::CutFigures;
 use eval::seams::SeamReport;
+use eval::{ViewFigures, mean};
 use serde::Serialize;
 
 use crate::run_record::Record;
@@ -60,17 +60,22 @@ pub(crate) fn text(evaluated: &Evaluated) -> String {
         + &heading(evaluated.psnr_fitted, "fitted");
     let mut text = format!("{:>8} {:>8} {:>8} {:>11}{lpips}\n", "PSNR", "cc-PSNR", "SSIM", "SSIMULACRA2");
     for view in &evaluated.views {
-        text += &line(&view.view, [
-            view.psnr,
-            view.cc_psnr,
-            Some(view.ssim),
-            view.perceptual,
-            view.lpips,
-            view.psnr_refined,
-            view.psnr_fitted,
-        ]);
+        text += &line(
+            &view.view,
+            [
+                view.psnr,
+                view.cc_psnr,
+                Some(view.ssim),
+                view.perceptual,
+                view.lpips,
+                view.psnr_refined,
+                view.psnr_fitted,
+            ],
+        );
     }
-    text += &line("mean", [
+    text += &line(
+        "mean",
+        [
             record.psnr,
             record.cc_psnr,
             record.ssim,
@@ -78,7 +83,8 @@ pub(crate) fn text(evaluated: &Evaluated) -> String {
             record.lpips,
             evaluated.psnr_refined,
             evaluated.psnr_fitted,
-        ]);
+        ],
+    );
     text += &format!("rendered on {}\n", record.backend);
     if !evaluated.cuts.is_empty() {
         text += &format!("\n{}\n", cuts(&evaluated.cuts));

@@ -11,11 +11,11 @@ use train::Backend;
 use crate::cuts::{CutFigures, CutMeter};
 use crate::details::Details;
 use crate::figures::{Comparison, ViewFigures, clamped};
+use crate::fits::{Fits, Fitter};
 use crate::images::{colour_image, photo_image, write_png};
 use crate::seams::{SeamFrames, SeamMeter, SeamReport};
 use crate::sheet::{SheetRow, contact_sheet};
 use crate::surface::without_backdrop;
-use crate::fits::{Fits, Fitter};
 use crate::{EvalError, Lpips, Observer, Photos, Renderer, Seconds};
 
 /// Rows of a contact sheet at most; of more views an even selection is shown.
@@ -73,7 +73,7 @@ pub fn evaluate(request: &Request, observer: &dyn Observer) -> Result<Evaluation
     std::fs::create_dir_all(out).map_err(|error| EvalError::Folder { path: out.to_path_buf(), error })?;
     let reader = photos.reader(CACHE_BYTES);
     let mut renderer = Renderer::new(backend)?;
-    let mut fitter = Fitter::new(fits, &model.splats, model.antialiased, &held_out, &reader, backend)?;
+    let mut fitter = Fitter::new(fits, &model.splats, model.antialiased, &held_out, &reader)?;
     let splats = renderer.upload(&model.splats)?;
 
     // The finest cut of the model's own tree is the model itself.

@@ -7,7 +7,7 @@
 use dataset::windows::WindowReader;
 use render::Options;
 use scene::{Camera, Capture, Pixels, Splats};
-use train::{Backend, PoseFinder, TrainView, metrics};
+use train::{PoseFinder, TrainView, metrics};
 
 use crate::figures::{Comparison, ViewFigures};
 use crate::{EvalError, Renderer, Uploaded};
@@ -31,17 +31,16 @@ impl<'a> Fitter<'a> {
     /// For these views of a model.
     ///
     /// # Errors
-    /// A device that fails or has too little memory.
+    /// As [`PoseFinder::new`].
     pub(crate) fn new(
         fits: Fits,
         splats: &Splats,
         antialiased: bool,
         views: &[u32],
         reader: &'a WindowReader,
-        backend: &Backend,
     ) -> Result<Self, EvalError> {
         let windows: Vec<TrainView> = views.iter().filter_map(|&view| window(reader.capture(), view)).collect();
-        let poses = fits.pose.then(|| PoseFinder::new(splats, antialiased, &windows, reader, backend)).transpose()?;
+        let poses = fits.pose.then(|| PoseFinder::new(splats, antialiased, &windows, reader)).transpose()?;
         Ok(Self { fits, poses })
     }
 

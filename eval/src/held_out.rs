@@ -24,7 +24,7 @@ pub fn figures_of_views(
     mut goes_on: impl FnMut(usize) -> bool,
 ) -> Result<Vec<ViewFigures>, EvalError> {
     let mut renderer = Renderer::new(backend)?;
-    let mut fitter = Fitter::new(fits, splats, options.antialiased, views, reader, backend)?;
+    let mut fitter = Fitter::new(fits, splats, options.antialiased, views, reader)?;
     let splats = renderer.upload(splats)?;
     let mut figures = Vec::with_capacity(views.len());
     for &index in views {

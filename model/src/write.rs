@@ -25,7 +25,9 @@ pub(crate) fn begin(out: &Path, plan: &Plan) -> Result<PathBuf, ModelError> {
     if folder.join(MANIFEST_FILE).exists() {
         fs::remove_dir_all(&folder).map_err(cannot("replaced", &folder))?;
     }
-    for file in [MERGED_FILE, CAMERAS_FILE, "report.json", "eval/report.json", "eval/sheet.png"].map(|name| out.join(name)) {
+    for file in
+        [MERGED_FILE, CAMERAS_FILE, "report.json", "eval/report.json", "eval/sheet.png"].map(|name| out.join(name))
+    {
         if file.exists() {
             fs::remove_file(&file).map_err(cannot("replaced", &file))?;
         }

@@ -235,15 +235,14 @@ mod tests {
         }
         let bytes = encode_splats(&splats);
         assert_eq!(decode_result(&bytes).unwrap(), (splats.clone(), TrainingInfo::default()));
-        let training = 
-            TrainingInfo { exposures: Some(ArtefactId::of(b"exposures")), residual: Some(0.1), poses: None };
+        let training = TrainingInfo { exposures: Some(ArtefactId::of(b"exposures")), residual: Some(0.1), poses: None };
         let exposed = encode_result(&splats, training);
         assert_eq!(decode_result(&exposed).unwrap(), (splats.clone(), training));
         let mut labelled = splats.clone();
         labelled.set_attribute("block", vec![1, 2, 3, 4, 5]);
         labelled.set_attribute("label", vec![9; 5]);
         let with_attributes = encode_result(&labelled, training);
-        assert_eq!(decode_result(&with_attributes).unwrap(), (labelled, training));
+        assert_eq!(decode_result(&with_attributes).unwrap(), (labelled.clone(), training));
         let refined = TrainingInfo { poses: Some(ArtefactId::of(b"poses")), ..training };
         for splats in [&splats, &labelled] {
             assert_eq!(decode_result(&encode_result(splats, refined)).unwrap(), (splats.clone(), refined));

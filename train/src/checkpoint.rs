@@ -229,8 +229,18 @@ mod tests {
                 steps: vec![7, 0, 2],
                 values: [1.0, 0.5, 0.25].map(|v| vec![[v; 6], [2.0 * v; 6], [3.0 * v; 6]]),
             });
-            let state =
-                State { step, skipped, start_count, coarse_to_fine, splats, adam, densification, exposures, poses, loss };
+            let state = State {
+                step,
+                skipped,
+                start_count,
+                coarse_to_fine,
+                splats,
+                adam,
+                densification,
+                exposures,
+                poses,
+                loss,
+            };
             let bytes = state.to_frame();
             let read = State::from_frame(&bytes).unwrap();
             assert_eq!((read.step, read.skipped, read.start_count), (40, 1, 7));

@@ -1,7 +1,7 @@
 //! Finds the pose of a view against splats that stay as they are (test-time pose optimisation, as BARF evaluates).
 //!
 //! A held-out photo of a capture with pose errors has such an error too, and training cannot remove it. The steps are
-//! those of training with refined poses, without an update of the splats, coarse mips first.
+//! those of training with refined poses, without an update of the splats, coarse mips first. They run on the CPU.
 
 use std::sync::Arc;
 
@@ -39,7 +39,7 @@ pub struct PoseFinder<'a> {
 }
 
 impl<'a> PoseFinder<'a> {
-    /// Copies the splats to the backend. Only the poses of these views can be found.
+    /// Copies the splats. Only the poses of these views can be found.
     ///
     /// # Errors
     /// A device that fails or has too little memory.
@@ -48,7 +48,6 @@ impl<'a> PoseFinder<'a> {
         antialiased: bool,
         views: &[TrainView],
         source: &'a dyn WindowSource,
-        backend: &Backend,
     ) -> Result<Self, TrainError> {
         let given = Arc::new(GivenPoses::of(views, splats, false));
         let isa = Isa::detect();
@@ -65,7 +64,7 @@ impl<'a> PoseFinder<'a> {
             splats: splats.clone(),
             loss: f64::NAN,
         };
-        let device = backend.open(&state, Recipe::default().lambda, None, &given)?;
+        let device = Backend::Cpu.open(&state, Recipe::default().lambda, None, &given)?;
         Ok(Self { device, state, antialiased, source })
     }
 
@@ -109,7 +108,7 @@ impl<'a> PoseFinder<'a> {
                 done += 1;
             }
         }
-        self.device.download(&mut self.state, StatePart::Views)?;
+        self.device.download(&mut self.state, StatePart::Tally)?;
         let poses = self.state.poses.as_ref().map(|poses| poses.apply(view.view, &view.camera));
         Ok(poses.unwrap_or(view.camera).camera_from_world)
     }

@@ -84,8 +84,7 @@ pub fn half_fitted_psnr(render: &[f32], photo: &[f32], width: usize, mask: Optio
     let mut corrected = render.to_vec();
     let fit = ColourFit::of(render, photo, pixels().filter(is_left));
     fit.correct(render, pixels().filter(|i| !is_left(i)), &mut corrected);
-    let measured: Vec<u8> =
-        (0..area).map(|i| if is_left(&i) { 0 } else { mask.map_or(255, |mask| mask[i]) }).collect();
+    let measured: Vec<u8> = (0..area).map(|i| if is_left(&i) { 0 } else { mask.map_or(255, |mask| mask[i]) }).collect();
     psnr(&corrected, photo, Some(&measured))
 }
 

@@ -22,6 +22,10 @@ const BETA1: f32 = 0.9;
 /// Adam's usual 0.999 remembers longer than a view is drawn.
 const BETA2: f32 = 0.99;
 const EPSILON: f32 = 1e-15;
+/// Learning rate of translations in units of the depth, relative to that of rotations. Either explains nearly the same
+/// motion of an image, and the error of a measured translation is the smaller one seen from a distance. At 1 the
+/// translations of a city with errors of 0.15 m and 0.6° got twice as wrong; at 0.2 they stayed as they were.
+const TRANSLATION_RATE: f32 = 0.2;
 /// Splats whose depths a view's median is taken of.
 const SAMPLED_SPLATS: usize = 4096;
 
@@ -102,15 +106,6 @@ fn joined([translation, rotation]: [DVec3; 2]) -> [f32; 6] {
     [x, y, z, a, b, c].map(|value| value as f32)
 }
 
-/// Rates of one step.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct PoseRates {
-    /// Learning rate: radians, and metres per metre of depth.
-    pub(crate) rate: f32,
-    /// Share of every displacement of a view in the step that is taken back.
-    pub(crate) decay: f32,
-}
-
 /// Displacements in training, each with its own Adam state. A view's step count is the number of times that it was
 /// rendered while poses were trained.
 #[derive(Debug, Clone, PartialEq)]
@@ -157,11 +152,12 @@ impl PoseTraining {
         let ages = [1.0 - BETA1.powi(age), 1.0 - BETA2.powi(age)];
         let [values, first, second] = &mut self.values;
         for (k, gradient) in gradient.iter().enumerate() {
-            let rate = if k < 3 { rates.rate * depth } else { rates.rate };
+            let rate = if k < 3 { TRANSLATION_RATE * rates.rate * depth } else { rates.rate };
             let (m, v) = (&mut first[at][k], &mut second[at][k]);
             *m = BETA1 * *m - (1.0 - BETA1) * gradient;
             *v = BETA2 * *v + (1.0 - BETA2) * gradient * gradient;
-            values[at][k] = (1.0 - rates.decay) * values[at][k] - rate * (*m / ages[0]) / ((*v / ages[1]).sqrt() + EPSILON);
+            values[at][k] =
+                (1.0 - rates.decay) * values[at][k] - rate * (*m / ages[0]) / ((*v / ages[1]).sqrt() + EPSILON);
         }
         if given.is_anchored {
             remove_common_motion(values, given);

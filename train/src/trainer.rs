@@ -109,8 +109,11 @@ pub fn train_from(
     if job.views.is_empty() {
         return Err(TrainError::NoViews);
     }
-    if job.backend.is_gpu() && (job.trains_exposures || job.trains_poses || job.exposures.is_some()) {
+    if job.backend.is_gpu() && (job.trains_exposures || job.exposures.is_some()) {
         return Err(TrainError::Exposures);
+    }
+    if job.backend.is_gpu() && job.trains_poses {
+        return Err(TrainError::Poses);
     }
     let mut trainer = Trainer::new(job, from)?;
     let steps = trainer.job.steps;

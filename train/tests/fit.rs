@@ -376,7 +376,8 @@ fn disturbed_poses_are_refined_with_the_splats() {
     let (photos, truth) = (photos(&ground_truth), views());
     let given = disturbed(&truth);
     let run = |trains_poses| {
-        let setup = Setup { trains_poses, steps: 1200, views: given.clone(), ..Setup::new(perturbed(&ground_truth), &photos) };
+        let setup =
+            Setup { trains_poses, steps: 1200, views: given.clone(), ..Setup::new(perturbed(&ground_truth), &photos) };
         setup.try_run_on(None, &|_| true, &mut |_| Flow::Continue).unwrap()
     };
     let (without, with) = (run(false), run(true));
@@ -411,7 +412,12 @@ fn poses_do_not_depend_on_threads_or_interruptions() {
             if left.is_some() { Flow::Stop } else { Flow::Continue }
         };
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-        let setup = Setup { trains_poses: true, steps: 120, views: disturbed(&views()), ..Setup::new(perturbed(&ground_truth), &photos) };
+        let setup = Setup {
+            trains_poses: true,
+            steps: 120,
+            views: disturbed(&views()),
+            ..Setup::new(perturbed(&ground_truth), &photos)
+        };
         let done = pool.install(|| setup.try_run_on(from, &|_| true, &mut report)).unwrap();
         (done, left)
     };

@@ -106,13 +106,16 @@ impl Block<'_> {
 
         let Trained { mut splats, exposures, poses } = self.optimise(job, limit.as_ref(), &mut progress)?;
         let refined: Vec<TrainView> = match &poses {
-            Some(poses) => views.iter().map(|view| TrainView { camera: poses.apply(view.view, view.camera), ..*view }).collect(),
+            Some(poses) => {
+                views.iter().map(|view| TrainView { camera: poses.apply(view.view, view.camera), ..*view }).collect()
+            }
             None => views.clone(),
         };
         // Set if the last step of training is not the last one to report.
         let mut last_step = (is_settled && pruning.is_none()).then_some(task.steps);
         if let Some(pruning) = pruning.filter(|_| !progress.is_stopped && !progress.is_late) {
-            let job = Job { exposures: exposures.as_ref().or(self.given_exposures), ..job_of(splats, all_steps, &refined) };
+            let job =
+                Job { exposures: exposures.as_ref().or(self.given_exposures), ..job_of(splats, all_steps, &refined) };
             splats = self.prune(job, &pruning, trained, limit.as_ref(), &mut progress)?;
             last_step = Some(progress.steps);
         }
@@ -277,7 +280,9 @@ impl Block<'_> {
     /// The failure class of a training error.
     fn failure(&self, error: TrainError) -> ExecuteError {
         let kind = match error {
-            TrainError::NoViews | TrainError::Exposures | TrainError::Empty(_) => FailureKind::Input,
+            TrainError::NoViews | TrainError::Exposures | TrainError::Poses | TrainError::Empty(_) => {
+                FailureKind::Input
+            }
             TrainError::Device(_) => FailureKind::Work,
             TrainError::OutOfMemory(_) => FailureKind::OutOfMemory,
             // Windows carry checksums: an unreadable one is unreachable or damaged, which the input does not explain.

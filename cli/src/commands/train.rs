@@ -250,6 +250,9 @@ fn backend_of(args: &TrainArgs) -> Result<train::Backend, BadInput> {
     if args.backend == Backend::Gpu && args.plan.exposure {
         return Err(BadInput::new("--exposure", "is not trained on a GPU", "leave it, or give --backend cpu"));
     }
+    if args.backend == Backend::Gpu && args.plan.refine_poses {
+        return Err(BadInput::new("--refine-poses", "is not done on a GPU", "leave it, or give --backend cpu"));
+    }
     backend::open(args.backend)
 }
 

@@ -28,7 +28,6 @@ use crate::coarse_to_fine::Tally;
 use crate::error::TrainError;
 use crate::growth::DensificationStats;
 use crate::optimiser::{self, Adam};
-use crate::pose::GivenPoses;
 
 /// Steps in flight on the device while the host reads the next photo.
 const IN_FLIGHT: usize = 2;
@@ -84,7 +83,6 @@ impl GpuDevice {
         state: &State,
         lambda: f32,
         context: Option<&Splats>,
-        _given: &Arc<GivenPoses>,
     ) -> Result<Self, TrainError> {
         let g = &**gpu;
         let kernels = Kernels {

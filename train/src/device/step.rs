@@ -51,8 +51,6 @@ pub(crate) struct ViewSample {
 pub(crate) enum StatePart {
     /// Last loss, errors of the epoch, number of skipped steps.
     Tally,
-    /// Exposures and poses in training.
-    Views,
     /// The splats.
     Splats,
     /// Everything that the next step depends on.

@@ -9,7 +9,9 @@ use render::Options;
 use render::cpu::Renderer;
 use scene::splats::SH_C0;
 use scene::{Camera, Exposures, Pinhole, Pixels, Rect, Rigid, Splat, Splats};
-use train::{Backend, Flow, Job, Recipe, State, TrainError, TrainView, WindowSource, Trained, metrics, random, train_from};
+use train::{
+    Backend, Flow, Job, Recipe, State, TrainError, TrainView, Trained, WindowSource, metrics, random, train_from,
+};
 
 pub const WIDTH: u32 = 64;
 pub const HEIGHT: u32 = 48;
