@@ -87,6 +87,8 @@ pub struct PlanSettings {
     pub evaluate: bool,
     /// Width of the stretches of streets of which about one in ten is held out as well, metres; see [`crate::Split`]. 0: none.
     pub test_stretches: f64,
+    /// Whether the root refines the poses of the training views, which all other blocks reuse unchanged.
+    pub refine_poses: bool,
 }
 
 impl Default for PlanSettings {
@@ -109,6 +111,7 @@ impl Default for PlanSettings {
             depth_weight: 0.0,
             evaluate: false,
             test_stretches: 0.0,
+            refine_poses: false,
         }
     }
 }

@@ -116,6 +116,10 @@ fn check(settings: &PlanSettings) -> Result<(), PlanError> {
         let problem = "flat blocks have no root that trains the exposures";
         return bad("--exposure", problem.into(), "omit it, or use --blocks tree or whole");
     }
+    if settings.refine_poses && settings.mode == Mode::Flat {
+        let problem = "flat blocks have no root that refines the poses";
+        return bad("--refine-poses", problem.into(), "omit it, or use --blocks tree or whole");
+    }
     if settings.sh_degree > 3 {
         return bad("sh_degree", format!("{} is not supported", settings.sh_degree), "give 0 to 3");
     }

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use eval::cuts::CutFigures;
 use eval::seams::SeamReport;
-use eval::{ByKind, Group, Summary, ViewFigures};
+use eval::{ByKind, Group, Summary, ViewFigures, mean};
 use serde::Serialize;
 
 use crate::run_record::Record;
@@ -14,6 +14,12 @@ use crate::run_record::Record;
 pub(crate) struct Evaluated {
     #[serde(flatten)]
     pub(crate) record: Record,
+    /// dB over the held-out views, each from the pose that fits its photo best.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(crate) psnr_refined: Option<f64>,
+    /// dB over the right halves of the held-out views, with the exposure fitted to the left half of each.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(crate) psnr_fitted: Option<f64>,
     /// The contact sheet; tasks of a job draw none.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) sheet: Option<PathBuf>,
@@ -36,25 +42,66 @@ pub(crate) struct Evaluated {
     pub(crate) seams: Option<SeamReport>,
 }
 
+impl Evaluated {
+    /// The figures of these views alone.
+    pub(crate) fn new(record: Record, views: Vec<ViewFigures>) -> Self {
+        let psnr_refined = mean(views.iter().map(|view| view.psnr_refined));
+        let psnr_fitted = mean(views.iter().map(|view| view.psnr_fitted));
+        Self {
+            record,
+            psnr_refined,
+            psnr_fitted,
+            sheet: None,
+            views,
+            by_kind: ByKind::default(),
+            stretches: None,
+            trained_on: None,
+            cuts: Vec::new(),
+            seams: None,
+        }
+    }
+}
+
 /// The figures, a line per view, then cuts and seams.
 pub(crate) fn text(evaluated: &Evaluated) -> String {
     let record = &evaluated.record;
-    let line = |name: &str, [psnr, cc_psnr, ssim, perceptual, lpips]: [Option<f64>; 5]| {
-        let lpips = record.lpips.map_or(String::new(), |_| format!(" {:>8}", figure(lpips, 4)));
+    let column = |is_measured: Option<f64>, value, digits| {
+        is_measured.map_or(String::new(), |_| format!(" {:>8}", figure(value, digits)))
+    };
+    let line = |name: &str, [psnr, cc_psnr, ssim, perceptual, lpips, refined, fitted]: [Option<f64>; 7]| {
+        let lpips = column(record.lpips, lpips, 4)
+            + &column(evaluated.psnr_refined, refined, 2)
+            + &column(evaluated.psnr_fitted, fitted, 2);
         let [psnr, cc_psnr] = [psnr, cc_psnr].map(|value| figure(value, 2));
         format!("{psnr:>8} {cc_psnr:>8} {:>8} {:>11}{lpips}  {name}\n", figure(ssim, 4), figure(perceptual, 2))
     };
-    let lpips = if record.lpips.is_some() { "    LPIPS" } else { "" };
+    let heading = |is_measured: Option<f64>, name: &str| is_measured.map_or(String::new(), |_| format!(" {name:>8}"));
+    let lpips = heading(record.lpips, "LPIPS")
+        + &heading(evaluated.psnr_refined, "refined")
+        + &heading(evaluated.psnr_fitted, "fitted");
     let mut text = format!("{:>8} {:>8} {:>8} {:>11}{lpips}\n", "PSNR", "cc-PSNR", "SSIM", "SSIMULACRA2");
     for view in &evaluated.views {
-        text += &line(&view.view, [view.psnr, view.cc_psnr, Some(view.ssim), view.perceptual, view.lpips]);
+        text += &line(
+            &view.view,
+            [
+                view.psnr,
+                view.cc_psnr,
+                Some(view.ssim),
+                view.perceptual,
+                view.lpips,
+                view.psnr_refined,
+                view.psnr_fitted,
+            ],
+        );
     }
-    text += &line("mean", [record.psnr, record.cc_psnr, record.ssim, record.perceptual, record.lpips]);
+    let fitted = [evaluated.psnr_refined, evaluated.psnr_fitted];
+    let mean_of = [record.psnr, record.cc_psnr, record.ssim, record.perceptual, record.lpips, fitted[0], fitted[1]];
+    text += &line("mean", mean_of);
     for (name, summary) in summaries(evaluated) {
         let Summary { views, psnr, cc_psnr, ssim, ssimulacra2, lpips, worst_psnr, worst_cc_gap } = summary;
         let [worst, gap] = [worst_psnr, worst_cc_gap].map(|value| figure(value, 2));
         let name = format!("{name}: {views} views, worst {worst} dB, up to {gap} dB below cc-PSNR");
-        text += &line(&name, [psnr, cc_psnr, ssim, ssimulacra2, lpips]);
+        text += &line(&name, [psnr, cc_psnr, ssim, ssimulacra2, lpips, None, None]);
     }
     text += &format!("rendered on {}\n", record.backend);
     if !evaluated.cuts.is_empty() {

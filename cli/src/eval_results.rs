@@ -36,14 +36,9 @@ pub(crate) fn collect(
     let mut record = Record { wall_seconds: None, cpu_seconds: None, command: "eval", ..about };
     record.set_figures(&views);
     let evaluated = Evaluated {
-        record,
-        sheet: None,
         by_kind: ByKind::of(&views, &test, &kinds),
-        views,
         stretches: Group::of(in_stretches, &stretches, &kinds),
-        trained_on: None,
-        cuts: Vec::new(),
-        seams: None,
+        ..Evaluated::new(record, views)
     };
     let folder = out.join("eval");
     make_folder(&folder)?;
@@ -86,6 +81,8 @@ mod tests {
             ssim: 0.5,
             perceptual: None,
             lpips: None,
+            psnr_refined: None,
+            psnr_fitted: psnr,
         };
         let tasks = [vec![view("a", Some(20.0)), view("b", None)], vec![view("c", Some(30.0))]];
         let ids: Vec<ArtefactId> = tasks.iter().map(|task| store.put(eval::figures_to_frame(task)).unwrap()).collect();

@@ -12,6 +12,7 @@ use train::Backend;
 use crate::cuts::{CutFigures, CutMeter};
 use crate::details::Details;
 use crate::figures::{Comparison, ViewFigures, clamped};
+use crate::fits::{Fits, Fitter};
 use crate::images::{colour_image, photo_image, write_png};
 use crate::seams::{SeamFrames, SeamMeter, SeamReport};
 use crate::sheet::{SheetRow, contact_sheet};
@@ -36,6 +37,8 @@ pub struct Request<'a> {
     pub backend: &'a Backend,
     /// The network for LPIPS.
     pub lpips: Option<&'a Lpips>,
+    /// What is fitted to each photo for further figures.
+    pub fits: Fits,
     /// Folder for contact sheets and pictures; created if need be.
     pub out: &'a Path,
     /// How many views that were trained on to measure as well, evenly chosen.
@@ -71,7 +74,7 @@ pub struct Evaluation {
 /// # Errors
 /// A capture without held-out views, photos that cannot be read, a renderer that fails, pictures that cannot be written.
 pub fn evaluate(request: &Request, observer: &dyn Observer) -> Result<Evaluation, EvalError> {
-    let Request { model, details, photos, backend, lpips, out, .. } = *request;
+    let Request { model, details, photos, backend, lpips, fits, out, .. } = *request;
     let [test, stretches, trained] = [Part::Test, Part::Stretch, Part::Trained].map(|part| photos.split.views(part));
     let held_out = [test.as_slice(), &stretches].concat();
     if held_out.is_empty() {
@@ -81,6 +84,7 @@ pub fn evaluate(request: &Request, observer: &dyn Observer) -> Result<Evaluation
     std::fs::create_dir_all(out).map_err(|error| EvalError::Folder { path: out.to_path_buf(), error })?;
     let reader = photos.reader(CACHE_BYTES);
     let mut renderer = Renderer::new(backend)?;
+    let mut fitter = Fitter::new(fits, &model.splats, model.antialiased, &held_out, &reader)?;
     let splats = renderer.upload(&model.splats)?;
 
     // The finest cut of the model's own tree is the model itself.
@@ -104,7 +108,9 @@ pub fn evaluate(request: &Request, observer: &dyn Observer) -> Result<Evaluation
         let frame = renderer.render(&splats, &view.camera, &model.options())?;
         render_seconds.add(began, observer.now());
         let compared = Comparison::new(&view.name, &frame.colour, &photo);
-        let figures = compared.figures(lpips)?;
+        let mut figures = compared.figures(lpips)?;
+        let rendering = (&mut renderer, &splats, &model.options());
+        fitter.add(&mut figures, (index, &photo), &compared, rendering, &photos.capture)?;
         if i.is_multiple_of(shown_every) {
             rows.push(SheetRow {
                 label: view.name.clone(),

@@ -11,7 +11,7 @@ use train::metrics;
 use crate::lpips::Lpips;
 
 /// The frame kind of a list of [`ViewFigures`].
-pub const FIGURES: Kind = Kind(*b"figs", 1);
+pub const FIGURES: Kind = Kind(*b"figs", 2);
 
 /// Figures of one view. The field names are keys of `eval/report.json`; their order is part of the frame's format.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -28,6 +28,11 @@ pub struct ViewFigures {
     pub perceptual: Option<f64>,
     /// Null without a network.
     pub lpips: Option<f64>,
+    /// dB, from the pose that fits the photo best; null where poses are not fitted.
+    pub psnr_refined: Option<f64>,
+    /// dB of the right half, after the affine colour transform that brings the left half closest to the photo, from the
+    /// fitted pose where poses are fitted; null where exposures are not.
+    pub psnr_fitted: Option<f64>,
 }
 
 /// Encodes figures as a frame: the result of an evaluation task.
@@ -86,6 +91,8 @@ impl<'a> Comparison<'a> {
             ssim: metrics::ssim(&render, truth, *width, *height),
             perceptual: metrics::ssimulacra2(truth, &render, *width, *height),
             lpips: lpips.map(|lpips| lpips.distance(&render, truth, *width, *height)).transpose()?,
+            psnr_refined: None,
+            psnr_fitted: None,
         })
     }
 }

@@ -6,6 +6,7 @@ use scene::{BadInput, Splats};
 use train::Backend;
 
 use crate::figures::{Comparison, ViewFigures};
+use crate::fits::{Fits, Fitter};
 use crate::{EvalError, Renderer};
 
 /// The figures of these views of the reader's capture at full resolution, in order, as [`crate::evaluate`] computes them, without
@@ -19,9 +20,11 @@ pub fn figures_of_views(
     reader: &WindowReader,
     views: &[u32],
     backend: &Backend,
+    fits: Fits,
     mut goes_on: impl FnMut(usize) -> bool,
 ) -> Result<Vec<ViewFigures>, EvalError> {
     let mut renderer = Renderer::new(backend)?;
+    let mut fitter = Fitter::new(fits, splats, options.antialiased, views, reader)?;
     let splats = renderer.upload(splats)?;
     let mut figures = Vec::with_capacity(views.len());
     for &index in views {
@@ -32,7 +35,11 @@ pub fn figures_of_views(
         })?;
         let photo = reader.window(index, 0, view.camera.full())?;
         let frame = renderer.render(&splats, &view.camera, options)?;
-        figures.push(Comparison::new(&view.name, &frame.colour, &photo).figures(None)?);
+        let compared = Comparison::new(&view.name, &frame.colour, &photo);
+        let mut of_view = compared.figures(None)?;
+        let rendering = (&mut renderer, &splats, options);
+        fitter.add(&mut of_view, (index, &photo), &compared, rendering, reader.capture())?;
+        figures.push(of_view);
         if !goes_on(figures.len()) {
             break;
         }

@@ -29,21 +29,24 @@ pub struct Pruner<'a> {
 }
 
 impl<'a> Pruner<'a> {
-    /// Reads nothing yet but the plan of a trained model, whose exposures count only if it was trained on these photos.
+    /// Reads nothing yet but the plan of a trained model, whose exposures and poses count only if it was trained on these photos.
     ///
     /// # Errors
     /// A trained model whose plan cannot be read.
     pub fn new(model: &'a Model, photos: &Photos, observer: &dyn Observer) -> Result<Self, EvalError> {
-        let has_own_photos = match (&model.exposures, &model.trained) {
-            (Some(_), Some((_, out))) => Some(read_tree(out)?.plan.capture) == photos.id,
+        let knows_its_photos = model.exposures.is_some() || model.poses.is_some();
+        let has_own_photos = match &model.trained {
+            Some((_, out)) if knows_its_photos => Some(read_tree(out)?.plan.capture) == photos.id,
             _ => false,
         };
-        if model.exposures.is_some() && !has_own_photos {
-            observer.note("the model was trained on other photos: its exposures are left out");
+        if knows_its_photos && !has_own_photos {
+            observer.note("the model was trained on other photos: its exposures are left out, and its refined poses");
         }
+        let poses = model.poses.as_ref().filter(|_| has_own_photos);
         let views = |part: Part| {
             let window = |i: u32| {
-                let camera = photos.capture.views[i as usize].camera;
+                let given = photos.capture.views[i as usize].camera;
+                let camera = poses.map_or(given, |poses| poses.apply(i, given));
                 TrainView { view: i, mip: 0, rect: camera.full(), camera }
             };
             photos.split.views(part).into_iter().map(window).collect()
@@ -115,6 +118,7 @@ impl<'a> Pruner<'a> {
             size_bounds_metres: size_bounds(&model.splats),
             exposures: self.exposures,
             trains_exposures: false,
+            trains_poses: false,
             recipe: &recipe,
             source: &self.reader,
             backend: &Backend::Cpu,

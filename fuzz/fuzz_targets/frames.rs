@@ -4,8 +4,9 @@
 use blocks::{Plan, plan::PLAN};
 use libfuzzer_sys::fuzz_target;
 use scene::exposures::EXPOSURES;
-use scene::{Capture, Exposures};
-use scene::frame::{self, Kind, SPLATS, SPLATS_WITH_ATTRIBUTES};
+use scene::poses::POSES;
+use scene::{Capture, Exposures, Poses};
+use scene::frame::{self, Kind, SPLATS, SPLATS_WITH_ATTRIBUTES, SPLATS_WITH_POSES};
 
 /// The same as `dataset::ingest::CAPTURE`.
 const CAPTURE: Kind = Kind(*b"capt", 1);
@@ -16,10 +17,13 @@ fuzz_target!(|bytes: &[u8]| {
     for header in 0..bytes.len().min(96) {
         let _ = frame::decode_splats(&sealed(SPLATS, bytes, header));
         let _ = frame::decode_splats(&sealed(SPLATS_WITH_ATTRIBUTES, bytes, header));
+        let _ = frame::decode_splats(&sealed(SPLATS_WITH_POSES, bytes, header));
     }
     let _ = Exposures::from_frame(bytes);
+    let _ = Poses::from_frame(bytes);
     for header in 0..bytes.len().min(10) {
         let _ = Exposures::from_frame(&sealed(EXPOSURES, bytes, header));
+        let _ = Poses::from_frame(&sealed(POSES, bytes, header));
     }
     if let Ok(plan) = Plan::from_frame(&sealed(PLAN, bytes, bytes.len())) {
         plan.leaves();

@@ -34,6 +34,9 @@ pub enum ModelError {
     /// The artefact of this block is damaged.
     #[error("block {0}: {1}")]
     DamagedResult(BlockId, CodecError),
+    /// The artefact of the refined poses is damaged.
+    #[error("refined poses: {0}")]
+    DamagedPoses(CodecError),
 }
 
 /// For `map_err` on file system calls.

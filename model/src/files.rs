@@ -10,6 +10,8 @@ use store::file::{SaveError, save};
 pub(crate) const MANIFEST_FILE: &str = "model.json";
 pub(crate) const PLAN_FILE: &str = "plan.plat";
 pub(crate) const EXPOSURES_FILE: &str = "exposures.plat";
+pub(crate) const POSES_FILE: &str = "poses.plat";
+pub(crate) const CAMERAS_FILE: &str = "cameras.json";
 pub(crate) const MERGED_FILE: &str = "merged.ply";
 
 /// File name of a block's splats.

@@ -4,8 +4,10 @@
 //! OUT/model/model.json          the manifest; written last, so a folder without it holds no model
 //! OUT/model/plan.plat           the plan as a frame: ground, tree, tasks
 //! OUT/model/exposures.plat      exposures of the training views, where they were trained
+//! OUT/model/poses.plat          poses of the training views, where they were refined
 //! OUT/model/blocks/L-x-y.plat   splats of one block with its halo, as a frame
 //! OUT/merged.ply                the finest cut, merged
+//! OUT/cameras.json              the refined cameras as transforms.json, where poses were refined
 //! ```
 //!
 //! Architecture invariant: no terminal and no exit codes. Errors are [`BadInput`](scene::BadInput) where a file cannot be read
@@ -21,7 +23,7 @@ mod write;
 use std::path::{Path, PathBuf};
 
 use blocks::{Ground, Split};
-use scene::{BadInput, Capture, Exposures, Splats, ply, spz};
+use scene::{BadInput, Capture, Exposures, Poses, Splats, ply, spz};
 
 pub use error::ModelError;
 pub use files::save_json;
@@ -44,6 +46,8 @@ pub struct Model {
     pub antialiased: bool,
     /// Exposures of the training views, by view of the plan's capture. Views are rendered without them.
     pub exposures: Option<Exposures>,
+    /// Refined poses of the training views, by view of the plan's capture.
+    pub poses: Option<Poses>,
     /// Of a trained model: its manifest and the folder that `plat train` wrote.
     pub trained: Option<(Manifest, PathBuf)>,
 }

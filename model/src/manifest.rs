@@ -32,6 +32,9 @@ pub struct Manifest {
     /// Id of the file of the training views' exposures, if there is one.
     #[serde(default)]
     pub exposures: Option<ArtefactId>,
+    /// Id of the file of the training views' refined poses, if there is one.
+    #[serde(default)]
+    pub poses: Option<ArtefactId>,
     /// Splats of the finest cut.
     pub splats: u64,
     /// By (level, y, x).

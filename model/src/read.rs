@@ -5,9 +5,9 @@ use std::convert::Infallible;
 use std::path::{Path, PathBuf};
 
 use blocks::{Cut, Plan};
-use scene::{BLOCK_ATTRIBUTE, BadInput, BlockId, CodecError, Exposures, Splats, frame, ply, spz};
+use scene::{BLOCK_ATTRIBUTE, BadInput, BlockId, CodecError, Exposures, Poses, Splats, frame, ply, spz};
 
-use crate::files::{EXPOSURES_FILE, MANIFEST_FILE, PLAN_FILE, block_file, damaged, load};
+use crate::files::{EXPOSURES_FILE, MANIFEST_FILE, PLAN_FILE, POSES_FILE, block_file, damaged, load};
 use crate::manifest::{Manifest, VERSION};
 use crate::{ANTIALIASED, Model};
 
@@ -31,11 +31,11 @@ pub fn read(path: &Path) -> Result<Model, BadInput> {
     let bytes = load(path)?;
     if is("spz") {
         let (splats, antialiased) = spz::read(&bytes).map_err(|error| damaged(path, &error))?;
-        return Ok(Model { splats, antialiased, exposures: None, trained: None });
+        return Ok(Model { splats, antialiased, exposures: None, poses: None, trained: None });
     }
     let splats = ply::read(&bytes).map_err(|error| damaged(path, &error))?;
     let antialiased = ply::comments(&bytes).iter().any(|comment| comment.trim() == ANTIALIASED);
-    Ok(Model { splats, antialiased, exposures: None, trained: None })
+    Ok(Model { splats, antialiased, exposures: None, poses: None, trained: None })
 }
 
 fn read_trained(folder: &Path) -> Result<Model, BadInput> {
@@ -50,8 +50,15 @@ fn read_trained(folder: &Path) -> Result<Model, BadInput> {
         }
         None => None,
     };
+    let poses = match manifest.poses {
+        Some(_) => {
+            let path = folder.join(POSES_FILE);
+            Some(Poses::from_frame(&load(&path)?).map_err(|error| damaged(&path, &error))?)
+        }
+        None => None,
+    };
     let antialiased = manifest.antialiased;
-    Ok(Model { splats, antialiased, exposures, trained: Some((manifest, out.to_path_buf())) })
+    Ok(Model { splats, antialiased, exposures, poses, trained: Some((manifest, out.to_path_buf())) })
 }
 
 /// A trained model block by block.
@@ -136,7 +143,7 @@ mod tests {
     fn model(antialiased: bool) -> Model {
         let mut splats = Splats::new(0);
         splats.push(&Splat::round(Vec3::new(1.0, 2.0, 3.0), -1.0, Vec3::splat(0.5), 0.9));
-        Model { splats, antialiased, exposures: None, trained: None }
+        Model { splats, antialiased, exposures: None, poses: None, trained: None }
     }
 
     #[test]

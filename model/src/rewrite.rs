@@ -7,7 +7,7 @@ use scene::{ArtefactId, BadInput, Splats, frame};
 use store::file::save;
 
 use crate::error::{ModelError, cannot};
-use crate::files::{EXPOSURES_FILE, MANIFEST_FILE, MERGED_FILE, block_file, save_json};
+use crate::files::{EXPOSURES_FILE, MANIFEST_FILE, MERGED_FILE, POSES_FILE, block_file, save_json};
 use crate::read::{Tree, read_tree};
 use crate::write::begin;
 use crate::{BlockEntry, Manifest, Model};
@@ -75,12 +75,15 @@ pub fn rewrite(path: &Path, out: &Path, model: Model, splats: Splats) -> Result<
     finish(out, &folder, &manifest, &Model { splats, trained: None, ..model })
 }
 
-/// Writes `merged.ply`, the exposures and at last the manifest; returns the bytes of `merged.ply`.
+/// Writes `merged.ply`, exposures, poses and at last the manifest; returns the bytes of `merged.ply`.
 fn finish(out: &Path, folder: &Path, manifest: &Manifest, model: &Model) -> Result<u64, ModelError> {
     let merged = model.to_ply();
     save(&out.join(MERGED_FILE), &merged)?;
     if let Some(exposures) = &model.exposures {
         save(&folder.join(EXPOSURES_FILE), &exposures.to_frame())?;
+    }
+    if let Some(poses) = &model.poses {
+        save(&folder.join(POSES_FILE), &poses.to_frame())?;
     }
     save_json(&folder.join(MANIFEST_FILE), manifest)?;
     Ok(merged.len() as u64)

@@ -5,12 +5,15 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use blocks::Plan;
-use scene::{ArtefactId, BlockId, GeoOrigin, Splats, frame, ply};
+use scene::transforms::{self, Frame, Intrinsics, Transforms};
+use scene::{ArtefactId, BlockId, CameraModel, Capture, Poses, Splats, frame, ply};
 use store::BlockingStore;
 use store::file::{AtomicFile, save};
 
 use crate::error::{ModelError, cannot};
-use crate::files::{EXPOSURES_FILE, MANIFEST_FILE, MERGED_FILE, PLAN_FILE, block_file, save_json};
+use crate::files::{
+    CAMERAS_FILE, EXPOSURES_FILE, MANIFEST_FILE, MERGED_FILE, PLAN_FILE, POSES_FILE, block_file, save_json,
+};
 use crate::manifest::{BlockEntry, Manifest, VERSION};
 use crate::ply_comments;
 use crate::read::read_block;
@@ -22,7 +25,9 @@ pub(crate) fn begin(out: &Path, plan: &Plan) -> Result<PathBuf, ModelError> {
     if folder.join(MANIFEST_FILE).exists() {
         fs::remove_dir_all(&folder).map_err(cannot("replaced", &folder))?;
     }
-    for file in [MERGED_FILE, "report.json", "eval/report.json", "eval/sheet.png"].map(|name| out.join(name)) {
+    for file in
+        [MERGED_FILE, CAMERAS_FILE, "report.json", "eval/report.json", "eval/sheet.png"].map(|name| out.join(name))
+    {
         if file.exists() {
             fs::remove_file(&file).map_err(cannot("replaced", &file))?;
         }
@@ -41,7 +46,7 @@ pub struct Written {
     pub bytes: u64,
 }
 
-/// Writes the results of all tasks of a plan, in the plan's order, under `out`. Holds one block in memory at a time, as a model
+/// Writes the results of all tasks of a plan for this capture, in the plan's order, under `out`. Holds one block in memory at a time, as a model
 /// may be larger than memory.
 ///
 /// # Errors
@@ -51,14 +56,15 @@ pub fn write(
     plan: &Plan,
     results: &[ArtefactId],
     store: &BlockingStore,
-    geo_origin: Option<GeoOrigin>,
+    capture: &Capture,
     downscale: u32,
 ) -> Result<Written, ModelError> {
     let folder = begin(out, plan)?;
     let (leaves, sh_degree) = (plan.leaves(), plan.settings.sh_degree);
     let owned = |splats: &Splats, block| leaves.keep(splats, &plan.ground, block).with_sh_degree(sh_degree);
 
-    let (mut blocks, mut exposures, mut count, mut attributes) = (Vec::new(), None, 0, BTreeSet::new());
+    let (mut blocks, mut exposures, mut poses) = (Vec::new(), None, None);
+    let (mut count, mut attributes) = (0, BTreeSet::new());
     for (index, task) in plan.tasks.iter().enumerate() {
         let block = task.block;
         let artefact = *results.get(index).ok_or(ModelError::NoResult(block))?;
@@ -66,6 +72,7 @@ pub fn write(
         let decoded = frame::decode_result(&bytes);
         let (splats, about) = decoded.map_err(|error| ModelError::DamagedResult(block, error))?;
         exposures = exposures.or(about.exposures);
+        poses = poses.or(about.poses);
         save(&folder.join("blocks").join(block_file(block)), &bytes)?;
         blocks.push(BlockEntry { block, artefact, splats: splats.len() as u64 });
         attributes.extend(splats.attribute_names());
@@ -89,20 +96,39 @@ pub fn write(
     if let Some(id) = exposures {
         save(&folder.join(EXPOSURES_FILE), &store.get(id)?)?;
     }
+    if let Some(id) = poses {
+        let bytes = store.get(id)?;
+        let decoded = Poses::from_frame(&bytes).map_err(ModelError::DamagedPoses)?;
+        save(&folder.join(POSES_FILE), &bytes)?;
+        save(&out.join(CAMERAS_FILE), &cameras(capture, &decoded))?;
+    }
     let manifest = Manifest {
         version: VERSION,
         plan: plan.id(),
         antialiased: plan.settings.antialiased,
         sh_degree,
-        geo_origin,
+        geo_origin: capture.geo_origin,
         ground: plan.ground,
         test_every: plan.settings.test_every,
         test_stretches: plan.settings.test_stretches,
         downscale,
         exposures,
+        poses,
         splats: count as u64,
         blocks,
     };
     save_json(&folder.join(MANIFEST_FILE), &manifest)?;
     Ok(Written { splats: count as u64, bytes })
+}
+
+/// A `transforms.json` of the views that have a refined pose, with the names of the capture's views as paths.
+fn cameras(capture: &Capture, poses: &Poses) -> Vec<u8> {
+    let frame = |(view, &camera_from_world): (u32, _)| {
+        let view = capture.views.get(view as usize)?;
+        let k = view.camera.pinhole;
+        let lens = CameraModel::Pinhole([k.fx, k.fy, k.cx, k.cy]);
+        let intrinsics = Intrinsics::from_model(&lens, Some((k.width, k.height)));
+        Some(Frame { file_path: view.name.clone(), mask_path: None, intrinsics, camera_from_world })
+    };
+    transforms::write(&Transforms { frames: poses.iter().filter_map(frame).collect(), ply_file_path: None })
 }

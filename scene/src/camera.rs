@@ -27,6 +27,12 @@ impl Rigid {
         Self { rotation, translation: -(rotation * self.translation) }
     }
 
+    /// This transform applied after `first`.
+    pub fn after(&self, first: &Self) -> Self {
+        let rotation = (self.rotation * first.rotation).normalize();
+        Self { rotation, translation: self.apply(first.translation) }
+    }
+
     /// True if every number is finite and the quaternion has unit length within 1e-3.
     pub fn is_sane(&self) -> bool {
         self.translation.is_finite() && self.rotation.is_finite() && (self.rotation.length() - 1.0).abs() < 1e-3
@@ -234,6 +240,14 @@ mod tests {
         assert_eq!(camera.mip(2).pinhole.width, 25);
         let (cropped, same) = camera.window(Rect { x: 7, y: 9, width: 20, height: 20 }).project(point);
         assert!((cropped + DVec2::new(7.0, 9.0) - pixel).length() < 1e-9 && same == depth);
+    }
+
+    #[test]
+    fn composed_transforms_apply_one_after_the_other() {
+        let (a, point) = (camera().camera_from_world, DVec3::new(0.3, -0.4, 5.0));
+        let b = Rigid { rotation: DQuat::from_rotation_z(0.7), translation: DVec3::new(-1.0, 0.5, 2.0) };
+        assert!((b.after(&a).apply(point) - b.apply(a.apply(point))).length() < 1e-12);
+        assert!(a.inverse().after(&a).translation.length() < 1e-12);
     }
 
     #[test]

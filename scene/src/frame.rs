@@ -23,6 +23,9 @@ pub struct Kind(pub [u8; 4], pub u32);
 pub const SPLATS: Kind = Kind(*b"spla", 2);
 /// Splat columns with attributes; the header is a [`SplatsHeader`] and the attributes' names.
 pub const SPLATS_WITH_ATTRIBUTES: Kind = Kind(*b"spla", 3);
+/// Splat columns with attributes, trained with refined poses; the header is a [`SplatsHeader`], the attributes' names
+/// and the artefact of the poses.
+pub const SPLATS_WITH_POSES: Kind = Kind(*b"spla", 4);
 
 /// Encodes a frame from a header and bulk bytes.
 pub fn encode<T: Serialize>(kind: Kind, header: &T, bulk: &[u8]) -> Vec<u8> {
@@ -115,6 +118,10 @@ pub struct TrainingInfo {
     pub exposures: Option<ArtefactId>,
     /// Root mean square error of the tree's root block on its photos, 0 to 1.
     pub residual: Option<f64>,
+    /// The [`Poses`](crate::Poses) that the splats were trained with, if they were refined. Only in frames of
+    /// [`SPLATS_WITH_POSES`].
+    #[serde(skip)]
+    pub poses: Option<ArtefactId>,
 }
 
 /// Encodes splats: all columns one after the other, f32 little endian, then the attributes, u32 little endian.
@@ -128,10 +135,11 @@ pub fn encode_result(splats: &Splats, training: TrainingInfo) -> Vec<u8> {
     let integers = splats.attributes().iter().flat_map(|attribute| bytemuck::cast_slice::<u32, u8>(&attribute.values));
     let bulk: Vec<u8> = floats.chain(integers).copied().collect();
     let header = SplatsHeader { sh_degree: splats.sh_degree(), count: splats.len() as u64, training };
-    // Splats without attributes keep the bytes, and so the id, that they had before attributes existed.
-    match splats.attribute_names() {
-        names if names.is_empty() => encode(SPLATS, &header, &bulk),
-        names => encode(SPLATS_WITH_ATTRIBUTES, &(header, names), &bulk),
+    // Splats without attributes or poses keep the bytes, and so the id, that they had before these existed.
+    match (splats.attribute_names(), training.poses) {
+        (names, Some(poses)) => encode(SPLATS_WITH_POSES, &(header, names, poses), &bulk),
+        (names, None) if names.is_empty() => encode(SPLATS, &header, &bulk),
+        (names, None) => encode(SPLATS_WITH_ATTRIBUTES, &(header, names), &bulk),
     }
 }
 
@@ -168,11 +176,18 @@ pub fn decode_splats(bytes: &[u8]) -> Result<Splats, CodecError> {
 /// # Errors
 /// As [`decode`], or a bulk whose length does not match the header.
 pub fn decode_result(bytes: &[u8]) -> Result<(Splats, TrainingInfo), CodecError> {
-    let is_version_3 = bytes.get(8..12) == Some(&SPLATS_WITH_ATTRIBUTES.1.to_le_bytes()[..]);
-    let ((header, names), bulk): ((SplatsHeader, Vec<String>), _) = match is_version_3 {
-        true => decode(SPLATS_WITH_ATTRIBUTES, bytes)?,
-        false => decode(SPLATS, bytes).map(|(header, bulk)| ((header, Vec::new()), bulk))?,
+    let has_version = |kind: Kind| bytes.get(8..12) == Some(&kind.1.to_le_bytes()[..]);
+    let (mut header, names, poses, bulk): (SplatsHeader, Vec<String>, _, _) = if has_version(SPLATS_WITH_POSES) {
+        let ((header, names, poses), bulk) = decode(SPLATS_WITH_POSES, bytes)?;
+        (header, names, Some(poses), bulk)
+    } else if has_version(SPLATS_WITH_ATTRIBUTES) {
+        let ((header, names), bulk) = decode(SPLATS_WITH_ATTRIBUTES, bytes)?;
+        (header, names, None, bulk)
+    } else {
+        let (header, bulk) = decode(SPLATS, bytes)?;
+        (header, Vec::new(), None, bulk)
     };
+    header.training.poses = poses;
     if header.sh_degree > 3 {
         return Err(CodecError::new(format!("SH degree {} is above 3", header.sh_degree)));
     }
@@ -220,15 +235,20 @@ mod tests {
         }
         let bytes = encode_splats(&splats);
         assert_eq!(decode_result(&bytes).unwrap(), (splats.clone(), TrainingInfo::default()));
-        let training = TrainingInfo { exposures: Some(ArtefactId::of(b"exposures")), residual: Some(0.1) };
+        let training = TrainingInfo { exposures: Some(ArtefactId::of(b"exposures")), residual: Some(0.1), poses: None };
         let exposed = encode_result(&splats, training);
         assert_eq!(decode_result(&exposed).unwrap(), (splats.clone(), training));
         let mut labelled = splats.clone();
         labelled.set_attribute("block", vec![1, 2, 3, 4, 5]);
         labelled.set_attribute("label", vec![9; 5]);
         let with_attributes = encode_result(&labelled, training);
-        assert_eq!(decode_result(&with_attributes).unwrap(), (labelled, training));
-        for bytes in [&bytes, &with_attributes] {
+        assert_eq!(decode_result(&with_attributes).unwrap(), (labelled.clone(), training));
+        let refined = TrainingInfo { poses: Some(ArtefactId::of(b"poses")), ..training };
+        for splats in [&splats, &labelled] {
+            assert_eq!(decode_result(&encode_result(splats, refined)).unwrap(), (splats.clone(), refined));
+        }
+        let with_poses = encode_result(&labelled, refined);
+        for bytes in [&bytes, &with_attributes, &with_poses] {
             for at in 0..bytes.len() {
                 let mut damaged = bytes.clone();
                 damaged[at] ^= 0x40;

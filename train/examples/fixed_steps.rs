@@ -55,6 +55,7 @@ fn steps() -> Splats {
         size_bounds_metres: [1e-3, 10.0],
         exposures: None,
         trains_exposures: false,
+        trains_poses: false,
         recipe: &recipe,
         source: &photos,
         backend: &Backend::Cpu,

@@ -9,13 +9,15 @@ use crate::coarse_to_fine::CoarseToFine;
 use crate::exposure::ExposureTraining;
 use crate::growth::DensificationStats;
 use crate::optimiser::Adam;
+use crate::pose::PoseTraining;
 
 /// A checkpoint. The header is [`Header`]. The bulk holds, little endian:
 /// - all columns of the splats, of the first and of the second Adam moments (f32);
 /// - densification statistics per splat: error, weight (f32), views (u32);
 /// - per trained exposure: view, steps (u32), then value, first and second moment (twelve f32 each);
+/// - per trained pose: view, steps (u32), then displacement, first and second moment (six f32 each);
 /// - all attributes of the splats (u32).
-const CHECKPOINT: Kind = Kind(*b"ckpt", 4);
+const CHECKPOINT: Kind = Kind(*b"ckpt", 5);
 
 /// Everything that a training step depends on besides its job.
 #[derive(Debug, Clone)]
@@ -32,6 +34,8 @@ pub struct State {
     pub(crate) densification: DensificationStats,
     /// `Some` where exposures are trained.
     pub(crate) exposures: Option<ExposureTraining>,
+    /// `Some` where poses are trained.
+    pub(crate) poses: Option<PoseTraining>,
     /// Loss of the last step, for reports only. Not part of a checkpoint.
     pub(crate) loss: f64,
 }
@@ -49,12 +53,16 @@ struct Header {
     stats_count: u64,
     /// Number of exposures, where they are trained.
     exposure_count: Option<u64>,
+    /// Number of poses, where they are trained.
+    pose_count: Option<u64>,
     /// Names of the splats' attributes.
     attributes: Vec<String>,
 }
 
 /// 32-bit words of an exposure in a checkpoint.
 const EXPOSURE_WORDS: usize = 2 + 3 * 12;
+/// 32-bit words of a pose in a checkpoint.
+const POSE_WORDS: usize = 2 + 3 * 6;
 
 impl State {
     /// Steps done.
@@ -76,14 +84,17 @@ impl State {
             count: self.splats.len() as u64,
             stats_count: views.len() as u64,
             exposure_count: self.exposures.as_ref().map(|exposures| exposures.views.len() as u64),
+            pose_count: self.poses.as_ref().map(|poses| poses.views.len() as u64),
             attributes: self.splats.attribute_names(),
         };
         let columns = self.splats.columns().iter().chain(first).chain(second);
         let floats = columns.chain([error, weight]).flatten().flat_map(|value| value.to_le_bytes());
         let mut bulk: Vec<u8> = floats.chain(views.iter().flat_map(|value| value.to_le_bytes())).collect();
         if let Some(ExposureTraining { views, steps, values }) = &self.exposures {
-            bulk.extend(views.iter().chain(steps).flat_map(|value| value.to_le_bytes()));
-            bulk.extend(values.iter().flatten().flatten().flat_map(|value| value.to_le_bytes()));
+            write_rows(&mut bulk, views, steps, values);
+        }
+        if let Some(PoseTraining { views, steps, values }) = &self.poses {
+            write_rows(&mut bulk, views, steps, values);
         }
         let attributes = self.splats.attributes().iter().flat_map(|attribute| &attribute.values);
         bulk.extend(attributes.flat_map(|value| value.to_le_bytes()));
@@ -106,6 +117,8 @@ impl State {
         let words = words.and_then(|words| words.checked_add(header.stats_count.checked_mul(3)?));
         let exposed = header.exposure_count.unwrap_or(0);
         let words = words.and_then(|words| words.checked_add(exposed.checked_mul(EXPOSURE_WORDS as u64)?));
+        let posed = header.pose_count.unwrap_or(0);
+        let words = words.and_then(|words| words.checked_add(posed.checked_mul(POSE_WORDS as u64)?));
         let attribute_words = (header.attributes.len() as u64).checked_mul(header.count);
         let words = words.and_then(|words| words.checked_add(attribute_words?));
         if words.and_then(|words| words.checked_mul(4)) != Some(bulk.len() as u64)
@@ -117,25 +130,21 @@ impl State {
         let (count, stats_count) = (header.count as usize, header.stats_count as usize);
         let (columns_bytes, rest) = bulk.split_at(4 * count * 3 * columns);
         let (stats_bytes, rest) = rest.split_at(4 * stats_count * 3);
-        let (exposure_bytes, attribute_bytes) = rest.split_at(4 * EXPOSURE_WORDS * exposed as usize);
-        let word = |bytes: &[u8]| <[u8; 4]>::try_from(bytes).expect("four bytes");
-        let floats =
-            |bytes: &[u8]| -> Vec<f32> { bytes.chunks_exact(4).map(|bytes| f32::from_le_bytes(word(bytes))).collect() };
+        let (exposure_bytes, rest) = rest.split_at(4 * EXPOSURE_WORDS * exposed as usize);
+        let (pose_bytes, attribute_bytes) = rest.split_at(4 * POSE_WORDS * posed as usize);
         let mut all = columns_bytes.chunks_exact(4 * count).map(floats);
         let splats = Splats::from_columns(all.by_ref().take(columns).collect()).ok_or_else(wrong)?;
         let splats = frame::with_attributes(splats, &header.attributes, attribute_bytes)?;
         let first = all.by_ref().take(columns).collect();
         let second = all.collect();
         let part = |n: usize| &stats_bytes[4 * stats_count * n..4 * stats_count * (n + 1)];
-        let whole =
-            |bytes: &[u8]| -> Vec<u32> { bytes.chunks_exact(4).map(|bytes| u32::from_le_bytes(word(bytes))).collect() };
         let exposures = || {
-            let (views, rest) = exposure_bytes.split_at(4 * exposed as usize);
-            let (steps, rest) = rest.split_at(4 * exposed as usize);
-            let rows: Vec<[f32; 12]> =
-                floats(rest).chunks_exact(12).map(|row| row.try_into().expect("twelve numbers")).collect();
-            let part = |n: usize| rows[n * exposed as usize..(n + 1) * exposed as usize].to_vec();
-            ExposureTraining { views: whole(views), steps: whole(steps), values: [part(0), part(1), part(2)] }
+            let (views, steps, values) = read_rows(exposure_bytes, exposed as usize);
+            ExposureTraining { views, steps, values }
+        };
+        let poses = || {
+            let (views, steps, values) = read_rows(pose_bytes, posed as usize);
+            PoseTraining { views, steps, values }
         };
         Ok(Self {
             step: header.step,
@@ -147,12 +156,43 @@ impl State {
             densification: DensificationStats {
                 error: floats(part(0)),
                 weight: floats(part(1)),
-                views: whole(part(2)),
+                views: integers(part(2)),
             },
             exposures: header.exposure_count.map(|_| exposures()),
+            poses: header.pose_count.map(|_| poses()),
             loss: f64::NAN,
         })
     }
+}
+
+/// Appends numbers of views: the views, their Adam steps, and rows of values and moments.
+fn write_rows<const N: usize>(bulk: &mut Vec<u8>, views: &[u32], steps: &[u32], values: &[Vec<[f32; N]>; 3]) {
+    bulk.extend(views.iter().chain(steps).flat_map(|value| value.to_le_bytes()));
+    bulk.extend(values.iter().flatten().flatten().flat_map(|value| value.to_le_bytes()));
+}
+
+/// Views, their Adam steps, and rows of values and moments.
+type Rows<const N: usize> = (Vec<u32>, Vec<u32>, [Vec<[f32; N]>; 3]);
+
+/// The inverse of [`write_rows`], for so many views.
+fn read_rows<const N: usize>(bytes: &[u8], count: usize) -> Rows<N> {
+    let (views, rest) = bytes.split_at(4 * count);
+    let (steps, rest) = rest.split_at(4 * count);
+    let rows: Vec<[f32; N]> = floats(rest).chunks_exact(N).map(|row| row.try_into().expect("N numbers")).collect();
+    let part = |n: usize| rows[n * count..(n + 1) * count].to_vec();
+    (integers(views), integers(steps), [part(0), part(1), part(2)])
+}
+
+fn words(bytes: &[u8]) -> impl Iterator<Item = [u8; 4]> {
+    bytes.chunks_exact(4).map(|bytes| bytes.try_into().expect("four bytes"))
+}
+
+fn floats(bytes: &[u8]) -> Vec<f32> {
+    words(bytes).map(f32::from_le_bytes).collect()
+}
+
+fn integers(bytes: &[u8]) -> Vec<u32> {
+    words(bytes).map(u32::from_le_bytes).collect()
 }
 
 #[cfg(test)]
@@ -184,14 +224,29 @@ mod tests {
             }
             let loss = f64::NAN;
             let (step, skipped, start_count) = (40, 1, 7);
-            let state =
-                State { step, skipped, start_count, coarse_to_fine, splats, adam, densification, exposures, loss };
+            let poses = exposures.is_some().then(|| PoseTraining {
+                views: vec![1, 3, 8],
+                steps: vec![7, 0, 2],
+                values: [1.0, 0.5, 0.25].map(|v| vec![[v; 6], [2.0 * v; 6], [3.0 * v; 6]]),
+            });
+            let state = State {
+                step,
+                skipped,
+                start_count,
+                coarse_to_fine,
+                splats,
+                adam,
+                densification,
+                exposures,
+                poses,
+                loss,
+            };
             let bytes = state.to_frame();
             let read = State::from_frame(&bytes).unwrap();
             assert_eq!((read.step, read.skipped, read.start_count), (40, 1, 7));
             assert!(read.splats == state.splats && read.adam.parts() == state.adam.parts());
             assert_eq!(read.densification.views, state.densification.views);
-            assert_eq!(read.exposures, state.exposures);
+            assert_eq!((&read.exposures, &read.poses), (&state.exposures, &state.poses));
             assert_eq!(
                 (&read.densification.error, &read.densification.weight),
                 (&state.densification.error, &state.densification.weight)
@@ -201,7 +256,13 @@ mod tests {
             assert!(State::from_frame(&[]).is_err());
         }
         // A header that announces more than the bulk holds.
-        for (count, exposure_count) in [(u64::MAX / 3, None), (1, Some(u64::MAX / 38)), (1, Some(1))] {
+        for (count, exposure_count, pose_count) in [
+            (u64::MAX / 3, None, None),
+            (1, Some(u64::MAX / 38), None),
+            (1, Some(1), None),
+            (1, None, Some(u64::MAX / 20)),
+            (1, None, Some(1)),
+        ] {
             let header = Header {
                 step: 1,
                 skipped: 0,
@@ -212,6 +273,7 @@ mod tests {
                 count,
                 stats_count: 0,
                 exposure_count,
+                pose_count,
                 attributes: Vec::new(),
             };
             assert!(State::from_frame(&frame::encode(CHECKPOINT, &header, &[0; 64])).is_err());

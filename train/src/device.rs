@@ -5,7 +5,6 @@ mod cpu;
 mod gpu;
 pub(crate) mod step;
 
-#[cfg(feature = "gpu")]
 use std::sync::Arc;
 
 use render::cpu::Isa;
@@ -16,6 +15,7 @@ use scene::Splats;
 use self::step::TrainDevice;
 use crate::checkpoint::State;
 use crate::error::TrainError;
+use crate::pose::GivenPoses;
 
 /// Which device computes training steps. Equal names give equal bits.
 #[derive(Debug, Clone, Default)]
@@ -44,7 +44,8 @@ impl Backend {
     }
 
     /// Sets up a device that continues from `state`; the CPU works on the host's state directly. `lambda` is the weight of D-SSIM
-    /// in the loss. `context` are frozen splats of other blocks, rendered but not trained.
+    /// in the loss. `context` are frozen splats of other blocks, rendered but not trained. `given` are the poses that displacements
+    /// of the state refer to; only the CPU trains them.
     ///
     /// # Errors
     /// A GPU that fails or has too little memory.
@@ -54,9 +55,10 @@ impl Backend {
         state: &State,
         lambda: f32,
         context: Option<&'a Splats>,
+        given: &Arc<GivenPoses>,
     ) -> Result<Box<dyn TrainDevice + 'a>, TrainError> {
         Ok(match self {
-            Self::Cpu => Box::new(cpu::CpuDevice::new(lambda, context)),
+            Self::Cpu => Box::new(cpu::CpuDevice::new(lambda, context, given)),
             #[cfg(feature = "gpu")]
             Self::Gpu(gpu) => Box::new(gpu::GpuDevice::new(gpu, state, lambda, context)?),
         })

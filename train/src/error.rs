@@ -18,6 +18,9 @@ pub enum TrainError {
     /// Only the CPU supports exposures.
     #[error("exposures are not trained on a GPU: use --backend cpu, or leave --exposure")]
     Exposures,
+    /// Only the CPU refines poses.
+    #[error("poses are not refined on a GPU: use --backend cpu, or leave --refine-poses")]
+    Poses,
     /// All splats were removed after this number of steps.
     #[error("every splat was removed after {0} steps: the views and the points do not agree, or poses are wrong")]
     Empty(u32),

@@ -34,6 +34,8 @@ pub struct Job<'a> {
     pub exposures: Option<&'a Exposures>,
     /// Trains exposures, starting from the identity, instead of using `exposures`.
     pub trains_exposures: bool,
+    /// Refines the poses of the views' cameras, which are the start.
+    pub trains_poses: bool,
     /// Hyperparameters.
     pub recipe: &'a Recipe,
     /// Photos.

@@ -60,29 +60,76 @@ pub fn colour_corrected_psnr(render: &[f32], photo: &[f32], mask: Option<&[u8]>)
     let area = render.len() / 3;
     assert!(mask.is_none_or(|m| m.len() == area), "a mask of the image's size");
     let pixels = || (0..area).filter(|&i| mask.is_none_or(|m| m[i] >= 128));
-    let at = |image: &[f32], i: usize| DVec3::from_array([0, 1, 2].map(|c| f64::from(image[c * area + i])));
-    let (mut count, mut sums) = (0.0, [DVec3::ZERO; 2]);
-    for i in pixels() {
-        count += 1.0;
-        sums = [sums[0] + at(render, i), sums[1] + at(photo, i)];
-    }
-    let [mean_render, mean_photo] = sums.map(|sum| sum / f64::max(count, 1.0));
-    // Least squares about the means: transform = 1 + change, with (Σ r rᵀ) changeᵀ = Σ r (p - r)ᵀ.
-    let (mut rr, mut rd) = (DMat3::ZERO, DMat3::ZERO);
-    for i in pixels() {
-        let r = at(render, i) - mean_render;
-        let d = at(photo, i) - mean_photo - r;
-        rr += DMat3::from_cols(r * r.x, r * r.y, r * r.z);
-        rd += DMat3::from_cols(r * d.x, r * d.y, r * d.z);
-    }
-    let transform = DMat3::IDENTITY + (pseudo_inverse(rr) * rd).transpose();
     let clamped: Vec<f32> = render.iter().map(|value| value.clamp(0.0, 1.0)).collect();
     let mut corrected = clamped.clone();
-    for i in pixels() {
-        let colour = mean_photo + transform * (at(render, i) - mean_render);
-        (0..3).for_each(|c| corrected[c * area + i] = colour[c].clamp(0.0, 1.0) as f32);
-    }
+    ColourFit::of(render, photo, pixels()).correct(render, pixels(), &mut corrected);
     Some(psnr(&corrected, photo, mask)?.max(psnr(&clamped, photo, mask)?))
+}
+
+/// PSNR in dB of the right half of an image after the affine colour transform that brings the render's left half
+/// closest to the photo's, clamped to 0..1. Nothing of the measured half enters the fit, so unlike
+/// [`colour_corrected_psnr`] it may be below [`psnr`]. NeRF-W (Martin-Brualla et al. 2021) introduced the division, and
+/// others with appearance models report it. `None` where the mask leaves no pixel of either half.
+///
+/// # Panics
+/// If the images differ in length, or their pixels are no multiple of the width, or the mask is not a third of them.
+pub fn half_fitted_psnr(render: &[f32], photo: &[f32], width: usize, mask: Option<&[u8]>) -> Option<f64> {
+    assert_eq!(render.len(), photo.len(), "images of one size");
+    let area = render.len() / 3;
+    assert!(width > 0 && area.is_multiple_of(width), "rows of one width");
+    assert!(mask.is_none_or(|m| m.len() == area), "a mask of the image's size");
+    let is_left = |i: &usize| i % width < width / 2;
+    let pixels = || (0..area).filter(|&i| mask.is_none_or(|m| m[i] >= 128));
+    pixels().find(is_left)?;
+    let mut corrected = render.to_vec();
+    let fit = ColourFit::of(render, photo, pixels().filter(is_left));
+    fit.correct(render, pixels().filter(|i| !is_left(i)), &mut corrected);
+    let measured: Vec<u8> = (0..area).map(|i| if is_left(&i) { 0 } else { mask.map_or(255, |mask| mask[i]) }).collect();
+    psnr(&corrected, photo, Some(&measured))
+}
+
+/// The affine colour transform of a render that minimises the squared error to a photo over some pixels.
+struct ColourFit {
+    mean_render: DVec3,
+    mean_photo: DVec3,
+    transform: DMat3,
+}
+
+impl ColourFit {
+    /// Fits the transform to these pixels.
+    fn of(render: &[f32], photo: &[f32], pixels: impl Iterator<Item = usize> + Clone) -> Self {
+        let (mut count, mut sums) = (0.0, [DVec3::ZERO; 2]);
+        for i in pixels.clone() {
+            count += 1.0;
+            sums = [sums[0] + colour_at(render, i), sums[1] + colour_at(photo, i)];
+        }
+        let [mean_render, mean_photo] = sums.map(|sum| sum / f64::max(count, 1.0));
+        // Least squares about the means: transform = 1 + change, with (Σ r rᵀ) changeᵀ = Σ r (p - r)ᵀ.
+        let (mut rr, mut rd) = (DMat3::ZERO, DMat3::ZERO);
+        for i in pixels {
+            let r = colour_at(render, i) - mean_render;
+            let d = colour_at(photo, i) - mean_photo - r;
+            rr += DMat3::from_cols(r * r.x, r * r.y, r * r.z);
+            rd += DMat3::from_cols(r * d.x, r * d.y, r * d.z);
+        }
+        let transform = DMat3::IDENTITY + (pseudo_inverse(rr) * rd).transpose();
+        Self { mean_render, mean_photo, transform }
+    }
+
+    /// Writes these pixels of the render, transformed and clamped to 0..1, to `out`.
+    fn correct(&self, render: &[f32], pixels: impl Iterator<Item = usize>, out: &mut [f32]) {
+        let area = render.len() / 3;
+        for i in pixels {
+            let colour = self.mean_photo + self.transform * (colour_at(render, i) - self.mean_render);
+            (0..3).for_each(|c| out[c * area + i] = colour[c].clamp(0.0, 1.0) as f32);
+        }
+    }
+}
+
+/// The colour of a pixel of an image of three planes.
+fn colour_at(image: &[f32], i: usize) -> DVec3 {
+    let area = image.len() / 3;
+    DVec3::from_array([0, 1, 2].map(|c| f64::from(image[c * area + i])))
 }
 
 /// Eigenvalues of a colour covariance below this share of its trace count as zero. Rounding to f32 leaves about 1e-14
@@ -303,6 +350,32 @@ mod tests {
             let [plain, corrected] =
                 [psnr, colour_corrected_psnr].map(|measure| measure(&flat, &photo, Some(&mask)).unwrap());
             assert!(corrected.is_finite() && corrected >= plain, "{a} {b}: {plain} {corrected}");
+        }
+    }
+
+    #[test]
+    fn the_exposure_of_one_half_is_measured_on_the_other() {
+        let photo = picture(40, 30, 0.0);
+        let dimmed: Vec<f32> = photo.iter().map(|v| 0.6 * v + 0.1).collect();
+        let fitted = half_fitted_psnr(&dimmed, &photo, 40, None).unwrap();
+        assert!(fitted > 80.0, "{fitted}");
+        // Another exposure on the right is not corrected, however well the left fits.
+        let mut uneven = dimmed.clone();
+        uneven.iter_mut().enumerate().filter(|(i, _)| i % 40 >= 20).for_each(|(_, v)| *v = (*v - 0.1) / 0.6 * 0.8);
+        assert!(half_fitted_psnr(&uneven, &photo, 40, None).unwrap() < 25.0);
+        assert!(colour_corrected_psnr(&uneven, &photo, None).unwrap() > 20.0);
+        // What the mask hides counts in neither half.
+        let mut mask = vec![255; 40 * 30];
+        for i in (0..40 * 30).filter(|i| i % 7 == 0) {
+            mask[i] = 0;
+            (0..3).for_each(|c| uneven[1200 * c + i] = 5.0);
+        }
+        let mut hidden = dimmed;
+        (0..1200).filter(|i| mask[*i] == 0).for_each(|i| (0..3).for_each(|c| hidden[1200 * c + i] = 5.0));
+        assert!(half_fitted_psnr(&hidden, &photo, 40, Some(&mask)).unwrap() > 80.0);
+        for empty in [|i: usize| i % 40 < 20, |i: usize| i % 40 >= 20] {
+            let mask: Vec<u8> = (0..1200).map(|i| if empty(i) { 0 } else { 255 }).collect();
+            assert_eq!(half_fitted_psnr(&photo, &photo, 40, Some(&mask)), None);
         }
     }
 

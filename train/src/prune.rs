@@ -276,7 +276,7 @@ impl<'a> Pruner<'a> {
         let splats = mem::replace(&mut job.initial, Splats::new(0));
         let pruning = pruning.fitted(job.steps);
         job.steps = pruning.round_steps(job.steps);
-        job.trains_exposures = false;
+        (job.trains_exposures, job.trains_poses) = (false, false);
         let Job { views, context, antialiased, exposures, source, .. } = job;
         let all = EvaluationViews { views, context, antialiased, exposures, source };
         let measured = Evaluator::new(&all, MEASURED_VIEWS.for_steps(job.steps), &splats)?;

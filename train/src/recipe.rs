@@ -53,6 +53,16 @@ pub struct Recipe {
     pub initial_opacity: f32,
     /// Densification schedule.
     pub growth: Growth,
+    /// Learning rate of camera poses where they are trained, in radians and in metres per metre of depth, multiplied by
+    /// the number of times that a view is drawn (as `exposure`).
+    #[serde(default)]
+    pub pose: [f32; 2],
+    /// Share of the steps before poses are trained: the first splats say nothing about a pose.
+    #[serde(default)]
+    pub pose_from: f32,
+    /// Weight decay of poses: the share of a displacement that all steps together take back where no gradient holds it.
+    #[serde(default)]
+    pub pose_decay: f32,
 }
 
 impl Default for Recipe {
@@ -76,6 +86,9 @@ impl Default for Recipe {
             views_per_step: 1,
             initial_opacity: 0.1,
             growth: Growth::default(),
+            pose: [0.1, 0.004],
+            pose_from: 0.05,
+            pose_decay: 0.1,
         }
     }
 }
@@ -109,6 +122,7 @@ impl Recipe {
             opacity: scaled(self.opacity),
             sh_dc: scaled(self.sh_dc),
             exposure: scaled(self.exposure),
+            pose: scaled(self.pose),
             ..self
         }
     }

@@ -5,9 +5,11 @@
 //! rates decay to the end. The frozen context covers what lies outside the block, and a pixel is weighted by the share
 //! of it that the block's own splats explain.
 
+use std::sync::Arc;
+
 use render::Options;
 use render::cpu::Isa;
-use scene::{Camera, Exposures, Rect, Splats};
+use scene::{Camera, Exposures, Poses, Rect, Splats};
 
 use crate::checkpoint::State;
 use crate::coarse_to_fine::{self, CoarseToFine};
@@ -18,6 +20,7 @@ use crate::exposure::ExposureTraining;
 use crate::growth::{self, DensificationStats};
 use crate::job::{Flow, Job};
 use crate::optimiser::{Adam, LearningRates};
+use crate::pose::{GivenPoses, PoseRates, PoseTraining};
 use crate::random;
 use crate::recipe::Recipe;
 use crate::source::AHEAD;
@@ -74,16 +77,27 @@ impl Progress<'_> {
     }
 }
 
+/// The result of training.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Trained {
+    /// The splats.
+    pub splats: Splats,
+    /// The exposures, where they are trained.
+    pub exposures: Option<Exposures>,
+    /// The refined poses, where they are trained.
+    pub poses: Option<Poses>,
+}
+
 /// Trains a block. Calls `report` after every step.
 ///
 /// # Errors
 /// See [`TrainError`].
 pub fn train(job: Job, report: &mut dyn FnMut(Progress) -> Flow) -> Result<Splats, TrainError> {
-    train_from(job, None, report).map(|(splats, _)| splats)
+    train_from(job, None, report).map(|trained| trained.splats)
 }
 
 /// Trains a block, resuming from a state of the same job where one is given; the result is that of an uninterrupted
-/// run. Returns the splats, and the exposures where they are trained.
+/// run.
 ///
 /// # Errors
 /// See [`TrainError`].
@@ -91,12 +105,15 @@ pub fn train_from(
     job: Job,
     from: Option<State>,
     report: &mut dyn FnMut(Progress) -> Flow,
-) -> Result<(Splats, Option<Exposures>), TrainError> {
+) -> Result<Trained, TrainError> {
     if job.views.is_empty() {
         return Err(TrainError::NoViews);
     }
     if job.backend.is_gpu() && (job.trains_exposures || job.exposures.is_some()) {
         return Err(TrainError::Exposures);
+    }
+    if job.backend.is_gpu() && job.trains_poses {
+        return Err(TrainError::Poses);
     }
     let mut trainer = Trainer::new(job, from)?;
     let steps = trainer.job.steps;
@@ -114,8 +131,9 @@ pub fn train_from(
         }
     }
     trainer.device.download(&mut trainer.state, StatePart::Splats)?;
-    let exposures = trainer.state.exposures.map(|exposures| exposures.exposures());
-    Ok((trainer.state.splats, exposures))
+    let Trainer { state: State { splats, exposures, poses, .. }, given, .. } = trainer;
+    let exposures = exposures.map(|exposures| exposures.exposures());
+    Ok(Trained { splats, exposures, poses: poses.map(|poses| poses.poses(&given)) })
 }
 
 /// A job with its state and device.
@@ -124,6 +142,7 @@ struct Trainer<'a> {
     job: Job<'a>,
     state: State,
     device: Box<dyn TrainDevice + 'a>,
+    given: Arc<GivenPoses>,
     log_scale_bounds: [f32; 2],
     /// Detail that each coarse mip lacks, from `first_stage` on.
     missing_detail: Vec<f64>,
@@ -138,6 +157,8 @@ impl<'a> Trainer<'a> {
     fn new(mut job: Job<'a>, from: Option<State>) -> Result<Self, TrainError> {
         let Job { context, views, counts, steps, recipe, .. } = job;
         let initial = std::mem::replace(&mut job.initial, Splats::new(0));
+        let posed = if job.trains_poses { views } else { &[] };
+        let given = Arc::new(GivenPoses::of(posed, &initial, true));
         let state = from.unwrap_or_else(|| State {
             step: 0,
             skipped: 0,
@@ -146,12 +167,13 @@ impl<'a> Trainer<'a> {
             adam: Adam::new(Isa::detect(), &initial),
             densification: DensificationStats::default(),
             exposures: job.trains_exposures.then(|| ExposureTraining::new(views)),
+            poses: job.trains_poses.then(|| PoseTraining::new(&given)),
             splats: initial,
             loss: f64::NAN,
         });
         // A finished job needs no upload.
         let backend = if state.step < steps { job.backend } else { &Backend::Cpu };
-        let device = backend.open(&state, recipe.lambda, context)?;
+        let device = backend.open(&state, recipe.lambda, context, &given)?;
         let first_stage = state.coarse_to_fine.stage;
         let missing_detail = (first_stage..recipe.coarse.len() as u8)
             .map(|stage| match recipe.detail_factor > 0.0 {
@@ -165,6 +187,7 @@ impl<'a> Trainer<'a> {
             job,
             state,
             device,
+            given,
             log_scale_bounds,
             missing_detail,
             first_stage,
@@ -201,9 +224,13 @@ impl<'a> Trainer<'a> {
         let inputs = Step {
             samples,
             options,
-            rates: learning_rates(recipe, progress, (count as f32).sqrt(), self.log_scale_bounds),
+            rates: Some(learning_rates(recipe, progress, (count as f32).sqrt(), self.log_scale_bounds)),
             depth_weight,
             exposure_rate: geometric(recipe.exposure, progress) / visits,
+            pose_rates: (self.job.trains_poses && progress >= recipe.pose_from).then(|| PoseRates {
+                rate: geometric(recipe.pose, progress) / visits,
+                decay: recipe.pose_decay / visits,
+            }),
         };
         self.device.step(&mut self.state, inputs)?;
 

@@ -93,7 +93,7 @@ fn check_same_bytes(gpu: &Backend, views_per_step: u32) {
     let run = |from: Option<State>, report: &mut dyn FnMut(train::Progress) -> Flow| {
         let recipe = Recipe { views_per_step, ..Recipe::default() };
         let job = Setup { recipe, ..job(&photos, &context, &ground_truth, gpu) };
-        job.try_run_on(from, &|_| true, report).expect("training succeeds").0
+        job.try_run_on(from, &|_| true, report).expect("training succeeds").splats
     };
     let uninterrupted = bits(&run(None, &mut |_| Flow::Continue));
     let mut left = None;

@@ -115,6 +115,7 @@ fn with_job<R>(
         size_bounds_metres: [1e-3, 2.0],
         exposures: None,
         trains_exposures: false,
+        trains_poses: false,
         recipe: &recipe,
         source: photos,
         backend: &Backend::Cpu,

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use blocks::{Cut, Plan, Task, ViewUse};
 use dataset::windows::WindowReader;
 use glam::DVec3;
-use scene::{BLOCK_ATTRIBUTE, BlockId, Capture, Exposures, Splats};
+use scene::{BLOCK_ATTRIBUTE, BlockId, Capture, Exposures, Poses, Splats};
 use train::TrainView;
 use train::prune::Pruning;
 
@@ -26,17 +26,20 @@ pub(crate) struct Block<'a> {
     pub(crate) cache: Option<&'a ResultCache>,
     /// The exposures that the root trained.
     pub(crate) given_exposures: Option<&'a Exposures>,
+    /// The poses that the root refined.
+    pub(crate) given_poses: Option<&'a Poses>,
     /// The error of the root's splats, see [`crate::refine`].
     pub(crate) given_residual: Option<f64>,
 }
 
 impl Block<'_> {
-    /// The windows of these uses, in the plan's order.
+    /// The windows of these uses, in the plan's order, from the given poses.
     pub(crate) fn windows(&self, uses: &[ViewUse]) -> Result<Vec<TrainView>, ExecuteError> {
         let window = |use_: &ViewUse| {
             let view = self.capture.views.get(use_.view as usize);
             let view = view.ok_or_else(|| ExecuteError::work(format!("the capture has no view {}", use_.view)))?;
-            Ok(TrainView { view: use_.view, mip: use_.mip, rect: use_.window, camera: view.camera })
+            let camera = self.given_poses.map_or(view.camera, |poses| poses.apply(use_.view, view.camera));
+            Ok(TrainView { view: use_.view, mip: use_.mip, rect: use_.window, camera })
         };
         uses.iter().map(window).collect()
     }

@@ -2,7 +2,7 @@
 
 use blocks::{EvalTask, Plan};
 use dataset::windows::WindowReader;
-use eval::{EvalError, ViewFigures};
+use eval::{EvalError, Fits, ViewFigures};
 use proto::FailureKind;
 use render::Options;
 use scene::Splats;
@@ -35,6 +35,7 @@ pub(crate) fn evaluate(
     let Evaluation { plan, task, model, reader, backend } = evaluation;
     let options =
         Options { antialiased: plan.settings.antialiased, sh_degree: model.sh_degree(), ..Options::default() };
+    let fits = Fits { pose: plan.settings.refine_poses, exposure: plan.settings.exposure };
     let steps = task.views.len() as u64;
     let mut overrun = None;
     let goes_on = |done: usize| {
@@ -51,7 +52,7 @@ pub(crate) fn evaluate(
         overrun = memory.as_mut().filter(|_| (done as u64) < steps).and_then(MemoryBudget::overrun);
         report == Flow::Continue && overrun.is_none()
     };
-    let figures = eval::figures_of_views(model, &options, reader, &task.views, backend, goes_on);
+    let figures = eval::figures_of_views(model, &options, reader, &task.views, backend, fits, goes_on);
     let figures = figures.map_err(failure)?;
     if let Some(resident) = overrun {
         let message = format!("evaluation: the worker takes {} MiB, above its --memory", resident.div_ceil(1 << 20));

@@ -18,7 +18,7 @@ use dataset::byte_lru::ByteLru;
 use dataset::ingest::IngestError;
 use dataset::windows::{SharedTileCache, WindowReader};
 use scene::frame::{self, TrainingInfo};
-use scene::{ArtefactId, BlockId, Capture, Exposures, Splats};
+use scene::{ArtefactId, BlockId, Capture, Exposures, Poses, Splats};
 use store::BlockingStore;
 use train::Backend;
 
@@ -158,8 +158,12 @@ impl PlanExecutor {
             Some(id) => Some(Exposures::from_frame(&store.get(id)?).map_err(ExecuteError::work)?),
             None => None,
         };
+        let poses = match given.poses {
+            Some(id) => Some(Poses::from_frame(&store.get(id)?).map_err(ExecuteError::work)?),
+            None => None,
+        };
         drop(fetching);
-        let (given_exposures, given_residual) = (exposures.as_ref(), given.residual);
+        let (given_exposures, given_poses, given_residual) = (exposures.as_ref(), poses.as_ref(), given.residual);
         let block = Block {
             context: &self.context,
             order,
@@ -169,6 +173,7 @@ impl PlanExecutor {
             reader: &reader,
             cache,
             given_exposures,
+            given_poses,
             given_residual,
         };
         let train_span = tracing::info_span!("train", block = %task.block);
@@ -262,15 +267,19 @@ impl PlanExecutor {
         });
     }
 
-    /// Puts a block's result into the store. Exposures and residual are passed down from the parent unless the block has its own.
+    /// Puts a block's result into the store. Exposures, poses and residual are passed down from the parent unless the block has its own.
     fn put_result(&self, trained: TrainedBlock, given: TrainingInfo) -> Result<ArtefactId, ExecuteError> {
-        let TrainedBlock { splats, exposures, residual } = trained;
+        let TrainedBlock { splats, exposures, poses, residual } = trained;
         let store = &self.context.store;
         let exposures = match exposures {
             Some(trained) => Some(store.put(trained.to_frame())?),
             None => given.exposures,
         };
-        let training = TrainingInfo { exposures, residual: residual.or(given.residual) };
+        let poses = match poses {
+            Some(refined) => Some(store.put(refined.to_frame())?),
+            None => given.poses,
+        };
+        let training = TrainingInfo { exposures, residual: residual.or(given.residual), poses };
         Ok(store.put(frame::encode_result(&splats, training))?)
     }
 

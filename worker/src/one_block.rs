@@ -104,6 +104,7 @@ impl OneBlockTraining<'_> {
             reader: &reader,
             cache: None,
             given_exposures: None,
+            given_poses: None,
             given_residual: None,
         };
         let recipe = change(recipe_of(&plan.settings, task));
@@ -133,6 +134,7 @@ impl OneBlockTraining<'_> {
             size_bounds_metres: block.size_bounds_metres(&views),
             exposures: None,
             trains_exposures: false,
+            trains_poses: false,
             recipe: &recipe,
             source: &reader,
             backend: &self.backend,

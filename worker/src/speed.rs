@@ -53,6 +53,7 @@ fn step_seconds() -> f64 {
         size_bounds_metres: [1e-3, 10.0],
         exposures: None,
         trains_exposures: false,
+        trains_poses: false,
         recipe: &recipe,
         source: &Photo,
         backend: &Backend::Cpu,

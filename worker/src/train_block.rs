@@ -5,10 +5,10 @@ use std::sync::atomic::Ordering;
 
 use glam::Vec3;
 use proto::FailureKind;
-use scene::{BlockId, Exposures, Splats};
+use scene::{BlockId, Exposures, Poses, Splats};
 use train::importance::EvaluationViews;
 use train::prune::{self, Pruning};
-use train::{Backend, Job, Recipe, TrainError, TrainView};
+use train::{Backend, Job, Recipe, TrainError, TrainView, Trained};
 
 use crate::block::Block;
 use crate::clock::Stopwatch;
@@ -26,6 +26,8 @@ pub(crate) struct TrainedBlock {
     pub(crate) splats: Splats,
     /// The exposures if this block trained them.
     pub(crate) exposures: Option<Exposures>,
+    /// The poses if this block refined them.
+    pub(crate) poses: Option<Poses>,
     /// The splats' error if the block is a root with children, see [`refine`].
     pub(crate) residual: Option<f64>,
 }
@@ -60,26 +62,28 @@ impl Block<'_> {
             self.start(results, &recipe, &counts)?;
         let cut = task.context_cut();
         let keeps = |p: Vec3| self.trains(&cut, p.as_dvec3());
-        let job_of = |initial, steps| Job {
+        let size_bounds_metres = self.size_bounds_metres(&views);
+        let job_of = |initial, steps, views| Job {
             initial,
             context: context.as_ref(),
-            views: &views,
+            views,
             counts: &counts,
             keeps: &keeps,
             budget,
             steps,
             antialiased: plan.settings.antialiased,
             seed: self.seed(),
-            size_bounds_metres: self.size_bounds_metres(&views),
+            size_bounds_metres,
             exposures: self.given_exposures,
             trains_exposures: plan.settings.exposure && task.parent.is_none(),
+            trains_poses: plan.settings.refine_poses && task.parent.is_none(),
             recipe: &recipe,
             source: self.reader,
             backend: &self.context.backend,
         };
         let mut progress = Progress::new(self, &views, evaluator, stopwatch, report);
         let pruning = self.pruning();
-        let mut job = job_of(initial, task.steps);
+        let mut job = job_of(initial, task.steps, &views);
         if is_settled {
             job.steps = 0;
         } else if pruning.is_some() {
@@ -100,11 +104,18 @@ impl Block<'_> {
         };
         progress.begin(trained + pruning.map_or(0, |pruning| pruning.steps(all_steps)));
 
-        let (mut splats, exposures) = self.optimise(job, limit.as_ref(), &mut progress)?;
+        let Trained { mut splats, exposures, poses } = self.optimise(job, limit.as_ref(), &mut progress)?;
+        let refined: Vec<TrainView> = match &poses {
+            Some(poses) => {
+                views.iter().map(|view| TrainView { camera: poses.apply(view.view, view.camera), ..*view }).collect()
+            }
+            None => views.clone(),
+        };
         // Set if the last step of training is not the last one to report.
         let mut last_step = (is_settled && pruning.is_none()).then_some(task.steps);
         if let Some(pruning) = pruning.filter(|_| !progress.is_stopped && !progress.is_late) {
-            let job = Job { exposures: exposures.as_ref().or(self.given_exposures), ..job_of(splats, all_steps) };
+            let job =
+                Job { exposures: exposures.as_ref().or(self.given_exposures), ..job_of(splats, all_steps, &refined) };
             splats = self.prune(job, &pruning, trained, limit.as_ref(), &mut progress)?;
             last_step = Some(progress.steps);
         }
@@ -113,13 +124,13 @@ impl Block<'_> {
             time_limit.into_iter().for_each(TimeLimit::mark_shortened);
         }
         let exposed = exposures.as_ref().or(self.given_exposures);
-        let residual = self.root_residual(&splats, &views, exposed).map_err(|error| self.failure(error))?;
+        let residual = self.root_residual(&splats, &refined, exposed).map_err(|error| self.failure(error))?;
         let splats = self.at_full_resolution(splats, &views);
         let splats = if plan.settings.label_blocks && !is_settled { self.labelled(splats) } else { splats };
         if is_evaluated {
             finished.insert(self.order.plan, plan, task.block, &splats);
         }
-        Ok(TrainedBlock { splats, exposures, residual })
+        Ok(TrainedBlock { splats, exposures, poses, residual })
     }
 
     /// Assembles the initial splats and decides whether the block is settled.
@@ -164,7 +175,7 @@ impl Block<'_> {
         job: Job,
         limit: Option<&TaskTimeLimit>,
         progress: &mut Progress,
-    ) -> Result<(Splats, Option<Exposures>), ExecuteError> {
+    ) -> Result<Trained, ExecuteError> {
         let (shared, options) = (&self.context.shared, &self.context.options);
         let checkpoint = self.cache.and_then(|cache| cache.checkpoint(&self.context.store));
         if checkpoint.is_some() {
@@ -269,7 +280,9 @@ impl Block<'_> {
     /// The failure class of a training error.
     fn failure(&self, error: TrainError) -> ExecuteError {
         let kind = match error {
-            TrainError::NoViews | TrainError::Exposures | TrainError::Empty(_) => FailureKind::Input,
+            TrainError::NoViews | TrainError::Exposures | TrainError::Poses | TrainError::Empty(_) => {
+                FailureKind::Input
+            }
             TrainError::Device(_) => FailureKind::Work,
             TrainError::OutOfMemory(_) => FailureKind::OutOfMemory,
             // Windows carry checksums: an unreadable one is unreachable or damaged, which the input does not explain.

@@ -35,6 +35,14 @@ pub(crate) struct EvalArgs {
     /// Store of the photos; by default the model's own if it exists, else a temporary one
     #[arg(long, value_name = "URL")]
     pub(crate) store: Option<String>,
+    /// Also measure each view from the pose that fits its photo best, found against the model as it is. For captures whose
+    /// poses have errors; by default if the model was trained with refined poses
+    #[arg(long)]
+    pub(crate) refine_poses: bool,
+    /// Also measure the right half of each view after fitting an exposure to its left half; by default if the model was
+    /// trained with exposures
+    #[arg(long)]
+    pub(crate) fit_exposure: bool,
     /// Also measure LPIPS with this network (ONNX)
     #[arg(long, value_name = "FILE", long_help = LPIPS_HELP)]
     pub(crate) lpips: Option<PathBuf>,

@@ -67,6 +67,10 @@ pub(crate) struct PlanOptions {
     /// balance; not with --blocks flat
     #[arg(long)]
     pub(crate) exposure: bool,
+    /// Refine the pose of each training view with the splats in the root block and use it in all other blocks. For poses
+    /// with errors of some pixels; not with --blocks flat. The refined cameras go to OUT/cameras.json
+    #[arg(long)]
+    pub(crate) refine_poses: bool,
     /// Label each splat with the block that trained it, as the integer property `block` of merged.ply
     #[arg(long)]
     pub(crate) label_blocks: bool,
@@ -117,6 +121,7 @@ impl PlanOptions {
             test_every: self.test_every,
             antialiased: self.antialiased,
             exposure: self.exposure,
+            refine_poses: self.refine_poses,
             label_blocks: self.label_blocks,
             depth_weight: self.depth_weight.0.unwrap_or(if is_measured { MEASURED_DEPTH_WEIGHT } else { 0.0 }),
             evaluate: self.evaluate,

@@ -135,6 +135,7 @@ fn plan_options(args: &AblateArgs, seed: u64) -> PlanOptions {
         test_every: args.test_every,
         antialiased: false,
         exposure: false,
+        refine_poses: false,
         label_blocks: false,
         depth_weight: Auto(Some(0.0)),
         no_lidar: true,

@@ -136,6 +136,7 @@ pub(crate) fn settings(args: &DemoArgs) -> (Settings, TrainArgs) {
             seed: 0,
             antialiased: false,
             exposure: false,
+            refine_poses: false,
             label_blocks: false,
             depth_weight: Auto(Some(0.0)),
             no_lidar: true,

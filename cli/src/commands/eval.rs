@@ -4,7 +4,7 @@
 
 use std::path::Path;
 
-use eval::{DetailOptions, Details, Evaluation, Lpips, PhotoOptions, Photos, Request};
+use eval::{DetailOptions, Details, Evaluation, Fits, Lpips, PhotoOptions, Photos, Request};
 use model::{Model, save_json};
 
 use crate::args::EvalArgs;
@@ -48,6 +48,10 @@ pub(crate) fn measure(args: &EvalArgs, output: &Output) -> Result<Evaluated, Fai
         photos: &photos,
         backend: &backend,
         lpips: lpips.as_ref(),
+        fits: Fits {
+            pose: args.refine_poses || model.poses.is_some(),
+            exposure: args.fit_exposure || model.exposures.is_some(),
+        },
         out: &out,
         trained: args.trained as usize,
     };
@@ -67,7 +71,8 @@ pub(crate) fn measure_trained(
     output: &Output,
 ) -> Result<Evaluated, Failure> {
     let (details, backend) = (Details::default(), train::Backend::Cpu);
-    let request = Request { model, details: &details, photos, backend: &backend, lpips, out, trained: 0 };
+    let fits = Fits { pose: model.poses.is_some(), exposure: model.exposures.is_some() };
+    let request = Request { model, details: &details, photos, backend: &backend, lpips, fits, out, trained: 0 };
     let evaluated = evaluated(&request, output)?;
     save_json(&out.join("report.json"), &evaluated)?;
     Ok(evaluated)
@@ -90,5 +95,6 @@ fn evaluated(request: &Request, output: &Output) -> Result<Evaluated, Failure> {
     };
     record.set_figures(&evaluation.views);
     let Evaluation { views, by_kind, stretches, trained_on, sheet, cuts, seams, .. } = evaluation;
-    Ok(Evaluated { record, sheet: Some(sheet), views, by_kind, stretches, trained_on, cuts, seams })
+    let evaluated = Evaluated::new(record, views);
+    Ok(Evaluated { by_kind, stretches, trained_on, sheet: Some(sheet), cuts, seams, ..evaluated })
 }

@@ -134,7 +134,7 @@ impl Finished<'_> {
         };
         save_json(&out.join("plan.json"), plan)?;
         let downscale = args.plan.downscale;
-        let written = model::write(out, plan, &results, store, capture.geo_origin, downscale)?;
+        let written = model::write(out, plan, &results, store, capture, downscale)?;
         if let Some(failure) = failed {
             return Err(eval_results::model_is_kept(failure, out));
         }
@@ -174,6 +174,10 @@ fn backend_of(args: &SubmitArgs, about: &proto::AboutReply, output: &Output) -> 
     if args.plan.exposure && !is_cpu(&name) {
         let advice = "leave it, or give --backend cpu";
         return Err(BadInput::new("--exposure", format!("is not trained on {name}"), advice).into());
+    }
+    if args.plan.refine_poses && !is_cpu(&name) {
+        let advice = "leave it, or give --backend cpu";
+        return Err(BadInput::new("--refine-poses", format!("is not done on {name}"), advice).into());
     }
     Ok(name)
 }

@@ -124,7 +124,7 @@ pub(crate) fn train(args: &TrainArgs, output: &Output) -> Result<Trained, Failur
     let clock = Stopwatch::start();
     let Prepared { capture, capture_id, plan, plan_id, config_hash, store, ingest_cpu_seconds, .. } = prepared;
     let (store, downscale) = (store.blocking(), args.plan.downscale);
-    let written = model::write(&args.out, &plan, &finished.results, &store, capture.geo_origin, downscale)?;
+    let written = model::write(&args.out, &plan, &finished.results, &store, &capture, downscale)?;
     let totals = finished.totals;
     let mut record = Record {
         scene: captures::name_of(&args.capture),
@@ -261,6 +261,9 @@ fn time_limit_of(minutes: f64, clock: Stopwatch, plan: &Plan, workers: u32) -> T
 fn backend_of(args: &TrainArgs) -> Result<train::Backend, BadInput> {
     if args.backend == Backend::Gpu && args.plan.exposure {
         return Err(BadInput::new("--exposure", "is not trained on a GPU", "leave it, or give --backend cpu"));
+    }
+    if args.backend == Backend::Gpu && args.plan.refine_poses {
+        return Err(BadInput::new("--refine-poses", "is not done on a GPU", "leave it, or give --backend cpu"));
     }
     backend::open(args.backend)
 }

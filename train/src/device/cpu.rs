@@ -1,5 +1,7 @@
 //! Computes training steps on the CPU, in place on the state.
 
+use std::sync::Arc;
+
 use rayon::prelude::*;
 use render::cpu::{Isa, Renderer};
 use render::{Frame, Gradients, Upstream};
@@ -11,10 +13,12 @@ use crate::depth_loss::depth_loss;
 use crate::error::TrainError;
 use crate::exposure::{expose, expose_backward};
 use crate::loss::PhotometricLoss;
+use crate::pose::GivenPoses;
 
 /// The renderer, the loss and their buffers.
 pub(crate) struct CpuDevice<'a> {
     context: Option<&'a Splats>,
+    given: Arc<GivenPoses>,
     renderer: Renderer,
     loss: PhotometricLoss,
     upstream: Upstream,
@@ -26,10 +30,11 @@ pub(crate) struct CpuDevice<'a> {
 
 impl<'a> CpuDevice<'a> {
     /// `lambda` is the weight of D-SSIM in the loss.
-    pub(crate) fn new(lambda: f32, context: Option<&'a Splats>) -> Self {
+    pub(crate) fn new(lambda: f32, context: Option<&'a Splats>, given: &Arc<GivenPoses>) -> Self {
         let isa = Isa::detect();
         Self {
             context,
+            given: Arc::clone(given),
             renderer: Renderer::new(isa),
             loss: PhotometricLoss::new(isa, lambda),
             upstream: Upstream::default(),
@@ -42,12 +47,14 @@ impl<'a> CpuDevice<'a> {
 
 impl TrainDevice for CpuDevice<'_> {
     fn step(&mut self, state: &mut State, step: Step) -> Result<(), TrainError> {
-        let Step { samples, options, mut rates, depth_weight, exposure_rate } = step;
+        let Step { samples, options, rates, depth_weight, exposure_rate, pose_rates } = step;
         let several = samples.len() > 1;
         let before = several.then(|| state.densification.clone());
-        let (mut loss, mut errors, mut by_exposure, mut visible_sum) = (0.0, Vec::new(), Vec::new(), 0);
+        let (mut loss, mut errors, mut visible_sum) = (0.0, Vec::new(), 0);
+        let (mut by_exposure, mut by_pose) = (Vec::new(), Vec::new());
         for ViewSample { view, photo, camera, exposure } in &samples {
-            let frame = self.renderer.forward(&state.splats, self.context, camera, &options);
+            let camera = state.poses.as_ref().map_or(*camera, |poses| poses.apply(*view, camera));
+            let frame = self.renderer.forward(&state.splats, self.context, &camera, &options);
             pixel_weights(frame, photo, self.context.is_some(), &mut self.weights);
             let exposure = state.exposures.as_ref().map_or(*exposure, |exposures| exposures.of(*view));
             let shown = exposure.as_ref().map_or(&frame.colour, |exposure| {
@@ -75,7 +82,10 @@ impl TrainDevice for CpuDevice<'_> {
                 by_exposure.push((*view, expose_backward(exposure, &frame.colour, &mut self.upstream.colour)));
             }
             let gradients = self.renderer.backward(&state.splats, &self.upstream);
-            state.densification.add(gradients, photo.area() as f32);
+            by_pose.push((*view, gradients.pose));
+            if rates.is_some() {
+                state.densification.add(gradients, photo.area() as f32);
+            }
             if several {
                 visible_sum += visible_count(gradients);
                 accumulate(&mut self.sum, gradients, errors.len() == 1);
@@ -85,6 +95,10 @@ impl TrainDevice for CpuDevice<'_> {
         if let Some(exposures) = &mut state.exposures {
             by_exposure.iter().for_each(|(view, gradient)| exposures.step(*view, gradient, exposure_rate));
         }
+        if let (Some(poses), Some(rates)) = (&mut state.poses, pose_rates) {
+            by_pose.iter().for_each(|(view, gradient)| poses.step(&self.given, *view, gradient, &rates));
+        }
+        let Some(mut rates) = rates else { return Ok(()) };
         let gradients = match several {
             // Each sample's regulariser is a mean over the splats visible in it, Adam's over those visible in any.
             true => {

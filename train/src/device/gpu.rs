@@ -185,7 +185,9 @@ impl GpuDevice {
             false => UpstreamPlanes::default(),
         };
         self.renderer.backward(&mut encoder, &self.splats, planes)?;
-        self.update_splats(&mut encoder, options.sh_degree, rates, samples.len());
+        if let Some(rates) = rates {
+            self.update_splats(&mut encoder, options.sh_degree, rates, samples.len());
+        }
         self.in_flight.push_back(gpu.submit(encoder)?);
         match self.in_flight.len() > IN_FLIGHT {
             true => self.in_flight.pop_front().map_or(Ok(()), |index| gpu.wait_for(index)),

@@ -12,6 +12,7 @@ use scene::{Camera, Exposure, Pixels};
 use crate::checkpoint::State;
 use crate::error::TrainError;
 use crate::optimiser::LearningRates;
+use crate::pose::PoseRates;
 
 /// Largest number of views in one optimiser step.
 pub const MAX_VIEWS_PER_STEP: u32 = 16;
@@ -22,11 +23,14 @@ pub(crate) struct Step {
     /// 1 to [`MAX_VIEWS_PER_STEP`] samples, no view twice.
     pub(crate) samples: Vec<ViewSample>,
     pub(crate) options: Options,
-    pub(crate) rates: LearningRates,
+    /// `None`: the splats are frozen, and only poses are trained.
+    pub(crate) rates: Option<LearningRates>,
     /// Weight of the depth loss. Above 0 a sample has target depths and the options ask for the planes that they need.
     pub(crate) depth_weight: f32,
     /// Learning rate of exposures, where they are trained.
     pub(crate) exposure_rate: f32,
+    /// Rates of poses, where they are trained in this step.
+    pub(crate) pose_rates: Option<PoseRates>,
 }
 
 /// A rectangular crop (window) of one mip of a view's photo.
@@ -36,7 +40,7 @@ pub(crate) struct ViewSample {
     pub(crate) view: u32,
     /// Pixels of the window.
     pub(crate) photo: Arc<Pixels>,
-    /// Camera of the window.
+    /// Camera of the window, with the given pose.
     pub(crate) camera: Camera,
     /// Exposure of the view where exposures are given and fixed; `None` if they are trained or not used.
     pub(crate) exposure: Option<Exposure>,

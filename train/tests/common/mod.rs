@@ -9,7 +9,9 @@ use render::Options;
 use render::cpu::Renderer;
 use scene::splats::SH_C0;
 use scene::{Camera, Exposures, Pinhole, Pixels, Rect, Rigid, Splat, Splats};
-use train::{Backend, Flow, Job, Recipe, State, TrainError, TrainView, WindowSource, metrics, random, train_from};
+use train::{
+    Backend, Flow, Job, Recipe, State, TrainError, TrainView, Trained, WindowSource, metrics, random, train_from,
+};
 
 pub const WIDTH: u32 = 64;
 pub const HEIGHT: u32 = 48;
@@ -134,17 +136,31 @@ pub struct Setup<'a> {
     pub recipe: Recipe,
     pub exposures: Option<&'a Exposures>,
     pub trains_exposures: bool,
+    pub trains_poses: bool,
     pub backend: Backend,
+    pub views: Vec<TrainView>,
 }
 
 impl<'a> Setup<'a> {
     /// A job whose budget is the number of initial splats, without context.
     pub fn new(initial: Splats, photos: &'a Photos) -> Self {
         let budget = initial.len();
-        let (exposures, trains_exposures) = (None, false);
+        let (exposures, trains_exposures, trains_poses) = (None, false, false);
         let recipe = Recipe::default();
         let backend = Backend::Cpu;
-        Self { initial, photos, context: None, budget, steps: 240, recipe, exposures, trains_exposures, backend }
+        Self {
+            initial,
+            photos,
+            context: None,
+            budget,
+            steps: 240,
+            recipe,
+            exposures,
+            trains_exposures,
+            trains_poses,
+            backend,
+            views: views(),
+        }
     }
 
     pub fn run(self) -> Splats {
@@ -156,7 +172,7 @@ impl<'a> Setup<'a> {
         counts: &(dyn Fn(Vec3) -> bool + Sync),
         report: &mut dyn FnMut(train::Progress) -> Flow,
     ) -> Result<Splats, TrainError> {
-        self.try_run_on(None, counts, report).map(|(splats, _)| splats)
+        self.try_run_on(None, counts, report).map(|trained| trained.splats)
     }
 
     pub fn try_run_on(
@@ -164,12 +180,11 @@ impl<'a> Setup<'a> {
         from: Option<State>,
         counts: &(dyn Fn(Vec3) -> bool + Sync),
         report: &mut dyn FnMut(train::Progress) -> Flow,
-    ) -> Result<(Splats, Option<Exposures>), TrainError> {
-        let views = views();
+    ) -> Result<Trained, TrainError> {
         let job = Job {
             initial: self.initial,
             context: self.context,
-            views: &views,
+            views: &self.views,
             counts,
             keeps: &|_| true,
             budget: self.budget,
@@ -179,6 +194,7 @@ impl<'a> Setup<'a> {
             size_bounds_metres: [1e-3, 2.0],
             exposures: self.exposures,
             trains_exposures: self.trains_exposures,
+            trains_poses: self.trains_poses,
             recipe: &self.recipe,
             source: self.photos,
             backend: &self.backend,

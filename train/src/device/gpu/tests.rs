@@ -8,6 +8,7 @@ use super::*;
 use crate::coarse_to_fine::CoarseToFine;
 use crate::depth_loss::depth_loss;
 use crate::loss::PhotometricLoss;
+use crate::pose::GivenPoses;
 use crate::random::{bits, uniform};
 
 fn gpu() -> Option<Arc<Gpu>> {
@@ -56,7 +57,7 @@ fn step(masked: bool, extras: bool, key: u64) -> Step {
     Step {
         samples: vec![sample(masked, key, [75, 53], DVec3::ZERO)],
         options: Options { extras, sh_degree: 3, ..Options::default() },
-        rates: optimiser::LearningRates {
+        rates: Some(optimiser::LearningRates {
             mean: 0.03,
             log_scale: 0.01,
             quat: 0.002,
@@ -67,9 +68,10 @@ fn step(masked: bool, extras: bool, key: u64) -> Step {
             opacity_reg: 0.02,
             needle_reg: 0.01,
             log_scale_bounds: [-5.0, -1.0],
-        },
+        }),
         depth_weight: 0.0,
         exposure_rate: 0.0,
+        pose_rates: None,
     }
 }
 
@@ -84,6 +86,11 @@ fn with_weights_and_depth(mut sample: ViewSample, key: u64) -> ViewSample {
     sample
 }
 
+/// Poses of no view.
+fn none() -> Arc<GivenPoses> {
+    Arc::new(GivenPoses::of(&[], &Splats::new(0), true))
+}
+
 fn new_state(splats: Splats) -> State {
     State {
         step: 0,
@@ -93,6 +100,7 @@ fn new_state(splats: Splats) -> State {
         adam: Adam::new(Isa::detect(), &splats),
         densification: DensificationStats::default(),
         exposures: None,
+        poses: None,
         splats,
         loss: f64::NAN,
     }
@@ -159,7 +167,7 @@ fn stages_agree_with_the_cpu() {
             let upstream_off = off(&found, &upstream).max(depth_off);
 
             let gradients = device.renderer.read_gradients(&device.splats).unwrap();
-            expected.adam.step(&mut expected.splats, &gradients, 3, &step.rates);
+            expected.adam.step(&mut expected.splats, &gradients, 3, step.rates.as_ref().unwrap());
             expected.densification.add(&gradients, photo.area() as f32);
             let by_column = |found: &[Vec<f32>], expected: &[Vec<f32>]| {
                 found.iter().zip(expected).map(|(a, b)| off(a, b)).fold(0.0, f32::max)
@@ -213,7 +221,8 @@ fn several_samples_agree_with_the_cpu(depth_weight: f32) {
     let one = |samples: &[ViewSample]| {
         let mut step = step(false, true, 1);
         // Regularisers large enough to exceed rounding errors.
-        (step.rates.opacity_reg, step.rates.needle_reg) = (30.0, 30.0);
+        let rates = step.rates.as_mut().unwrap();
+        (rates.opacity_reg, rates.needle_reg) = (30.0, 30.0);
         step.depth_weight = depth_weight;
         Step { samples: samples.to_vec(), ..step }
     };
@@ -223,7 +232,7 @@ fn several_samples_agree_with_the_cpu(depth_weight: f32) {
         device.download(&mut state, StatePart::All).unwrap();
         state
     };
-    let cpu = run(&mut super::super::cpu::CpuDevice::new(0.2, Some(&context)), &samples);
+    let cpu = run(&mut super::super::cpu::CpuDevice::new(0.2, Some(&context), &none()), &samples);
     let gpu_device = || GpuDevice::new(&gpu, &begin, 0.2, Some(&context)).unwrap();
     let on_gpu = run(&mut gpu_device(), &samples);
     assert!(words(&on_gpu) == words(&run(&mut gpu_device(), &samples)), "the same bits");
@@ -256,7 +265,7 @@ fn several_samples_agree_with_the_cpu(depth_weight: f32) {
     }
     // A loss that is not finite skips the whole step.
     let mut gpu_nan = GpuDevice::new(&gpu, &begin, f32::NAN, Some(&context)).unwrap();
-    let mut cpu_nan = super::super::cpu::CpuDevice::new(f32::NAN, Some(&context));
+    let mut cpu_nan = super::super::cpu::CpuDevice::new(f32::NAN, Some(&context), &none());
     for device in [&mut gpu_nan as &mut dyn TrainDevice, &mut cpu_nan] {
         let skipped = run(device, &samples);
         assert_eq!((skipped.skipped, skipped.coarse_to_fine.tally.count, skipped.adam.parts().0), (1, 0, 0));
@@ -278,7 +287,7 @@ fn pair_buffer_size_changes_no_byte() {
         device.upload(&state, StatePart::All).unwrap();
         for key in 0..3 {
             let mut step = step(false, false, key);
-            step.rates.log_scale_bounds = [-5.0, 1.0];
+            step.rates.as_mut().unwrap().log_scale_bounds = [-5.0, 1.0];
             device.step(&mut state, step).unwrap();
         }
         let status: shaders::Status = gpu.read(device.renderer.status_buffer(), 0, 1).unwrap()[0];
