@@ -199,7 +199,8 @@ mod tests {
 
     #[test]
     fn depths_that_cannot_be_are_left_out() {
-        let odd = [(0, 0, f32::NAN), (1, 0, 0.0), (2, 0, -1.0), (3, 0, f32::INFINITY), (9, 0, 1.0), (4, 0, 2.0), (5, 0, 1e9)];
+        let odd =
+            [(0, 0, f32::NAN), (1, 0, 0.0), (2, 0, -1.0), (3, 0, f32::INFINITY), (9, 0, 1.0), (4, 0, 2.0), (5, 0, 1e9)];
         let samples = DepthSamples::new(8, 1, odd.into_iter());
         assert_eq!(samples.iter().collect::<Vec<_>>(), [(4, 0, 2.0)]);
     }

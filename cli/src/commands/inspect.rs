@@ -123,7 +123,9 @@ fn text(found: &Inspected, plan: Option<&Plan>) -> String {
     text += &format!(", over {x:.1} × {y:.1} m, {z:.1} m high\n");
     if found.sweeps > 0 {
         let (sweeps, views, points) = (found.sweeps, found.views_with_lidar, found.lidar_points);
-        text += &format!("{sweeps} sweeps of a lidar, taken with {views} of the views; {points} of the points come from them\n");
+        text += &format!(
+            "{sweeps} sweeps of a lidar, taken with {views} of the views; {points} of the points come from them\n"
+        );
     }
     text += &match found.geo_origin {
         Some(at) => format!(

@@ -53,12 +53,16 @@ impl<'a> Lidar<'a> {
     ///
     /// # Errors
     /// A sweep that cannot be read, or a failing store.
-    pub(super) fn measure(&self, capture: &Capture, number: usize, store: &BlockingStore) -> Result<Measured, IngestError> {
+    pub(super) fn measure(
+        &self,
+        capture: &Capture,
+        number: usize,
+        store: &BlockingStore,
+    ) -> Result<Measured, IngestError> {
         let view = &capture.views[number];
         let pixels = finest(view, store)?;
-        let is_used = |x: u32, y: u32| {
-            pixels.mask.as_ref().is_none_or(|mask| mask[(y * pixels.width + x) as usize] >= 128)
-        };
+        let is_used =
+            |x: u32, y: u32| pixels.mask.as_ref().is_none_or(|mask| mask[(y * pixels.width + x) as usize] >= 128);
         let mut returns = Vec::new();
         for &sweep in &self.of_view[number] {
             returns.extend(self.sweeps[sweep as usize].read()?.into_iter().map(|found| found.place));
@@ -114,5 +118,6 @@ fn finest(view: &View, store: &BlockingStore) -> Result<Pixels, IngestError> {
         index.window(rect, &parts)
     });
     let advice = "delete the artefact and ingest again";
-    Ok(decoded.map_err(|e| BadInput::new(format!("artefact {} of {}", view.mips[0], view.name), e.to_string(), advice))?)
+    Ok(decoded
+        .map_err(|e| BadInput::new(format!("artefact {} of {}", view.mips[0], view.name), e.to_string(), advice))?)
 }

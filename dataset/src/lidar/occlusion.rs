@@ -124,7 +124,8 @@ mod tests {
             (62.0..94.0).contains(&pixel.x) && (12.0..84.0).contains(&pixel.y)
         };
         let behind = far.iter().filter(|p| is_behind(p)).count();
-        let leaked = seen.iter().filter(|s| s.point as usize >= near.len() && is_behind(&all[s.point as usize])).count();
+        let leaked =
+            seen.iter().filter(|s| s.point as usize >= near.len() && is_behind(&all[s.point as usize])).count();
         assert!(behind > 50 && leaked == 0, "{leaked} of {behind}");
         let beside = far.iter().filter(|p| camera().project(**p).0.x > 110.0).count();
         let kept = seen.iter().filter(|s| s.x > 110).count();

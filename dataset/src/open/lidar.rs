@@ -27,7 +27,8 @@ pub(super) fn find(root: &CaptureRoot, views: &[View]) -> Result<Vec<Sweep>, Bad
     if path.metadata().is_ok_and(|data| data.len() > MAX_POSES_BYTES) {
         return Err(bad("is too large for poses".into(), "correct or remove the file"));
     }
-    let poses = lidar::read_poses(&files::read(&path)?).map_err(|e| bad(e.to_string(), "correct or remove the file"))?;
+    let poses =
+        lidar::read_poses(&files::read(&path)?).map_err(|e| bad(e.to_string(), "correct or remove the file"))?;
     let index: BTreeMap<&str, u32> = views.iter().map(|view| stem(&view.name)).zip(0..).collect();
     let sweep = |pose: &SweepPose| -> Result<Sweep, BadInput> {
         let name = format!("lidar/{}.bin", pose.name);
