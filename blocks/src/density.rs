@@ -191,7 +191,7 @@ mod tests {
             .collect();
         let length = stops as f64 * spacing;
         let place = |i: u64| {
-            let side = if i % 2 == 0 { -7.0 } else { 7.0 };
+            let side = if i.is_multiple_of(2) { -7.0 } else { 7.0 };
             DVec3::new(noise(2 * i) * length, side, 9.0 * noise(2 * i + 1))
         };
         let mut drive = capture(&cameras, (0..2000).map(place).collect(), true);
