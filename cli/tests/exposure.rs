@@ -9,7 +9,7 @@ use std::process::{Command, Output};
 use blocks::Plan;
 use city::CitySettings;
 use dataset::synth::{self, Settings};
-use scene::{ArtefactId, BlockId, Capture, Exposures, Splats, frame, ply};
+use scene::{ArtefactId, BlockId, Exposures, Splats, frame, ply};
 use serde_json::Value;
 
 fn plat(folder: &Path, words: &[&str]) -> Output {
@@ -29,7 +29,7 @@ fn expose_photos(images: &Path) -> Vec<f64> {
     let mut names: Vec<_> = std::fs::read_dir(images).unwrap().map(|entry| entry.unwrap().path()).collect();
     names.sort();
     let gain = |view: usize| {
-        if Capture::is_test(view, 8) { 1.0 } else { 0.7 + 0.5 * f64::from(train::random::uniform(5, view as u64)) }
+        if view.is_multiple_of(8) { 1.0 } else { 0.7 + 0.5 * f64::from(train::random::uniform(5, view as u64)) }
     };
     for (view, name) in names.iter().enumerate() {
         let mut photo = image::open(name).unwrap().to_rgb8();
@@ -99,7 +99,7 @@ fn plan_and_results(at: &Path) -> (Plan, impl Fn(BlockId) -> (Splats, Option<Art
 fn check_exposures(at: &Path, gains: &[f64]) {
     let file = std::fs::read(at.join("on/model/exposures.plat")).unwrap();
     let exposures = Exposures::from_frame(&file).unwrap();
-    let trained: Vec<u32> = (0..32).filter(|&view| !Capture::is_test(view as usize, 8)).collect();
+    let trained: Vec<u32> = (0..32).filter(|view: &u32| !view.is_multiple_of(8)).collect();
     assert_eq!(exposures.iter().map(|(view, _)| view).collect::<Vec<_>>(), trained);
     let mean = |of: &dyn Fn(u32) -> f64| trained.iter().map(|&view| of(view)).sum::<f64>() / trained.len() as f64;
     let found = |view: u32| f64::from(exposures.of(view).unwrap().gain());

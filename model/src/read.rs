@@ -135,8 +135,9 @@ pub(crate) fn read_block(folder: &Path, block: BlockId) -> Result<Splats, BadInp
 
 #[cfg(test)]
 mod tests {
+    use blocks::Split;
     use glam::Vec3;
-    use scene::Splat;
+    use scene::{Capture, Splat};
 
     use super::*;
 
