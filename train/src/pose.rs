@@ -106,6 +106,15 @@ fn joined([translation, rotation]: [DVec3; 2]) -> [f32; 6] {
     [x, y, z, a, b, c].map(|value| value as f32)
 }
 
+/// Rates of one step.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct PoseRates {
+    /// Learning rate of rotations in radians; that of translations follows from the depth.
+    pub(crate) rate: f32,
+    /// Share of every displacement of a view in the step that is taken back.
+    pub(crate) decay: f32,
+}
+
 /// Displacements in training, each with its own Adam state. A view's step count is the number of times that it was
 /// rendered while poses were trained.
 #[derive(Debug, Clone, PartialEq)]
