@@ -22,7 +22,7 @@ use self::depths::Lidar;
 use crate::open::{Photo, Source};
 use crate::photo::DecodedPhoto;
 use crate::undistortion::Undistorter;
-use crate::{mip_tiles, mips, photo};
+use crate::{box_masks, mip_tiles, mips, photo};
 
 /// An ingested capture in the store.
 pub const CAPTURE: Kind = Kind(*b"capt", 2);
@@ -203,7 +203,7 @@ impl Job<'_> {
                     let usable = photo::decode_mask(&bytes, w, h).map_err(|e| at(path, &e))?;
                     pixels.mask = Some(intersected(pixels.mask.take(), usable));
                 }
-                let finest = self.finest(pixels, undistorter(photo, ideal, last_undistorter)?);
+                let finest = self.finest(pixels, photo, undistorter(photo, ideal, last_undistorter)?);
                 self.store_mips(finest, &name, &photo.path)?
             }
         };
@@ -221,12 +221,16 @@ impl Job<'_> {
     }
 
     /// Mip 0: undistorted and downscaled. A mask that excludes nothing is dropped.
-    fn finest(&self, mut photo: DecodedPhoto, undistorter: &Undistorter) -> Pixels {
+    fn finest(&self, mut photo: DecodedPhoto, source: &Photo, undistorter: &Undistorter) -> Pixels {
         if !undistorter.is_identity() {
             photo.mask = photo.mask.map(|mask| undistorter.mask(&mask));
             photo.rgb = undistorter.rgb(&photo.rgb);
         }
         let Pinhole { width, height, .. } = undistorter.pinhole();
+        if !source.moving.is_empty() {
+            let all = || vec![255; width as usize * height as usize];
+            box_masks::exclude(photo.mask.get_or_insert_with(all), &undistorter.pinhole(), &source.moving);
+        }
         let mut pixels =
             Pixels { width, height, rgb: photo::planes(&photo.rgb), mask: photo.mask, weights: None, depth: None };
         drop(photo.rgb);
@@ -256,7 +260,11 @@ impl Job<'_> {
     fn record_name(&self, photo: &Photo, bytes: &[u8], mask: Option<&[u8]>) -> String {
         let mask = mask.map(ArtefactId::of);
         let key = (FORMAT, ArtefactId::of(bytes), mask, photo.model, photo.width, photo.height, self.downscale);
-        format!("ingest/{}", ArtefactId::of(&frame::encode(RECORD, &key, &[])))
+        let key = match photo.moving.as_slice() {
+            [] => frame::encode(RECORD, &key, &[]),
+            moving => frame::encode(RECORD, &(key, moving), &[]),
+        };
+        format!("ingest/{}", ArtefactId::of(&key))
     }
 
     /// The ingest record of this name, if the store has all of its mips at their full length.

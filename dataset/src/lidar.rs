@@ -3,6 +3,7 @@
 //! Training uses them twice. Each photo gets target depths from the sweeps taken at its time ([`crate::ingest`]), and the
 //! sweeps of the whole capture, thinned, are initial points ([`seeds`]).
 
+mod npz;
 mod occlusion;
 pub(crate) mod seeds;
 
@@ -43,6 +44,8 @@ pub struct Sweep {
 pub enum PointFormat {
     /// This many f32 a point, of which the first three are x, y and z (KITTI: 4, nuScenes: 5).
     Floats(usize),
+    /// The array `data` of an npz file, or its first one: a row a point, of which the first three columns are x, y and z (DGP).
+    Npz,
 }
 
 /// A return of the lidar.
@@ -67,7 +70,10 @@ impl Sweep {
         if bytes.len() as u64 > MAX_FILE_BYTES {
             return Err(bad(format!("is larger than {} MB, too large for a sweep", MAX_FILE_BYTES >> 20)));
         }
-        let PointFormat::Floats(floats) = self.format;
+        let (bytes, floats) = match self.format {
+            PointFormat::Floats(floats) => (bytes, floats),
+            PointFormat::Npz => npz::rows(&bytes).map_err(|e| bad(e.to_string()))?,
+        };
         let count = (bytes.len() / (4 * floats)) as u64;
         if let Some(readings) = self.readings.filter(|readings| *readings != count) {
             return Err(bad(format!("holds {count} points, and the capture says {readings}")));

@@ -8,6 +8,7 @@
 //! Missing photos are skipped and reported, because captures are often shared without all of them.
 
 mod colmap;
+mod dgp;
 mod files;
 mod frustum_points;
 mod kitti360;
@@ -20,6 +21,7 @@ mod transforms;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
+use glam::DVec3;
 use rayon::prelude::*;
 use scene::transforms::{Focal, Intrinsics};
 use scene::{BadInput, Camera, CameraModel, Capture, GeoOrigin, Pinhole, View};
@@ -44,6 +46,8 @@ pub struct Photo {
     pub width: u32,
     /// Height of the file in pixels.
     pub height: u32,
+    /// Boxes of moving objects, which are left out like masked pixels: corners in the camera's axes.
+    pub moving: Vec<[DVec3; 8]>,
 }
 
 /// An opened capture: everything but the pixels.
@@ -55,13 +59,15 @@ pub struct Source {
     pub photos: Vec<Photo>,
     /// Names of the capture's images that are not used, with the reason.
     pub left_out: Vec<(String, String)>,
-    /// `colmap`, `transforms`, `opensfm` or `kitti360`, followed by ` without points` if its points were sampled from the
+    /// `colmap`, `transforms`, `opensfm`, `dgp` or `kitti360`, followed by ` without points` if its points were sampled from the
     /// overlap of its views.
     pub format: &'static str,
     /// Lidar sweeps. The last [`seeds`](Self::seeds) points of the capture come from them.
     pub sweeps: Vec<Sweep>,
     /// For each of the points that come from lidar, the view that colours it.
     pub seeds: Vec<u32>,
+    /// Number of annotated boxes by class.
+    pub labels: BTreeMap<String, usize>,
 }
 
 impl Source {
@@ -77,13 +83,18 @@ impl Source {
 /// The invalid file, its defect, and advice.
 pub fn open(path: &Path, options: &OpenOptions) -> Result<Source, BadInput> {
     let root = CaptureRoot::new(path)?;
-    let ParsedCapture { mut format, images, points, origin, left_out: unused } = parse(&root, path, options)?;
+    let ParsedCapture { mut format, images, points, origin, left_out: unused, sweeps, labels } =
+        parse(&root, path, options)?;
     let (images, photos, mut left_out) = find_photos(&root, images, options)?;
     left_out.extend(unused);
     let views = views(&images, &photos)?;
     let mut points = points.with_view_indices(images.iter().map(|image| image.id));
     let cameras: Vec<Camera> = views.iter().map(|view| view.camera).collect();
-    let sweeps = if options.lidar { lidar::find(&root, &views)? } else { Vec::new() };
+    let sweeps = match sweeps {
+        _ if !options.lidar => Vec::new(),
+        none if none.is_empty() => lidar::find(&root, &views)?,
+        parsed => lidar::with_views(parsed, &images),
+    };
     let Seeds { points: measured, best_view: seeds } = seeds(&sweeps, &cameras, points.len())?;
     points.append(measured);
     if points.is_empty() && !options.cameras_only {
@@ -95,11 +106,12 @@ pub fn open(path: &Path, options: &OpenOptions) -> Result<Source, BadInput> {
             "colmap" => "colmap without points",
             "transforms" => "transforms without points",
             "opensfm" => "opensfm without points",
+            "dgp" => "dgp without points",
             _ => "kitti360 without points",
         };
     }
     let capture = Capture { views, points, geo_origin: geo_origin(&root)?.or(origin) };
-    Ok(Source { capture, photos, left_out, format, sweeps, seeds })
+    Ok(Source { capture, photos, left_out, format, sweeps, seeds, labels })
 }
 
 /// Detects the format of a capture and parses it.
@@ -119,6 +131,9 @@ fn parse(root: &CaptureRoot, path: &Path, options: &OpenOptions) -> Result<Parse
     }
     if let Some(path) = opensfm::find(root) {
         return opensfm::read(root, &path);
+    }
+    if let Some(scene) = dgp::find(root) {
+        return dgp::read(root, &scene, options);
     }
     if kitti360::is_present(root) {
         return kitti360::read(root, options);
@@ -176,7 +191,7 @@ fn photo(
             let Some((width, height)) = image.intrinsics.size.filter(|_| options.cameras_only) else { return Ok(None) };
             files::check_size(&root.path(&image.file), width, height)?;
             let model = image.intrinsics.model(width, height);
-            return Ok(Some(Photo { path: root.path(&image.file), mask: None, model, width, height }));
+            return Ok(Some(Photo { path: root.path(&image.file), mask: None, model, width, height, moving: Vec::new() }));
         }
     };
     let (width, height) = files::image_size(&path)?;
@@ -195,7 +210,7 @@ fn photo(
         },
         None => masks::find(root, masks, &image.file, &path, options),
     };
-    Ok(Some(Photo { path, mask, model, width, height }))
+    Ok(Some(Photo { path, mask, model, width, height, moving: image.moving.clone() }))
 }
 
 /// The lens in pixels of a photo of this size. The photo may be a uniformly scaled copy of the camera's image; `None` for another
@@ -235,7 +250,7 @@ fn views(images: &[PosedImage], photos: &[Photo]) -> Result<Vec<View>, BadInput>
             BadInput::new(files::show(&photo.path), problem, "check the parameters of its camera")
         })?;
         let camera = Camera { pinhole, camera_from_world: image.camera_from_world };
-        Ok(View { name: image.name.clone(), camera, mips: Vec::new(), masked: photo.mask.is_some(), depth: None })
+        Ok(View { name: image.name.clone(), camera, mips: Vec::new(), masked: photo.mask.is_some() || !photo.moving.is_empty(), depth: None })
     };
     images.iter().zip(photos).map(view).collect()
 }

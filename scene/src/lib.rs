@@ -9,6 +9,7 @@
 pub mod camera;
 pub mod capture;
 pub mod colmap;
+pub mod dgp;
 pub mod error;
 pub mod exposures;
 pub mod frame;

@@ -37,6 +37,8 @@ struct Inspected {
     views_with_lidar: usize,
     /// How many of the points come from lidar.
     lidar_points: usize,
+    /// Number of annotated boxes by class.
+    boxes: BTreeMap<String, usize>,
     left_out: Vec<(String, String)>,
     /// Along the ground's axes and up, 1st to 99th percentile of the points.
     extent_metres: [f64; 3],
@@ -96,6 +98,7 @@ pub(crate) fn run(args: &InspectArgs, output: &Output) -> Result<(), Failure> {
         sweeps: source.sweeps.len(),
         views_with_lidar: source.sweeps.iter().flat_map(|sweep| &sweep.views).collect::<BTreeSet<_>>().len(),
         lidar_points: source.seeds.len(),
+        boxes: source.labels,
         left_out: source.left_out,
         extent_metres: extent_metres(capture),
         geo_origin: capture.geo_origin,
@@ -126,6 +129,10 @@ fn text(found: &Inspected, plan: Option<&Plan>) -> String {
         text += &format!(
             "{sweeps} sweeps of a lidar, taken with {views} of the views; {points} of the points come from them\n"
         );
+    }
+    if !found.boxes.is_empty() {
+        let boxes: Vec<String> = found.boxes.iter().map(|(class, count)| format!("{count} {class}")).collect();
+        text += &format!("boxes: {}\n", boxes.join(", "));
     }
     text += &match found.geo_origin {
         Some(at) => format!(

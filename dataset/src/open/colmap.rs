@@ -46,6 +46,7 @@ pub(super) fn read(root: &CaptureRoot, folder: &str, options: &OpenOptions) -> R
             mask: None,
             intrinsics: Intrinsics::from_model(&camera.model, size),
             camera_from_world: image.camera_from_world,
+            moving: Vec::new(),
         })
     });
     let images = images.collect::<Result<Vec<_>, BadInput>>()?;
@@ -54,7 +55,7 @@ pub(super) fn read(root: &CaptureRoot, folder: &str, options: &OpenOptions) -> R
     }
     let ColmapPoints { positions, colours, track_start, track_images, .. } = points;
     let points = RawPoints(SparsePoints { positions, colours, track_start, seen_by: track_images });
-    Ok(ParsedCapture { format: "colmap", images, points, origin: None, left_out: Vec::new() })
+    Ok(ParsedCapture::new("colmap", images, points))
 }
 
 type Codec<T> = fn(&[u8]) -> Result<T, CodecError>;

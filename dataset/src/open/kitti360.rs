@@ -81,6 +81,7 @@ pub(super) fn read(root: &CaptureRoot, options: &OpenOptions) -> Result<ParsedCa
                     mask: None,
                     intrinsics: Intrinsics::from_model(&lens.model, Some((lens.width, lens.height))),
                     camera_from_world: world_from_camera.inverse(),
+                    moving: Vec::new(),
                 });
             }
         }
@@ -103,7 +104,7 @@ pub(super) fn read(root: &CaptureRoot, options: &OpenOptions) -> Result<ParsedCa
         }
         None => RawPoints::default(),
     };
-    Ok(ParsedCapture { format: "kitti360", images, points, origin: None, left_out: Vec::new() })
+    Ok(ParsedCapture::new("kitti360", images, points))
 }
 
 /// World points of the scans, thinned evenly.

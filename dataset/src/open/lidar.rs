@@ -12,6 +12,7 @@ use scene::lidar::{self, SweepPose};
 use scene::{BadInput, View};
 
 use super::files::{self, CaptureRoot, Found};
+use super::parsed::{ParsedSweep, PosedImage};
 use crate::lidar::{PointFormat, Sweep};
 
 const POSES: &str = "lidar/poses.jsonl";
@@ -61,6 +62,18 @@ pub(super) fn find(root: &CaptureRoot, views: &[View]) -> Result<Vec<Sweep>, Bad
         return Err(bad(problem.into(), "correct the names of photos in it, or remove the folder"));
     }
     Ok(sweeps)
+}
+
+/// The sweeps that a reader parsed; `images` are those of the views, in order.
+pub(super) fn with_views(parsed: Vec<ParsedSweep>, images: &[PosedImage]) -> Vec<Sweep> {
+    let index: BTreeMap<u32, u32> = images.iter().map(|image| image.id).zip(0..).collect();
+    let sweep = |sweep: ParsedSweep| {
+        let ParsedSweep { path, format, world_from_sensor, images } = sweep;
+        let mut views: Vec<u32> = images.iter().filter_map(|id| index.get(id).copied()).collect();
+        views.sort_unstable();
+        Sweep { path, format, readings: None, world_from_sensor, turn: None, views }
+    };
+    parsed.into_iter().map(sweep).collect()
 }
 
 /// The name of a photo without `images/` and extension.

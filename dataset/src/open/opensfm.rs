@@ -29,13 +29,13 @@ pub(super) fn read(root: &CaptureRoot, path: &Path) -> Result<ParsedCapture, Bad
         mask: None,
         intrinsics: Intrinsics::from_model(&shot.camera.model, Some((shot.camera.width, shot.camera.height))),
         camera_from_world: shot.camera_from_world,
+        moving: Vec::new(),
     });
     let reason = "it belongs to another reconstruction, which is smaller";
+    let points = RawPoints(SparsePoints { positions, colours, ..Default::default() });
     Ok(ParsedCapture {
-        format: "opensfm",
-        images: images.collect(),
-        points: RawPoints(SparsePoints { positions, colours, ..Default::default() }),
         origin,
         left_out: others.into_iter().map(|name| (name, reason.to_string())).collect(),
+        ..ParsedCapture::new("opensfm", images.collect(), points)
     })
 }

@@ -1,9 +1,13 @@
 //! A capture as its files describe it, common to all formats.
 
 use std::collections::BTreeMap;
+use std::path::PathBuf;
 
+use glam::DVec3;
 use scene::transforms::Intrinsics;
 use scene::{GeoOrigin, Rigid, SparsePoints};
+
+use crate::lidar::PointFormat;
 
 /// How to open a capture.
 #[derive(Debug, Clone, Default)]
@@ -17,6 +21,7 @@ pub struct OpenOptions {
 }
 
 /// A capture as parsed from its files, before its photos are found.
+#[derive(Default)]
 pub(super) struct ParsedCapture {
     pub(super) format: &'static str,
     pub(super) images: Vec<PosedImage>,
@@ -24,6 +29,25 @@ pub(super) struct ParsedCapture {
     pub(super) origin: Option<GeoOrigin>,
     /// Names of images that are not used, with the reason.
     pub(super) left_out: Vec<(String, String)>,
+    /// Sweeps of its lidar.
+    pub(super) sweeps: Vec<ParsedSweep>,
+    /// Number of annotated boxes by class.
+    pub(super) labels: BTreeMap<String, usize>,
+}
+
+impl ParsedCapture {
+    pub(super) fn new(format: &'static str, images: Vec<PosedImage>, points: RawPoints) -> Self {
+        Self { format, images, points, ..Self::default() }
+    }
+}
+
+/// A sweep of a capture's lidar.
+pub(super) struct ParsedSweep {
+    pub(super) path: PathBuf,
+    pub(super) format: PointFormat,
+    pub(super) world_from_sensor: Rigid,
+    /// The images taken during the sweep, by id.
+    pub(super) images: Vec<u32>,
 }
 
 /// An image of the capture with its lens and pose.
@@ -36,6 +60,8 @@ pub(super) struct PosedImage {
     pub(super) mask: Option<String>,
     pub(super) intrinsics: Intrinsics,
     pub(super) camera_from_world: Rigid,
+    /// Boxes of moving objects, which are left out of the photo: corners in the camera's axes.
+    pub(super) moving: Vec<[DVec3; 8]>,
 }
 
 /// Sparse points whose tracks hold ids of [`PosedImage`]s instead of indices of views.

@@ -46,6 +46,7 @@ pub(super) fn read(root: &CaptureRoot, paths: &[PathBuf]) -> Result<ParsedCaptur
                 mask: frame.mask_path,
                 intrinsics: frame.intrinsics,
                 camera_from_world: frame.camera_from_world,
+                moving: Vec::new(),
             });
         }
     }
@@ -67,7 +68,7 @@ pub(super) fn read(root: &CaptureRoot, paths: &[PathBuf]) -> Result<ParsedCaptur
         }
         None => colmap_points(root, &images)?,
     };
-    Ok(ParsedCapture { format: "transforms", images, points, origin: None, left_out: Vec::new() })
+    Ok(ParsedCapture::new("transforms", images, points))
 }
 
 /// The points of a COLMAP model beside the file, if its poses equal those of the frames: many exporters transform the world.

@@ -1,0 +1,152 @@
+//! Parses a scene of DGP: photos and sweeps with poses, and boxes of objects in each photo.
+//!
+//! ```text
+//! scene_HASH.json                       data, samples
+//! calibration/KEY.json                  lenses
+//! rgb/CAMERA/TIME.jpg                   as the scene says
+//! point_cloud/LIDAR/TIME.npz            as the scene says; array `data`, N × 4 or more: x, y, z
+//! bounding_box_3d/CAMERA/TIME.json      as the scene says; optional
+//! ontology/KEY.json                     names of classes; optional
+//! ```
+//!
+//! A sweep gives depths to the photos of its sample. Objects that move between samples are left out of the photos.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+
+use glam::DVec3;
+use scene::dgp::{self, BoxAnnotation, Datum, Scene};
+use scene::transforms::Intrinsics;
+use scene::{BadInput, CameraModel, CodecError, Rigid};
+
+use super::files::{self, CaptureRoot, Found};
+use super::parsed::{OpenOptions, ParsedCapture, ParsedSweep, PosedImage, RawPoints};
+use crate::lidar::PointFormat;
+
+/// An object moves if its place in the world differs by more between two samples, metres.
+const MOVED_METRES: f64 = 0.5;
+
+/// The scene's file.
+pub(super) fn find(root: &CaptureRoot) -> Option<PathBuf> {
+    let entries = root.path("").read_dir().ok()?;
+    let names = entries.filter_map(|entry| entry.ok()?.file_name().into_string().ok());
+    let scene = names.filter(|name| name.starts_with("scene_") && name.ends_with(".json")).min()?;
+    (root.path("calibration").is_dir()).then(|| root.file(&scene))?
+}
+
+/// Parses the scene.
+pub(super) fn read(root: &CaptureRoot, path: &Path, options: &OpenOptions) -> Result<ParsedCapture, BadInput> {
+    let Scene { samples } = parse(path, dgp::read_scene)?;
+    let mut lenses: BTreeMap<String, BTreeMap<String, CameraModel>> = BTreeMap::new();
+    let (mut images, mut sweeps, mut boxes) = (Vec::new(), Vec::new(), Vec::new());
+    for sample in samples {
+        if !lenses.contains_key(&sample.calibration) {
+            let name = format!("calibration/{}.json", sample.calibration);
+            lenses.insert(sample.calibration.clone(), parse(&named(root, path, &name)?, dgp::read_calibration)?);
+        }
+        let first = images.len() as u32;
+        for photo in &sample.photos {
+            let model = lenses[&sample.calibration].get(&photo.sensor).ok_or_else(|| {
+                let problem = format!("has photos of {}, which its calibration lacks", photo.sensor);
+                BadInput::new(files::show(path), problem, "correct the file or download the scene again")
+            })?;
+            let id = images.len() as u32;
+            for found in annotated(root, path, photo)? {
+                boxes.push((id, photo.world_from_sensor, found));
+            }
+            images.push(PosedImage {
+                id,
+                name: photo.file.clone(),
+                file: photo.file.clone(),
+                mask: None,
+                intrinsics: Intrinsics::from_model(model, Some(photo.size).filter(|size| size.0 > 0)),
+                camera_from_world: photo.world_from_sensor.inverse(),
+                moving: Vec::new(),
+            });
+        }
+        for sweep in sample.sweeps.iter().filter(|_| options.lidar) {
+            sweeps.push(ParsedSweep {
+                path: named(root, path, &sweep.file)?,
+                format: PointFormat::Npz,
+                world_from_sensor: sweep.world_from_sensor,
+                images: (first..images.len() as u32).collect(),
+            });
+        }
+    }
+    let moving = moving(&boxes);
+    for (image, _, found) in boxes.iter().filter(|(.., found)| moving.contains(&found.instance)) {
+        images[*image as usize].moving.push(corners(found));
+    }
+    Ok(ParsedCapture {
+        labels: labels(root, &boxes)?,
+        sweeps,
+        ..ParsedCapture::new("dgp", images, RawPoints::default())
+    })
+}
+
+/// A box with its photo and that photo's pose.
+type Labelled = (u32, Rigid, BoxAnnotation);
+
+/// The instances that move.
+fn moving(boxes: &[Labelled]) -> BTreeSet<i64> {
+    let mut places: BTreeMap<i64, (DVec3, DVec3)> = BTreeMap::new();
+    for (_, world_from_sensor, found) in boxes {
+        let place = world_from_sensor.apply(found.sensor_from_box.translation);
+        let (low, high) = places.entry(found.instance).or_insert((place, place));
+        (*low, *high) = (low.min(place), high.max(place));
+    }
+    let moved = places.into_iter().filter(|(_, (low, high))| low.distance(*high) > MOVED_METRES);
+    moved.map(|(instance, _)| instance).collect()
+}
+
+/// The corners of a box, in its sensor's axes.
+fn corners(found: &BoxAnnotation) -> [DVec3; 8] {
+    let sign = |i: usize, bit: usize| if i & bit == 0 { -0.5 } else { 0.5 };
+    let corner = |i: usize| found.size * DVec3::new(sign(i, 1), sign(i, 2), sign(i, 4));
+    std::array::from_fn(|i| found.sensor_from_box.apply(corner(i)))
+}
+
+/// Number of boxes by class.
+fn labels(root: &CaptureRoot, boxes: &[Labelled]) -> Result<BTreeMap<String, usize>, BadInput> {
+    let mut names = BTreeMap::new();
+    let entries = root.path("ontology").read_dir().into_iter().flatten();
+    let mut files: Vec<String> = entries.filter_map(|entry| entry.ok()?.file_name().into_string().ok()).collect();
+    files.sort();
+    for name in files.iter().filter(|name| name.ends_with(".json")) {
+        if let Some(path) = root.file(&format!("ontology/{name}")) {
+            names.extend(parse(&path, dgp::read_ontology)?);
+        }
+    }
+    let mut labels = BTreeMap::new();
+    for (.., found) in boxes {
+        let name = names.get(&found.class).cloned().unwrap_or_else(|| format!("class {}", found.class));
+        *labels.entry(name).or_default() += 1;
+    }
+    Ok(labels)
+}
+
+/// The 3D boxes annotated in a photo, if there are any.
+fn annotated(root: &CaptureRoot, scene: &Path, photo: &Datum) -> Result<Vec<BoxAnnotation>, BadInput> {
+    let names = photo.annotations.iter().filter(|name| name.contains("bounding_box_3d"));
+    let mut boxes = Vec::new();
+    for name in names {
+        boxes.extend(parse(&named(root, scene, name)?, dgp::read_boxes)?);
+    }
+    Ok(boxes)
+}
+
+/// A file that the scene names.
+fn named(root: &CaptureRoot, scene: &Path, name: &str) -> Result<PathBuf, BadInput> {
+    match root.image(name)? {
+        Found::File(path) => Ok(path),
+        Found::Missing => {
+            let problem = format!("names {name}, which is not there");
+            Err(BadInput::new(files::show(scene), problem, "put the file there"))
+        }
+    }
+}
+
+fn parse<T>(path: &Path, read: fn(&[u8]) -> Result<T, CodecError>) -> Result<T, BadInput> {
+    read(&files::read(path)?)
+        .map_err(|e| BadInput::new(files::show(path), e.to_string(), "correct the file or download the scene again"))
+}
