@@ -8,7 +8,7 @@ use blocks::Plan;
 use city::faults::{Fault, FaultKind};
 use common::{done, refused};
 use dataset::synth::{self, Settings};
-use scene::{ArtefactId, BlockId, Capture, Poses, frame, transforms};
+use scene::{ArtefactId, BlockId, Poses, frame, transforms};
 use serde_json::Value;
 
 fn train(at: &Path, out: &str, more: &[&str]) -> Value {
@@ -33,7 +33,7 @@ fn poses_come_from_the_root_and_do_not_change() {
 
     // All training views and no others have poses, which all blocks refer to.
     let poses = Poses::from_frame(&bytes("on/model/poses.plat")).unwrap();
-    let trained: Vec<u32> = (0..32).filter(|&view| !Capture::is_test(view as usize, 8)).collect();
+    let trained: Vec<u32> = (0..32u32).filter(|&view| !view.is_multiple_of(8)).collect();
     assert_eq!(poses.iter().map(|(view, _)| view).collect::<Vec<_>>(), trained);
     let plan = Plan::from_frame(&bytes("on/model/plan.plat")).unwrap();
     assert!(plan.tasks.len() > 1);

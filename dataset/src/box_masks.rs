@@ -14,7 +14,8 @@ const NEAR_METRES: f64 = 0.1;
 pub(crate) fn exclude(mask: &mut [u8], pinhole: &Pinhole, boxes: &[[DVec3; 8]]) {
     for corners in boxes {
         let outline = outline(&grown(corners), pinhole);
-        let bound = |pick: fn(&DVec2) -> f64, start: f64, fold: fn(f64, f64) -> f64| outline.iter().map(pick).fold(start, fold);
+        let bound =
+            |pick: fn(&DVec2) -> f64, start: f64, fold: fn(f64, f64) -> f64| outline.iter().map(pick).fold(start, fold);
         let top = bound(|p| p.y, f64::INFINITY, f64::min).floor().max(0.0) as u32;
         let bottom = bound(|p| p.y, 0.0, f64::max).ceil().min(f64::from(pinhole.height)) as u32;
         for y in top..bottom {

@@ -191,7 +191,14 @@ fn photo(
             let Some((width, height)) = image.intrinsics.size.filter(|_| options.cameras_only) else { return Ok(None) };
             files::check_size(&root.path(&image.file), width, height)?;
             let model = image.intrinsics.model(width, height);
-            return Ok(Some(Photo { path: root.path(&image.file), mask: None, model, width, height, moving: Vec::new() }));
+            return Ok(Some(Photo {
+                path: root.path(&image.file),
+                mask: None,
+                model,
+                width,
+                height,
+                moving: Vec::new(),
+            }));
         }
     };
     let (width, height) = files::image_size(&path)?;
@@ -250,7 +257,13 @@ fn views(images: &[PosedImage], photos: &[Photo]) -> Result<Vec<View>, BadInput>
             BadInput::new(files::show(&photo.path), problem, "check the parameters of its camera")
         })?;
         let camera = Camera { pinhole, camera_from_world: image.camera_from_world };
-        Ok(View { name: image.name.clone(), camera, mips: Vec::new(), masked: photo.mask.is_some() || !photo.moving.is_empty(), depth: None })
+        Ok(View {
+            name: image.name.clone(),
+            camera,
+            mips: Vec::new(),
+            masked: photo.mask.is_some() || !photo.moving.is_empty(),
+            depth: None,
+        })
     };
     images.iter().zip(photos).map(view).collect()
 }

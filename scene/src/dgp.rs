@@ -148,8 +148,7 @@ pub fn read_scene(bytes: &[u8]) -> Result<Scene, CodecError> {
     let data: BTreeMap<&str, &DatumEntry> = file.data.iter().map(|datum| (datum.key.as_str(), datum)).collect();
     let mut samples = Vec::new();
     for entry in &file.samples {
-        let mut sample =
-            Sample { calibration: entry.calibration_key.clone(), photos: Vec::new(), sweeps: Vec::new() };
+        let mut sample = Sample { calibration: entry.calibration_key.clone(), photos: Vec::new(), sweeps: Vec::new() };
         for key in &entry.datum_keys {
             let missing = || CodecError::new(format!("has a sample with the datum {key:.40}, which is not there"));
             let datum = data.get(key.as_str()).ok_or_else(missing)?;
@@ -158,8 +157,9 @@ pub fn read_scene(bytes: &[u8]) -> Result<Scene, CodecError> {
                 DatumKind { point_cloud: Some(cloud), .. } => (cloud, &mut sample.sweeps),
                 _ => continue,
             };
-            let bad_pose =
-                || CodecError::new(format!("has {:.100} with a pose that is not finite or not a rotation", found.filename));
+            let bad_pose = || {
+                CodecError::new(format!("has {:.100} with a pose that is not finite or not a rotation", found.filename))
+            };
             list.push(Datum {
                 sensor: datum.id.name.clone(),
                 file: found.filename.clone(),
@@ -211,7 +211,9 @@ pub fn read_calibration(bytes: &[u8]) -> Result<BTreeMap<String, CameraModel>, C
     let mut lenses = BTreeMap::new();
     for (name, i) in file.names.into_iter().zip(&file.intrinsics).filter(|(_, i)| i.fx != 0.0 || i.fy != 0.0) {
         if i.skew != 0.0 || i.fov != 0.0 {
-            return Err(CodecError::new(format!("has {name:.100} with skew or a fisheye lens, which are not supported")));
+            return Err(CodecError::new(format!(
+                "has {name:.100} with skew or a fisheye lens, which are not supported"
+            )));
         }
         let model = CameraModel::FullOpenCv([i.fx, i.fy, i.cx, i.cy, i.k1, i.k2, i.p1, i.p2, i.k3, i.k4, i.k5, i.k6]);
         let finite = model.focal_and_centre().iter().chain(&model.distortion()).all(|v| v.is_finite());
@@ -256,8 +258,8 @@ const MAX_BOX_METRES: f64 = 1000.0;
 /// # Errors
 /// Not such JSON, or a box without a rotation, with sides that are not positive, or over a kilometre away or long.
 pub fn read_boxes(bytes: &[u8]) -> Result<Vec<BoxAnnotation>, CodecError> {
-    let file: BoxesFile =
-        serde_json::from_slice(bytes).map_err(|e| CodecError::new(format!("is not a list of 3D boxes of DGP ({e})")))?;
+    let file: BoxesFile = serde_json::from_slice(bytes)
+        .map_err(|e| CodecError::new(format!("is not a list of 3D boxes of DGP ({e})")))?;
     let read = |entry: &BoxEntry| {
         let ShapeEntry { pose, length, width, height } = &entry.shape;
         let (pose, size) = (pose.rigid()?, DVec3::new(*length, *width, *height));
@@ -320,14 +322,17 @@ mod tests {
         let (photo, sweep) = (&sample.photos[0], &sample.sweeps[0]);
         assert_eq!((photo.sensor.as_str(), photo.size, photo.annotations.len()), ("CAM", (40, 30), 1));
         assert_eq!((sweep.file.as_str(), sweep.world_from_sensor.translation.z), ("a.npz", -1.5));
-        for (from, to) in [("1.0", "2.0"), ("3.0", "1e999"), ("\"b\", ", "\"e\", "), ("\"image\"", "\"radar\""), ("[", "")] {
+        for (from, to) in
+            [("1.0", "2.0"), ("3.0", "1e999"), ("\"b\", ", "\"e\", "), ("\"image\"", "\"radar\""), ("[", "")]
+        {
             assert!(read_scene(scene().replacen(from, to, 1).as_bytes()).is_err(), "{to}");
         }
     }
 
     #[test]
     fn calibrations_boxes_and_ontologies_are_read_and_refused() {
-        let lens = r#"{"names": ["LIDAR", "CAM"], "intrinsics": [{}, {"fx": 50, "fy": 51, "cx": 20, "cy": 15, "k1": 0.1}]}"#;
+        let lens =
+            r#"{"names": ["LIDAR", "CAM"], "intrinsics": [{}, {"fx": 50, "fy": 51, "cx": 20, "cy": 15, "k1": 0.1}]}"#;
         let lenses = read_calibration(lens.as_bytes()).unwrap();
         assert_eq!((lenses.len(), lenses["CAM"].focal_and_centre()), (1, [50.0, 51.0, 20.0, 15.0]));
         assert!(lenses["CAM"].is_distorted());
@@ -340,7 +345,9 @@ mod tests {
         let found = read_boxes(boxes.as_bytes()).unwrap();
         assert_eq!((found[0].class, found[0].instance, found[1].instance), (2, 77, 5));
         assert_eq!((found[0].size, read_boxes(b"{}").unwrap().len()), (DVec3::new(4.0, 2.0, 1.5), 0));
-        for (from, to) in [("3.0", "3e5"), ("1.5", "0"), ("\"qw\": 1.0", "\"qw\": 0"), ("\"length\": 4", "\"length\": 4e9")] {
+        for (from, to) in
+            [("3.0", "3e5"), ("1.5", "0"), ("\"qw\": 1.0", "\"qw\": 0"), ("\"length\": 4", "\"length\": 4e9")]
+        {
             assert!(read_boxes(boxes.replacen(from, to, 1).as_bytes()).is_err(), "{to}");
         }
         let ontology = read_ontology(br#"{"items": [{"name": "Car"}, {"id": 3, "name": "Bus"}]}"#).unwrap();

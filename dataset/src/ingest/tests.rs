@@ -24,14 +24,29 @@ fn source(folder: &Path, count: u32) -> Source {
         let mut image = texture(WIDTH, HEIGHT);
         image.pixels_mut().for_each(|p| p.0[0] = p.0[0].wrapping_add(i as u8));
         std::fs::write(folder.join(&name), encoded(image, format)).unwrap();
-        let photo = Photo { path: folder.join(&name), mask: None, model: model(), width: WIDTH, height: HEIGHT, moving: Vec::new() };
+        let photo = Photo {
+            path: folder.join(&name),
+            mask: None,
+            model: model(),
+            width: WIDTH,
+            height: HEIGHT,
+            moving: Vec::new(),
+        };
         let camera_from_world = Rigid { translation: [f64::from(i), 0.0, 0.0].into(), ..Rigid::IDENTITY };
         let camera = Camera { pinhole: ideal_pinhole(&model(), WIDTH, HEIGHT).unwrap(), camera_from_world };
         (View { name, camera, mips: Vec::new(), masked: false, depth: None }, photo)
     };
     let (views, photos) = (0..count).map(photo).unzip();
     let capture = Capture { views, ..Capture::default() };
-    Source { capture, photos, left_out: Vec::new(), format: "test", sweeps: Vec::new(), seeds: Vec::new(), labels: Default::default() }
+    Source {
+        capture,
+        photos,
+        left_out: Vec::new(),
+        format: "test",
+        sweeps: Vec::new(),
+        seeds: Vec::new(),
+        labels: Default::default(),
+    }
 }
 
 fn options(threads: usize, downscale: u32) -> IngestOptions {
