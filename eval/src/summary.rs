@@ -97,7 +97,17 @@ mod tests {
 
     fn view(psnr: Option<f64>, gap: f64) -> ViewFigures {
         let cc_psnr = psnr.map(|psnr| psnr + gap);
-        ViewFigures { view: "a".into(), psnr, cc_psnr, ssim: 0.5, perceptual: Some(40.0), lpips: None }
+        let [psnr_refined, psnr_fitted] = [None; 2];
+        ViewFigures {
+            view: "a".into(),
+            psnr,
+            cc_psnr,
+            ssim: 0.5,
+            perceptual: Some(40.0),
+            lpips: None,
+            psnr_refined,
+            psnr_fitted,
+        }
     }
 
     #[test]
