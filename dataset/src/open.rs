@@ -11,6 +11,7 @@ mod colmap;
 mod dgp;
 mod files;
 mod frustum_points;
+mod kitti;
 mod kitti360;
 mod lidar;
 mod masks;
@@ -59,7 +60,7 @@ pub struct Source {
     pub photos: Vec<Photo>,
     /// Names of the capture's images that are not used, with the reason.
     pub left_out: Vec<(String, String)>,
-    /// `colmap`, `transforms`, `opensfm`, `dgp` or `kitti360`, followed by ` without points` if its points were sampled from the
+    /// `colmap`, `transforms`, `opensfm`, `dgp`, `kitti` or `kitti360`, followed by ` without points` if its points were sampled from the
     /// overlap of its views.
     pub format: &'static str,
     /// Lidar sweeps. The last [`seeds`](Self::seeds) points of the capture come from them.
@@ -107,6 +108,7 @@ pub fn open(path: &Path, options: &OpenOptions) -> Result<Source, BadInput> {
             "transforms" => "transforms without points",
             "opensfm" => "opensfm without points",
             "dgp" => "dgp without points",
+            "kitti" => "kitti without points",
             _ => "kitti360 without points",
         };
     }
@@ -135,14 +137,22 @@ fn parse(root: &CaptureRoot, path: &Path, options: &OpenOptions) -> Result<Parse
     if let Some(scene) = dgp::find(root) {
         return dgp::read(root, &scene, options);
     }
+    if let Some(sequence) = kitti::find(root)? {
+        return kitti::read(root, &sequence, options);
+    }
     if kitti360::is_present(root) {
         return kitti360::read(root, options);
     }
     if let Some(folder) = colmap::find(root, &["colmap/sparse/0"]) {
         return colmap::read(root, &folder, options);
     }
-    let problem =
-        "has neither a COLMAP model in sparse/0 nor a transforms.json, reconstruction.json or KITTI-360's data_poses";
+    if files::has_photos(root) {
+        let problem = "has photos but no camera poses";
+        let advice = "make them with COLMAP (pycolmap; docs/src/captures.md has the commands), which writes sparse/0";
+        return Err(BadInput::new(files::show(path), problem, advice));
+    }
+    let problem = "has neither a COLMAP model in sparse/0 nor a transforms.json, a reconstruction.json, or the files of DGP, \
+                   KITTI or KITTI-360";
     Err(BadInput::new(files::show(path), problem, "give a folder that has one of them"))
 }
 

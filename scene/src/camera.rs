@@ -21,6 +21,11 @@ impl Rigid {
         self.rotation * point + self.translation
     }
 
+    /// `self ∘ inner`: applies `inner` first.
+    pub fn compose(&self, inner: &Self) -> Self {
+        Self { rotation: self.rotation * inner.rotation, translation: self.apply(inner.translation) }
+    }
+
     /// The inverse transform.
     pub fn inverse(&self) -> Self {
         let rotation = self.rotation.inverse();

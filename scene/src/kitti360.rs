@@ -12,6 +12,7 @@ use glam::{DMat3, DQuat, DVec3};
 
 use crate::camera::{CameraModel, Rigid};
 use crate::error::CodecError;
+use crate::lidar::read_points;
 
 /// A rectified perspective camera.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -118,35 +119,27 @@ pub fn read_poses(bytes: &[u8]) -> Result<BTreeMap<u32, Rigid>, CodecError> {
 /// # Errors
 /// A length that is not a multiple of 16 bytes, the size of a point.
 pub fn read_scan(bytes: &[u8], step: usize) -> Result<Vec<DVec3>, CodecError> {
-    let (points, rest) = bytes.as_chunks::<16>();
-    if !rest.is_empty() {
-        return Err(CodecError::new("is cut short: its length is not a multiple of 16 bytes"));
-    }
-    let point = |bytes: &[u8; 16]| {
-        let [x, y, z] = [0, 4, 8].map(|at| f32::from_le_bytes(bytes[at..at + 4].try_into().expect("four bytes")));
-        DVec3::new(x.into(), y.into(), z.into())
-    };
-    Ok(points.iter().step_by(step.max(1)).map(point).filter(|point| point.is_finite()).collect())
+    Ok(read_points(bytes, 4)?.into_iter().step_by(step.max(1)).collect())
 }
 
 /// Lines `name: numbers`. Lines with other values are skipped.
-fn entries(bytes: &[u8]) -> Result<BTreeMap<&str, Vec<f64>>, CodecError> {
+pub(crate) fn entries(bytes: &[u8]) -> Result<BTreeMap<&str, Vec<f64>>, CodecError> {
     let lines = text(bytes)?.lines().filter_map(|line| line.split_once(':'));
     Ok(lines.filter_map(|(name, values)| Some((name.trim(), numbers(values).ok()?))).collect())
 }
 
-fn text(bytes: &[u8]) -> Result<&str, CodecError> {
+pub(crate) fn text(bytes: &[u8]) -> Result<&str, CodecError> {
     std::str::from_utf8(bytes).map_err(|_| CodecError::new("is not UTF-8 text"))
 }
 
-fn numbers(text: &str) -> Result<Vec<f64>, CodecError> {
+pub(crate) fn numbers(text: &str) -> Result<Vec<f64>, CodecError> {
     let number = |word: &str| word.parse::<f64>().ok().filter(|v| v.is_finite());
     let numbers = text.split_ascii_whitespace().map(number).collect::<Option<Vec<_>>>();
     numbers.ok_or_else(|| CodecError::new("has a word that is not a number"))
 }
 
 /// The transform of a row-major 3×4 matrix; `None` unless its rotation is orthonormal within 1e-3.
-fn rigid(rows: &[f64; 12]) -> Option<Rigid> {
+pub(crate) fn rigid(rows: &[f64; 12]) -> Option<Rigid> {
     let column = |k: usize| DVec3::new(rows[k], rows[4 + k], rows[8 + k]);
     let matrix = DMat3::from_cols(column(0), column(1), column(2));
     let deviation = matrix.transpose() * matrix - DMat3::IDENTITY;

@@ -15,6 +15,7 @@ pub mod exposures;
 pub mod frame;
 pub mod ids;
 pub mod image;
+pub mod kitti;
 pub mod kitti360;
 pub mod lidar;
 pub mod npy;

@@ -20,6 +20,8 @@ const GROWTH: f64 = 1.25;
 const PER_SPARSE_POINT: usize = 2;
 /// Bounds of that maximum.
 const MAX_POINTS: std::ops::RangeInclusive<usize> = 20_000..=1_000_000;
+/// Returns that are kept until it is known which of them a camera sees, as a multiple of the maximum.
+const UNSEEN_FACTOR: usize = 4;
 /// Most sweeps that are read for initial points, spread evenly.
 const MAX_SWEEPS: usize = 4000;
 /// Sweeps read before the voxels are thinned again.
@@ -44,6 +46,8 @@ struct Measured {
     place: DVec3,
     range: f32,
     sweep: u32,
+    /// Its number among those whose visibility was tested.
+    number: usize,
 }
 
 impl Measured {
@@ -59,7 +63,8 @@ impl Measured {
 /// A sweep that cannot be read.
 pub(crate) fn seeds(sweeps: &[Sweep], cameras: &[Camera], sparse_points: usize) -> Result<Seeds, BadInput> {
     let max = (PER_SPARSE_POINT * sparse_points).clamp(*MAX_POINTS.start(), *MAX_POINTS.end());
-    let measured = thinned(sweeps, max)?;
+    let Voxels { side, returns } = thinned(sweeps, UNSEEN_FACTOR * max)?;
+    let measured = sorted(returns);
     // Returns are sorted by sweep: `start[s] .. start[s + 1]` are those of sweep `s`.
     let start: Vec<usize> = (0..=sweeps.len()).map(|s| measured.partition_point(|m| (m.sweep as usize) < s)).collect();
     let seen_by = |view: usize| -> Vec<Seen> {
@@ -78,32 +83,41 @@ pub(crate) fn seeds(sweeps: &[Sweep], cameras: &[Camera], sparse_points: usize) 
     for (view, seen) in (0..).zip(&seen) {
         seen.iter().for_each(|seen| tracks[seen.point as usize].push(view));
     }
+    let mut kept = Voxels::new(side);
+    (0..).zip(&measured).filter(|(i, _)| !tracks[*i].is_empty()).for_each(|(i, m)| kept.insert(Measured { number: i, ..*m }));
     let mut seeds = Seeds::default();
     seeds.points.track_start.push(0);
-    for (point, track) in measured.iter().zip(tracks) {
+    for point in sorted(kept.at_most(max).returns) {
+        let track = &tracks[point.number];
         let distance = |view: u32| {
             let is_other = sweeps[point.sweep as usize].views.binary_search(&view).is_err();
             (is_other, cameras[view as usize].centre().distance_squared(point.place).to_bits(), view)
         };
-        let Some(best) = track.iter().copied().min_by_key(|&view| distance(view)) else { continue };
-        seeds.best_view.push(best);
+        seeds.best_view.extend(track.iter().copied().min_by_key(|&view| distance(view)));
         seeds.points.positions.push(point.place);
         seeds.points.colours.push([128; 3]);
-        seeds.points.seen_by.extend(track);
+        seeds.points.seen_by.extend_from_slice(track);
         seeds.points.track_start.push(seeds.points.seen_by.len() as u32);
     }
     Ok(seeds)
 }
 
-/// At most `max` returns of the sweeps, one per voxel, sorted by sweep.
-fn thinned(sweeps: &[Sweep], max: usize) -> Result<Vec<Measured>, BadInput> {
+/// Returns by sweep.
+fn sorted(returns: HashMap<I64Vec3, Measured>) -> Vec<Measured> {
+    let mut returns: Vec<Measured> = returns.into_values().collect();
+    returns.sort_by_key(|m| (m.sweep, m.rank()));
+    returns
+}
+
+/// At most `max` returns of the sweeps, one per voxel.
+fn thinned(sweeps: &[Sweep], max: usize) -> Result<Voxels, BadInput> {
     let chosen: Vec<usize> = (0..sweeps.len()).step_by(sweeps.len().div_ceil(MAX_SWEEPS).max(1)).collect();
     let mut voxels = Voxels::new(VOXEL_METRES);
     for chunk in chosen.chunks(CHUNK) {
         let read = |&sweep: &usize| -> Result<Voxels, BadInput> {
             let mut own = Voxels::new(voxels.side);
             for Return { place, range } in sweeps[sweep].read()? {
-                own.insert(Measured { place, range, sweep: sweep as u32 });
+                own.insert(Measured { place, range, sweep: sweep as u32, number: 0 });
             }
             Ok(own)
         };
@@ -111,14 +125,10 @@ fn thinned(sweeps: &[Sweep], max: usize) -> Result<Vec<Measured>, BadInput> {
         let read: Vec<_> = chunk.par_iter().map(read).collect();
         for own in read {
             own?.returns.into_values().for_each(|measured| voxels.insert(measured));
-            while voxels.returns.len() > max {
-                voxels = voxels.grown();
-            }
+            voxels = voxels.at_most(max);
         }
     }
-    let mut measured: Vec<Measured> = voxels.returns.into_values().collect();
-    measured.sort_by_key(|m| (m.sweep, m.rank()));
-    Ok(measured)
+    Ok(voxels)
 }
 
 /// One return per voxel of this side.
@@ -140,9 +150,13 @@ impl Voxels {
         }
     }
 
-    fn grown(self) -> Self {
-        let mut grown = Self::new(GROWTH * self.side);
-        self.returns.into_values().for_each(|measured| grown.insert(measured));
-        grown
+    /// Larger voxels, so that there are at most `max`.
+    fn at_most(mut self, max: usize) -> Self {
+        while self.returns.len() > max {
+            let mut grown = Self::new(GROWTH * self.side);
+            self.returns.into_values().for_each(|measured| grown.insert(measured));
+            self = grown;
+        }
+        self
     }
 }

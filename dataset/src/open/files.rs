@@ -86,6 +86,16 @@ impl CaptureRoot {
     }
 }
 
+/// Whether there are images in the folder or its `images`.
+pub(super) fn has_photos(root: &CaptureRoot) -> bool {
+    let is_image = |path: &Path| {
+        let extension = path.extension().and_then(|end| end.to_str());
+        extension.is_some_and(|end| EXTENSIONS.contains(&end))
+    };
+    let entries = ["", "images"].into_iter().filter_map(|folder| root.path(folder).read_dir().ok());
+    entries.flatten().flatten().any(|entry| is_image(&entry.path()))
+}
+
 /// Width and height from the image's header.
 pub(super) fn image_size(path: &Path) -> Result<(u32, u32), BadInput> {
     let cannot = |e: &dyn fmt::Display| {

@@ -8,7 +8,7 @@
 //! data_3d_raw/DRIVE/velodyne_points/data/FRAME.bin
 //! ```
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 use glam::DVec3;
@@ -18,7 +18,8 @@ use scene::transforms::Intrinsics;
 use scene::{BadInput, CodecError, Rigid, SparsePoints};
 
 use super::files::{self, CaptureRoot};
-use super::parsed::{OpenOptions, ParsedCapture, PosedImage, RawPoints};
+use super::parsed::{OpenOptions, ParsedCapture, ParsedSweep, PosedImage, RawPoints};
+use crate::lidar::PointFormat;
 
 /// Approximate maximum of initial points.
 const MAX_POINTS: u64 = 400_000;
@@ -52,14 +53,15 @@ pub(super) fn read(root: &CaptureRoot, options: &OpenOptions) -> Result<ParsedCa
             vehicle = load(root, &name, kitti360::read_poses)?;
             for (camera, KittiCamera { rectified_from_camera, .. }) in &cameras {
                 let Some(imu_from_camera) = imu_from_cameras.get(camera) else { continue };
-                let imu_from_rectified = compose(imu_from_camera, &rectified_from_camera.inverse());
-                let track = vehicle.iter().map(|(&frame, pose)| (frame, compose(pose, &imu_from_rectified)));
+                let imu_from_rectified = imu_from_camera.compose(&rectified_from_camera.inverse());
+                let track = vehicle.iter().map(|(&frame, pose)| (frame, pose.compose(&imu_from_rectified)));
                 tracks.insert(camera, track.collect());
             }
         } else if let Some(name) = first_camera {
             tracks.insert("image_00", load(root, &name, kitti360::read_poses)?);
         }
-        let mut seen = BTreeSet::new();
+        // The images of each frame.
+        let mut seen: BTreeMap<u32, Vec<u32>> = BTreeMap::new();
         for (camera, track) in tracks {
             let Some(lens) = cameras.get(camera) else { continue };
             let folders = [
@@ -72,7 +74,7 @@ pub(super) fn read(root: &CaptureRoot, options: &OpenOptions) -> Result<ParsedCa
             for (frame, world_from_camera) in track {
                 let file = format!("{folder}/{frame:010}.png");
                 if root.file(&file).is_some() {
-                    seen.insert(frame);
+                    seen.entry(frame).or_default().push(images.len() as u32);
                 }
                 images.push(PosedImage {
                     id: images.len() as u32,
@@ -85,11 +87,11 @@ pub(super) fn read(root: &CaptureRoot, options: &OpenOptions) -> Result<ParsedCa
                 });
             }
         }
-        let of_frame = |frame: &u32| {
+        let of_frame = |(frame, images): (u32, Vec<u32>)| {
             let scan = root.file(&format!("data_3d_raw/{drive}/velodyne_points/data/{frame:010}.bin"))?;
-            Some((scan, *vehicle.get(frame)?))
+            Some((scan, *vehicle.get(&frame)?, images))
         };
-        scans.extend(seen.iter().filter_map(of_frame));
+        scans.extend(seen.into_iter().filter_map(of_frame));
     }
     if images.is_empty() {
         let problem = "has no drive with poses and rectified photos";
@@ -97,21 +99,32 @@ pub(super) fn read(root: &CaptureRoot, options: &OpenOptions) -> Result<ParsedCa
         return Err(BadInput::new(root.to_string(), problem, advice));
     }
     let imu_from_first = imu_from_cameras.get("image_00").filter(|_| !scans.is_empty() && !options.cameras_only);
-    let points = match imu_from_first.filter(|_| root.file("calibration/calib_cam_to_velo.txt").is_some()) {
-        Some(imu_from_camera) => {
-            let velo_from_camera = load(root, "calibration/calib_cam_to_velo.txt", kitti360::read_cam_to_velo)?;
-            scan_points(&scans, &compose(imu_from_camera, &velo_from_camera.inverse()))?
-        }
-        None => RawPoints::default(),
+    let Some(imu_from_camera) =
+        imu_from_first.filter(|_| root.file("calibration/calib_cam_to_velo.txt").is_some())
+    else {
+        return Ok(ParsedCapture::new("kitti360", images, RawPoints::default()));
     };
-    Ok(ParsedCapture::new("kitti360", images, points))
+    let velo_from_camera = load(root, "calibration/calib_cam_to_velo.txt", kitti360::read_cam_to_velo)?;
+    let imu_from_velo = imu_from_camera.compose(&velo_from_camera.inverse());
+    if !options.lidar {
+        return Ok(ParsedCapture::new("kitti360", images, scan_points(&scans, &imu_from_velo)?));
+    }
+    let sweep = |(path, world_from_imu, images): Scan| {
+        let world_from_sensor = world_from_imu.compose(&imu_from_velo);
+        ParsedSweep { path, format: PointFormat::Floats(4), world_from_sensor, images }
+    };
+    let sweeps = scans.into_iter().map(sweep).collect();
+    Ok(ParsedCapture { sweeps, ..ParsedCapture::new("kitti360", images, RawPoints::default()) })
 }
 
-/// World points of the scans, thinned evenly.
-fn scan_points(scans: &[(PathBuf, Rigid)], imu_from_velo: &Rigid) -> Result<RawPoints, BadInput> {
+/// A scan: its file, world_from_imu, and the images of its frame.
+type Scan = (PathBuf, Rigid, Vec<u32>);
+
+/// World points of the scans, thinned evenly: the initial points if the lidar is not used otherwise.
+fn scan_points(scans: &[Scan], imu_from_velo: &Rigid) -> Result<RawPoints, BadInput> {
     let chosen: Vec<_> = scans.iter().step_by(scans.len().div_ceil(MAX_SCANS)).collect();
     let mut bytes = 0;
-    for (path, _) in &chosen {
+    for (path, ..) in &chosen {
         let length = path.metadata().map_or(0, |data| data.len());
         if length > MAX_SCAN_BYTES {
             return Err(BadInput::new(
@@ -123,10 +136,10 @@ fn scan_points(scans: &[(PathBuf, Rigid)], imu_from_velo: &Rigid) -> Result<RawP
         bytes += length;
     }
     let step = (bytes / 16).div_ceil(MAX_POINTS).max(1) as usize;
-    let scan = |(path, world_from_imu): &&(PathBuf, Rigid)| -> Result<Vec<DVec3>, BadInput> {
+    let scan = |(path, world_from_imu, _): &&Scan| -> Result<Vec<DVec3>, BadInput> {
         let points = kitti360::read_scan(&files::read(path)?, step)
             .map_err(|e| BadInput::new(files::show(path), e.to_string(), "download the scan again"))?;
-        let world_from_velo = compose(world_from_imu, imu_from_velo);
+        let world_from_velo = world_from_imu.compose(imu_from_velo);
         let in_range = points.into_iter().filter(|point| RANGE_METRES.contains(&point.length()));
         Ok(in_range.map(|point| world_from_velo.apply(point)).collect())
     };
@@ -137,11 +150,6 @@ fn scan_points(scans: &[(PathBuf, Rigid)], imu_from_velo: &Rigid) -> Result<RawP
     }
     let colours = vec![[128; 3]; positions.len()];
     Ok(RawPoints(SparsePoints { positions, colours, ..Default::default() }))
-}
-
-/// `outer ∘ inner`: applies `inner` first.
-fn compose(outer: &Rigid, inner: &Rigid) -> Rigid {
-    Rigid { rotation: outer.rotation * inner.rotation, translation: outer.apply(inner.translation) }
 }
 
 /// The drives with poses, sorted by name.
