@@ -94,7 +94,9 @@ mod tests {
 
     #[test]
     fn invalid_files_are_refused() {
-        for (from, to) in [("700", "-700"), ("P0: 700 0", "P0: 700 1"), ("Tr: 0 -1", "Tr: 0 -2"), ("0.3", ""), ("1 0\n", "2 0\n")] {
+        for (from, to) in
+            [("700", "-700"), ("P0: 700 0", "P0: 700 1"), ("Tr: 0 -1", "Tr: 0 -2"), ("0.3", ""), ("1 0\n", "2 0\n")]
+        {
             assert!(read_calibration(CALIBRATION.replacen(from, to, 1).as_bytes()).is_err(), "{to}");
         }
         assert!(read_calibration(b"Tr: 1").is_err() && read_poses(b"").is_err() && read_poses(b"1 0 0 0").is_err());

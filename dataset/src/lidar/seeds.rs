@@ -84,7 +84,10 @@ pub(crate) fn seeds(sweeps: &[Sweep], cameras: &[Camera], sparse_points: usize) 
         seen.iter().for_each(|seen| tracks[seen.point as usize].push(view));
     }
     let mut kept = Voxels::new(side);
-    (0..).zip(&measured).filter(|(i, _)| !tracks[*i].is_empty()).for_each(|(i, m)| kept.insert(Measured { number: i, ..*m }));
+    (0..)
+        .zip(&measured)
+        .filter(|(i, _)| !tracks[*i].is_empty())
+        .for_each(|(i, m)| kept.insert(Measured { number: i, ..*m }));
     let mut seeds = Seeds::default();
     seeds.points.track_start.push(0);
     for point in sorted(kept.at_most(max).returns) {

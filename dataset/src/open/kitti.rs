@@ -42,7 +42,9 @@ pub(super) fn find(root: &CaptureRoot) -> Result<Option<Sequence>, BadInput> {
             return Err(BadInput::new(root.to_string(), problem, "give a folder with one sequence and its poses.txt"));
         }
     };
-    if root.file(&format!("{folder}calib.txt")).is_none() || !root.path(&format!("{folder}velodyne")).is_dir() && photos(root, &folder).is_empty() {
+    if root.file(&format!("{folder}calib.txt")).is_none()
+        || !root.path(&format!("{folder}velodyne")).is_dir() && photos(root, &folder).is_empty()
+    {
         return Ok(None);
     }
     match poses.into_iter().find(|name| root.file(name).is_some()) {
@@ -64,7 +66,8 @@ fn photos(root: &CaptureRoot, folder: &str) -> Vec<u8> {
 /// Parses the sequence.
 pub(super) fn read(root: &CaptureRoot, of: &Sequence, options: &OpenOptions) -> Result<ParsedCapture, BadInput> {
     let Sequence { folder, poses } = of;
-    let Calibration { cameras, camera_from_velodyne } = parse(root, &format!("{folder}calib.txt"), kitti::read_calibration)?;
+    let Calibration { cameras, camera_from_velodyne } =
+        parse(root, &format!("{folder}calib.txt"), kitti::read_calibration)?;
     let poses = parse(root, poses, kitti::read_poses)?;
     let (mut images, mut sweeps) = (Vec::new(), Vec::new());
     for (frame, world_from_first) in poses.iter().enumerate() {
@@ -102,7 +105,8 @@ pub(super) fn read(root: &CaptureRoot, of: &Sequence, options: &OpenOptions) -> 
 }
 
 fn parse<T>(root: &CaptureRoot, name: &str, read: fn(&[u8]) -> Result<T, CodecError>) -> Result<T, BadInput> {
-    let path = root.file(name).ok_or_else(|| BadInput::new(format!("{root}: {name}"), "is not there", "put it there"))?;
+    let path =
+        root.file(name).ok_or_else(|| BadInput::new(format!("{root}: {name}"), "is not there", "put it there"))?;
     let bad = |path: &Path, e: CodecError| BadInput::new(files::show(path), e.to_string(), "download the file again");
     read(&files::read(&path)?).map_err(|e| bad(&path, e))
 }

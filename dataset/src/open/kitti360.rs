@@ -99,8 +99,7 @@ pub(super) fn read(root: &CaptureRoot, options: &OpenOptions) -> Result<ParsedCa
         return Err(BadInput::new(root.to_string(), problem, advice));
     }
     let imu_from_first = imu_from_cameras.get("image_00").filter(|_| !scans.is_empty() && !options.cameras_only);
-    let Some(imu_from_camera) =
-        imu_from_first.filter(|_| root.file("calibration/calib_cam_to_velo.txt").is_some())
+    let Some(imu_from_camera) = imu_from_first.filter(|_| root.file("calibration/calib_cam_to_velo.txt").is_some())
     else {
         return Ok(ParsedCapture::new("kitti360", images, RawPoints::default()));
     };
