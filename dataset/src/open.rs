@@ -148,7 +148,7 @@ fn parse(root: &CaptureRoot, path: &Path, options: &OpenOptions) -> Result<Parse
     }
     if files::has_photos(root) {
         let problem = "has photos but no camera poses";
-        let advice = "make them with COLMAP (pycolmap; docs/src/captures.md has the commands), which writes sparse/0";
+        let advice = "make them with COLMAP or pycolmap, which write sparse/0";
         return Err(BadInput::new(files::show(path), problem, advice));
     }
     let problem = "has neither a COLMAP model in sparse/0 nor a transforms.json, a reconstruction.json, or the files of DGP, \

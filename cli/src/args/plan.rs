@@ -5,7 +5,7 @@ use clap::{Args, ValueEnum};
 use scene::Capture;
 use serde::Serialize;
 
-use super::values::{Auto, decibels, metres_or_none, residual, views_per_step, weight_or_auto};
+use super::values::{Auto, decibels, metres_or_none, residual, views_per_step, weight};
 
 /// How the scene is divided.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum, Serialize)]
@@ -21,9 +21,6 @@ pub(crate) enum Blocks {
 
 /// Default of `--residual`.
 pub(crate) const RESIDUAL: f64 = 0.4;
-
-/// Default of `--depth-weight` where lidar or depth maps measured depths: that of SDG (eq. 6).
-const MEASURED_DEPTH_WEIGHT: f64 = 0.8;
 
 /// Options of the plan.
 #[derive(Debug, Clone, Args, Serialize)]
@@ -74,11 +71,10 @@ pub(crate) struct PlanOptions {
     /// Label each splat with the block that trained it, as the integer property `block` of merged.ply
     #[arg(long)]
     pub(crate) label_blocks: bool,
-    /// Weight of a loss that compares rendered depths with those that lidar, depth maps and the sparse points give for the photo. It
-    /// keeps splats from floating where few photos overlap; 0 leaves it out, auto takes 0.8 for captures with lidar or depth
-    /// maps and 0 for others
-    #[arg(long, value_name = "W|auto", value_parser = weight_or_auto, default_value_t)]
-    pub(crate) depth_weight: Auto<f64>,
+    /// Weight of a loss that compares rendered depths with those that lidar and the sparse points give for the photo. It keeps splats
+    /// from floating where few photos overlap; 0 leaves it out
+    #[arg(long, value_name = "W", value_parser = weight, default_value_t = 0.0)]
+    pub(crate) depth_weight: f64,
     /// Leave out the capture's lidar: its sweeps give neither target depths nor initial points
     #[arg(long)]
     pub(crate) no_lidar: bool,
@@ -100,8 +96,7 @@ impl PlanOptions {
     ///
     /// Budget and steps grow with points and views, as more would overfit: at a quarter of its size `street_lund` (25 views,
     /// 1,540 points) reaches 16.1 dB held out with 6,000 splats and 1,500 steps, 15.3 dB with 20,000 and 3,000.
-    /// `is_measured` says whether lidar or depth maps give depths.
-    pub(crate) fn settings(&self, capture: &Capture, is_measured: bool) -> PlanSettings {
+    pub(crate) fn settings(&self, capture: &Capture) -> PlanSettings {
         let times = |count: usize, each: u32| u32::try_from(count).unwrap_or(u32::MAX).saturating_mul(each);
         let budget = || times(capture.points.len(), 3).clamp(5000, 2_000_000);
         let steps = || times(capture.views.len(), 60).max(500);
@@ -123,7 +118,7 @@ impl PlanOptions {
             exposure: self.exposure,
             refine_poses: self.refine_poses,
             label_blocks: self.label_blocks,
-            depth_weight: self.depth_weight.0.unwrap_or(if is_measured { MEASURED_DEPTH_WEIGHT } else { 0.0 }),
+            depth_weight: self.depth_weight,
             evaluate: self.evaluate,
             test_stretches: self.test_stretches,
             ..PlanSettings::default()

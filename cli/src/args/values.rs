@@ -118,12 +118,9 @@ pub(super) fn decibels(text: &str) -> Result<f64, String> {
     value.ok_or_else(|| "give decibels from 0, such as 0.1".into())
 }
 
-pub(super) fn weight_or_auto(text: &str) -> Result<Auto<f64>, String> {
+pub(super) fn weight(text: &str) -> Result<f64, String> {
     let value = text.parse().ok().filter(|weight: &f64| *weight >= 0.0 && weight.is_finite());
-    match text {
-        "auto" => Ok(Auto(None)),
-        _ => value.map(|value| Auto(Some(value))).ok_or_else(|| "give a weight from 0, such as 0.1, or auto".into()),
-    }
+    value.ok_or_else(|| "give a weight from 0, such as 0.1".into())
 }
 
 pub(super) fn residual(text: &str) -> Result<f64, String> {

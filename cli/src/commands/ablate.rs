@@ -137,7 +137,7 @@ fn plan_options(args: &AblateArgs, seed: u64) -> PlanOptions {
         exposure: false,
         refine_poses: false,
         label_blocks: false,
-        depth_weight: Auto(Some(0.0)),
+        depth_weight: 0.0,
         no_lidar: true,
         evaluate: false,
         test_stretches: 0.0,

@@ -138,7 +138,7 @@ pub(crate) fn settings(args: &DemoArgs) -> (Settings, TrainArgs) {
             exposure: false,
             refine_poses: false,
             label_blocks: false,
-            depth_weight: Auto(Some(0.0)),
+            depth_weight: 0.0,
             no_lidar: true,
             test_stretches: 0.0,
             evaluate: false,
