@@ -273,7 +273,6 @@ pub(crate) fn resolved(args: &TrainArgs, plan: &Plan) -> (String, ArtefactId) {
     let mut resolved = args.clone();
     resolved.plan.budget.0 = Some(plan.settings.budget);
     resolved.plan.steps.0 = Some(plan.settings.steps);
-    resolved.plan.depth_weight.0 = Some(plan.settings.depth_weight);
     resolved.threads.0 = Some(threads_of(args));
     config::resolved(&resolved)
 }
