@@ -6,6 +6,7 @@
 //! number of photos.
 
 mod depths;
+mod error;
 
 use std::fs::File;
 use std::io::Read;
@@ -19,6 +20,7 @@ use serde::{Deserialize, Serialize};
 use store::{BlockingStore, StoreError};
 
 use self::depths::Lidar;
+pub use self::error::IngestError;
 use crate::open::{Photo, Source};
 use crate::photo::DecodedPhoto;
 use crate::undistortion::Undistorter;
@@ -51,17 +53,6 @@ pub struct Ingested {
     pub decoded: usize,
     /// Number of depths that lidar or depth maps measured, in all views.
     pub depth_samples: usize,
-}
-
-/// Why an ingest stopped.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum IngestError {
-    /// An invalid file or option.
-    #[error(transparent)]
-    BadInput(#[from] BadInput),
-    /// The store failed.
-    #[error(transparent)]
-    Store(#[from] StoreError),
 }
 
 /// Ingests all photos of a capture. `progress` is called with (photos done, photos in total) from any thread, one call at a

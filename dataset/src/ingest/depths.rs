@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use scene::{ArtefactId, BadInput, Capture, Pixels, View};
 use store::BlockingStore;
 
-use super::IngestError;
+use super::error::IngestError;
 use crate::depth_samples::DepthSamples;
 use crate::lidar::{Sweep, visible};
 use crate::mip_tiles::MipLayout;

@@ -179,7 +179,7 @@ fn damaged_files_are_named() {
         refused(folder.path(), &[name, "cut short"]);
         std::fs::write(&path, bytes).unwrap();
     }
-    refused(&folder.path().join("images"), &["neither", "sparse/0"]);
+    refused(&folder.path().join("images"), &["no camera poses", "sparse/0"]);
 }
 
 fn shared(name: &str) -> Option<PathBuf> {
