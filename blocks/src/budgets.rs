@@ -18,13 +18,17 @@ use crate::visibility::Observations;
 const INNER_BUDGET_RATIO: f64 = 1.0 / 2.5;
 /// Minimum number of splats of a task, where the whole budget allows it.
 const MIN_BUDGET: u32 = 500;
-/// Splats that one block can hold. The reference cost of a step is capped at a scene of this size: along a street a
-/// view of the whole scene shows ever more splats as the city grows, and a tree does not have that cost.
-pub(crate) const BLOCK_SPLATS: u32 = 100_000;
-/// Weight of a pixel that a coarser level covers already, relative to a new pixel.
-const REPEATED_PIXEL_WEIGHT: f64 = 0.05;
-/// Weight of the new pixels of inner blocks, because all their descendants start from them.
-const INNER_WEIGHT: f64 = 2.0;
+/// Splats that one block can hold, in about 1.6 GB. With automatic levels a scene of more is divided.
+pub(crate) const BLOCK_SPLATS: u32 = 400_000;
+/// The reference cost of a step is that of a scene of at most this many splats: along a street a view of the whole
+/// scene shows ever more splats as the city grows, and a tree does not have that cost.
+pub(crate) const COSTED_SPLATS: u32 = 100_000;
+/// Weight of a pixel that a coarser level covers already, relative to a new pixel. Leaves have more splats than their
+/// parent, and each has to be trained. At 0.05 the leaves of a dense street drew their windows 0.7 times, and the tree
+/// had 23.0 dB where the whole scene had 30.7 (docs/decisions/0056).
+const REPEATED_PIXEL_WEIGHT: f64 = 0.5;
+/// Most visits of a window, relative to those of a view in a job of one block.
+const MAX_VISITS: f64 = 2.0;
 /// A block that keeps at least this share of its detail, because too few of its children have a task, counts as a leaf.
 const LEAF_KEPT_SHARE: f64 = 0.25;
 /// Minimum number of steps of a task.
@@ -120,7 +124,7 @@ pub(crate) fn set_all(
     set_budgets(tasks, &positions, settings);
     set_visible_splats(tasks, capture, ground);
     set_visible_context_splats(tasks, capture, ground);
-    let mut whole = [Task { budget: settings.budget.min(BLOCK_SPLATS), ..whole }];
+    let mut whole = [Task { budget: settings.budget.min(COSTED_SPLATS), ..whole }];
     set_visible_splats(&mut whole, capture, ground);
     set_steps(tasks, &whole[0], &positions, capture, settings);
     set_memory(tasks, settings);
@@ -177,7 +181,7 @@ fn set_steps(tasks: &mut [Task], whole: &Task, positions: &[TreePosition], captu
     }
     let work = f64::from(settings.steps) * epoch_cost(whole) / whole.views.len().max(1) as f64;
     // A cheap epoch (few splats and pixels) must not lead to an unbounded number of steps.
-    let max_epochs = INNER_WEIGHT * f64::from(settings.steps) / whole.views.len().max(1) as f64;
+    let max_epochs = MAX_VISITS * f64::from(settings.steps) / whole.views.len().max(1) as f64;
     let new_pixels = new_pixels_by_height(tasks, positions, capture);
     let all: f64 = new_pixels.values().sum();
     for (height, pixels) in new_pixels {
@@ -196,11 +200,12 @@ fn parents(tasks: &[Task]) -> BTreeSet<BlockId> {
     tasks.iter().filter_map(|task| task.parent).collect()
 }
 
-/// The weighted number of pixels that the windows of each height add to the heights above it. Repeated pixels count
+/// The number of pixels that the windows of each height add to the heights above it. Repeated pixels count
 /// [`REPEATED_PIXEL_WEIGHT`].
 ///
-/// In an aerial capture every level has four times the pixels of the level above, and leaves get three fifths of the
-/// work. In a street capture most content is observed from so far away that the root resolves it as finely as a leaf.
+/// In an aerial capture every level has four times the pixels of the level above, and leaves get three quarters of the
+/// work. In a street capture most content is observed from so far away that the root resolves it as finely as a leaf,
+/// and leaves get a third.
 fn new_pixels_by_height(tasks: &[Task], positions: &[TreePosition], capture: &Capture) -> BTreeMap<u8, f64> {
     let mut heights: BTreeMap<u8, PixelCoverage> = BTreeMap::new();
     for (task, position) in tasks.iter().zip(positions) {
@@ -209,8 +214,7 @@ fn new_pixels_by_height(tasks: &[Task], positions: &[TreePosition], capture: &Ca
     let mut before = PixelCoverage::default();
     let mut first = BTreeMap::new();
     for (height, coverage) in heights.into_iter().rev() {
-        let weight = if height > 0 { INNER_WEIGHT } else { 1.0 };
-        first.insert(height, weight * coverage.new_pixels(&before, REPEATED_PIXEL_WEIGHT));
+        first.insert(height, coverage.new_pixels(&before, REPEATED_PIXEL_WEIGHT));
         before = coverage.max_per_view(before);
     }
     first

@@ -55,9 +55,9 @@ pub struct PlanSettings {
     pub levels: Option<u8>,
     /// Seed of all random numbers of the job.
     pub seed: u64,
-    /// Training work, as steps on full images of the whole scene. Plans of all modes cost about the same. For a scene
-    /// larger than one block (100,000 splats) the cost of a step is capped at one block, so that the cost grows
-    /// linearly with the scene.
+    /// Training work, as steps on full images of the whole scene. Plans of all modes cost about the same. A step of a
+    /// scene of more than 100,000 splats costs as much as one of 100,000, so that the cost grows linearly with the
+    /// scene.
     pub steps: u32,
     /// Batch size: windows rendered per optimiser step, 1 to [`MAX_VIEWS_PER_STEP`]. Larger batches fill a large GPU.
     pub views_per_step: u32,

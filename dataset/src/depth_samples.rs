@@ -1,4 +1,4 @@
-//! The artefact of the depths measured in one view, by lidar or from a depth map: single pixels of mip 0 with a depth each.
+//! The artefact of the depths measured in one view by lidar: single pixels of mip 0 with a depth each.
 //!
 //! A frame of kind [`DEPTHS`]. The header has the image's size, the nearest depth and the number of samples. The bulk is a zstd
 //! frame of six planes of bytes: four of the gaps between the samples' pixel numbers (`y · width + x`, ascending, u32 little

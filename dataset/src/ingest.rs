@@ -51,7 +51,7 @@ pub struct Ingested {
     pub id: ArtefactId,
     /// Number of photos decoded; the others had an ingest record.
     pub decoded: usize,
-    /// Number of depths that lidar or depth maps measured, in all views.
+    /// Number of depths that lidar measured, in all views.
     pub depth_samples: usize,
 }
 

@@ -106,7 +106,7 @@ impl Recipe {
             opacity: longer(recipe.opacity),
             sh_dc: longer(recipe.sh_dc),
             sh_from: [0.0; 3],
-            coarse: vec![0.7],
+            coarse: vec![0.3],
             ..recipe
         }
     }

@@ -6,7 +6,7 @@ use glam::DVec3;
 use scene::{BlockId, Camera};
 
 use super::*;
-use crate::budgets::BLOCK_SPLATS;
+use crate::budgets::COSTED_SPLATS;
 use crate::cost::epoch_cost;
 use crate::lint::{Severity, lint};
 use crate::plan::{PlannedTask, Task};
@@ -88,7 +88,7 @@ fn automatic_levels_are_worth_their_work_or_needed() {
         let settings = PlanSettings { budget, ..settings(Mode::Tree, None) };
         plan(&capture, ArtefactId::of(b"capture"), &settings, "cpu").unwrap().levels
     };
-    assert_eq!([50_000, 2_000_000].map(levels), [0, 1]);
+    assert_eq!([50_000, 400_000, 2_000_000].map(levels), [0, 0, 1]);
 }
 
 /// In an aerial capture every level trains on the photos about as often as a single block would.
@@ -103,7 +103,25 @@ fn heights_get_work_for_what_they_are_the_first_to_see() {
     };
     let whole = 4000.0 / plan.tasks[0].views.len() as f64;
     let ratios = [0, 1, 2].map(|level| epochs(level) / whole);
-    assert!(ratios[0] > 0.5 && ratios[1] > ratios[2] && ratios[2] > 0.2, "{ratios:?}");
+    assert!(ratios.iter().all(|ratio| (0.5..1.0).contains(ratio)), "{ratios:?}");
+}
+
+/// Along a street the root sees everything as finely as the leaves, but only the leaves have all splats.
+#[test]
+fn leaves_of_a_street_are_trained_though_their_parents_saw_their_pixels() {
+    for levels in [1, 2] {
+        let plan = plan_of(&street(120, 20_000), Mode::Tree, Some(levels));
+        let visits = |of: &dyn Fn(&Task) -> bool| {
+            let tasks = plan.tasks.iter().filter(|task| of(task));
+            let (steps, views) = tasks.fold((0, 0), |(s, v), t| (s + t.steps, v + t.views.len()));
+            f64::from(steps) / views as f64
+        };
+        let whole = 4000.0 / plan.tasks[0].views.len() as f64;
+        let leaves = visits(&|task| task.block.level == plan.levels) / whole;
+        let inner = visits(&|task| task.block.level < plan.levels) / whole;
+        println!("{levels} levels: leaves {leaves:.2}, inner {inner:.2} of the visits of a whole scene");
+        assert!(leaves > 0.1 && inner > leaves, "{levels}: {leaves} {inner}");
+    }
 }
 
 #[test]
@@ -157,7 +175,7 @@ fn finished_neighbours_are_donors_along_their_faces() {
 }
 
 #[test]
-fn splats_beyond_the_capacity_of_a_block_do_not_raise_the_work() {
+fn splats_beyond_the_largest_costed_scene_do_not_raise_the_work() {
     // Small photos, so that splats dominate the cost.
     let mut capture = aerial(8, 300.0, 8000);
     capture.views.iter_mut().for_each(|view| view.camera = view.camera.mip(2));
@@ -166,7 +184,7 @@ fn splats_beyond_the_capacity_of_a_block_do_not_raise_the_work() {
         let plan = plan(&capture, ArtefactId::of(b"capture"), &settings, "cpu").unwrap();
         plan.tasks.iter().map(|t| f64::from(t.steps) / t.views.len() as f64 * epoch_cost(t)).sum()
     };
-    let [few, many, more] = [BLOCK_SPLATS / 16, BLOCK_SPLATS, 4 * BLOCK_SPLATS].map(work);
+    let [few, many, more] = [COSTED_SPLATS / 16, COSTED_SPLATS, 4 * COSTED_SPLATS].map(work);
     assert!(many > 1.5 * few && (0.95..1.05).contains(&(more / many)), "{few} {many} {more}");
 }
 

@@ -126,7 +126,7 @@ pub(crate) struct WorkerArgs {
 
 #[derive(Debug, Clone, Args)]
 pub(crate) struct SubmitArgs {
-    /// Folder of the capture: COLMAP, transforms.json, OpenSfM or KITTI-360
+    /// Folder of the capture: COLMAP, transforms.json, OpenSfM, DGP, KITTI or KITTI-360
     pub(crate) capture: PathBuf,
     #[command(flatten)]
     pub(crate) connection: Connection,

@@ -7,6 +7,7 @@ use city::{CitySettings, Layout, Traffic};
 use glam::{DVec2, DVec3};
 
 use super::*;
+use crate::depth_samples::DepthSamples;
 use crate::open::{OpenOptions, open};
 
 fn small() -> Settings {
@@ -415,4 +416,34 @@ fn the_gallery_shows_every_layout_label_and_fault() {
         let before = &all[..if i < 2 * Layout::ALL.len() { i } else { 0 }];
         assert!(before.iter().all(|b| differs(a, b) > 0.05), "pane {i} appears twice");
     }
+}
+
+#[test]
+fn lidar_measures_the_depths_that_photos_show() {
+    let settings = Settings { aerial: 0.0, width: 192, height: 108, truth: true, lidar: true, ..small() };
+    let (folder, _) = written(&settings, 2);
+    let source = open(folder.path(), &OpenOptions { lidar: true, ..OpenOptions::default() }).unwrap();
+    assert!(!source.sweeps.is_empty() && source.sweeps.iter().all(|sweep| !sweep.views.is_empty()));
+    let store = store::Store::open("memory://").unwrap().blocking();
+    let options = crate::ingest::IngestOptions { downscale: 1, threads: 2 };
+    let ingested = crate::ingest::ingest(&source, &store, &options, &|_, _| ()).unwrap();
+    // Relative errors of the samples against the photo's true depths.
+    let mut errors = Vec::new();
+    for view in &ingested.capture.views {
+        let Some(id) = view.depth else { continue };
+        let depths = DepthSamples::decode(&store.get(id).unwrap(), 192, 108).unwrap();
+        let name = view.name.rsplit_once('.').unwrap().0;
+        let truth = fs::read(folder.path().join(format!("depth/{name}.npy"))).unwrap();
+        let (shape, truth) = scene::npy::read_f32(&truth).unwrap();
+        assert_eq!(shape, [108, 192]);
+        errors.extend(depths.iter().map(|(x, y, depth)| {
+            let expected = truth[(y * 192 + x) as usize];
+            if expected > 0.0 { (depth / expected - 1.0).abs() } else { f32::INFINITY }
+        }));
+    }
+    errors.sort_by(f32::total_cmp);
+    let within = |share: f32| errors.partition_point(|error| *error <= share) as f64 / errors.len() as f64;
+    println!("{} samples, median {}, within 5 % {}, 20 % {}", errors.len(), errors[errors.len() / 2], within(0.05), within(0.2));
+    assert!(errors.len() > 2000 && errors[errors.len() / 2] < 0.01, "{} {}", errors.len(), errors[errors.len() / 2]);
+    assert!(within(0.05) > 0.9 && within(0.2) > 0.95, "{} {}", within(0.05), within(0.2));
 }
