@@ -9,8 +9,8 @@ use crate::plan::Task;
 
 /// Cost of a splat that the window shows, in pixels: it is projected, sorted, blended over its pixels and updated.
 const PER_VISIBLE: f64 = 1.0;
-/// Cost of a frozen splat that the window shows. It has no gradient, but the estimate from sparse points counts too few.
-const PER_FROZEN: f64 = 1.0;
+/// Cost of a frozen splat that the window shows. The estimate from sparse points counts too few of them.
+const PER_FROZEN: f64 = 3.0;
 /// Cost of a splat under training, visible or not.
 const PER_TRAINED: f64 = 0.5;
 /// Splats of core and halo per splat of the core: the ratio of their areas.
