@@ -39,11 +39,14 @@ pub struct Options {
     pub background: [f32; 3],
     /// Also render the planes `depth` and `trainable_alpha`; costs 10 % more.
     pub extras: bool,
+    /// The plane `depth` is of inverse depths: Σ αT/z, 1/metres. A trace of sky behind a surface then has no weight,
+    /// where it could double the mean depth.
+    pub inverse_depth: bool,
 }
 
 impl Default for Options {
     fn default() -> Self {
-        Self { antialiased: false, sh_degree: 3, background: [0.0; 3], extras: false }
+        Self { antialiased: false, sh_degree: 3, background: [0.0; 3], extras: false, inverse_depth: false }
     }
 }
 
@@ -58,7 +61,8 @@ pub struct Frame {
     pub colour: Vec<f32>,
     /// Remaining transmittance: 1 - alpha.
     pub transmittance: Vec<f32>,
-    /// Σ αTz, metres; empty without [`Options::extras`]. Divide by `1 - transmittance` for the mean depth.
+    /// Σ αTz, metres, or Σ αT/z with [`Options::inverse_depth`]; empty without [`Options::extras`]. Divide by
+    /// `1 - transmittance` for the mean.
     pub depth: Vec<f32>,
     /// Σ αT over the trainable splats, without the context; empty without [`Options::extras`].
     pub trainable_alpha: Vec<f32>,
@@ -71,7 +75,7 @@ pub struct Upstream {
     pub colour: Vec<f32>,
     /// dL/d transmittance.
     pub transmittance: Vec<f32>,
-    /// dL/d depth (Σ αTz).
+    /// dL/d depth, the plane of [`Frame`].
     pub depth: Vec<f32>,
 }
 
@@ -81,7 +85,8 @@ pub struct ForwardIntermediates {
     /// Indices of the visible splats, nearest first. Context indices start after the trainable ones.
     pub order: Vec<u32>,
     /// The projected splats in this order: mean x, y (pixels); a, b, c, log2 opacity with
-    /// `α = 2^(log2 opacity - (a dx + b dy)² - (c dy)²)`; red, green, blue; depth (metres); half extents x, y (pixels).
+    /// `α = 2^(log2 opacity - (a dx + b dy)² - (c dy)²)`; red, green, blue; depth (metres, or its inverse); half extents x, y
+    /// (pixels).
     pub records: Vec<[f32; 12]>,
     /// `pairs[start[t] .. start[t + 1]]` belong to tile `t` of 16×16 pixels (row-major).
     pub start: Vec<u32>,

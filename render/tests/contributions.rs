@@ -8,7 +8,8 @@ use render::{Contributions, Options};
 use scene::{Camera, Splats, column};
 
 const AREA: usize = 37 * 26;
-const OPTIONS: Options = Options { antialiased: false, sh_degree: 3, background: [0.2, 0.4, 0.1], extras: false };
+const OPTIONS: Options =
+    Options { antialiased: false, sh_degree: 3, background: [0.2, 0.4, 0.1], extras: false, inverse_depth: false };
 
 fn splats(seed: u64, count: usize) -> (Splats, Camera) {
     let camera = camera(37, 26, 40.0);

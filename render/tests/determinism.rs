@@ -24,7 +24,8 @@ fn bits(isa: Isa, threads: usize, antialiased: bool) -> Vec<u32> {
     let area = 250 * 187;
     let upstream =
         Upstream { colour: random.plane(3 * area), transmittance: random.plane(area), depth: random.plane(area) };
-    let options = Options { antialiased, sh_degree: 1, background: [0.1, 0.2, 0.3], extras: true };
+    let options =
+        Options { antialiased, sh_degree: 1, background: [0.1, 0.2, 0.3], extras: true, inverse_depth: false };
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("threads");
     pool.install(|| {
         let mut renderer = Renderer::new(isa);

@@ -11,7 +11,7 @@ use render::{Frame, Gradients, Options, Upstream};
 use scene::{Camera, Rigid, Splats};
 
 fn options(antialiased: bool) -> Options {
-    Options { antialiased, sh_degree: 2, background: [0.2, 0.4, 0.1], extras: true }
+    Options { antialiased, sh_degree: 2, background: [0.2, 0.4, 0.1], extras: true, inverse_depth: false }
 }
 
 #[test]

@@ -56,7 +56,7 @@ fn soft(random: &mut Random, camera: &Camera, count: usize, sh_degree: u8) -> Sp
 }
 
 fn options(antialiased: bool, sh_degree: u8) -> Options {
-    Options { antialiased, sh_degree, background: [0.3, 0.1, 0.6], extras: true }
+    Options { antialiased, sh_degree, background: [0.3, 0.1, 0.6], extras: true, inverse_depth: false }
 }
 
 /// The loss of each pixel.

@@ -196,7 +196,7 @@ pub struct Views {
     pub pair_capacity: u32,
     /// 1: opacity is compensated for the dilation.
     pub antialiased: u32,
-    /// 1: the frame has the planes depth and trainable alpha.
+    /// 1 and 2: the frame has the planes depth and trainable alpha; 2: the former of inverse depths.
     pub extras: u32,
     /// The views; only the first `count` are defined.
     pub view: [View; MAX_VIEWS],

@@ -93,8 +93,8 @@ struct DepthError {
     // False: the pixel has no target depth or too little alpha, and no part in the depth loss.
     used: bool,
     alpha: f32,
-    // Expected depth and target depth, metres.
-    depth: f32,
+    // Mean inverse depth, 1/metres, and target depth, metres.
+    inverse: f32,
     goal: f32,
 }
 
@@ -111,9 +111,9 @@ fn depth_error(pixel: u32) -> DepthError {
     return DepthError(true, alpha, frame_value(4u * area + pixel) / alpha, goal);
 }
 
-// Smooth L1 of the relative depth error of a pixel.
+// Smooth L1 of the relative error of a pixel's inverse depth.
 fn depth_value(at: DepthError) -> f32 {
-    let size = abs(at.depth / at.goal - 1.0);
+    let size = abs(at.inverse * at.goal - 1.0);
     return select(size - 0.5 * DEPTH_BETA, 0.5 * size * size / DEPTH_BETA, size < DEPTH_BETA);
 }
 
@@ -358,10 +358,10 @@ fn loss_backward(
         var d_transmittance = 0.0;
         let depth = depth_error(i);
         if depth.used {
-            let error = depth.depth / depth.goal - 1.0;
-            let slope = clamp(error / DEPTH_BETA, -1.0, 1.0) / depth.goal;
+            let error = depth.inverse * depth.goal - 1.0;
+            let slope = clamp(error / DEPTH_BETA, -1.0, 1.0) * depth.goal;
             d_depth = state.depth_scales[at.view] * weight(i) * slope / depth.alpha;
-            d_transmittance = d_depth * depth.depth;
+            d_transmittance = d_depth * depth.inverse;
         }
         upstream[5u * photo.first_pixel + 3u * area + i] = d_transmittance;
         upstream[5u * photo.first_pixel + 4u * area + i] = d_depth;

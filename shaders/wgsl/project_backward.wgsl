@@ -159,6 +159,9 @@ fn splat_gradient(i: u32, visible_at: u32) {
 
     // Chain rule through T = J W and the projection of the centre.
     var d_p = vec3<f32>(0.0, 0.0, sums[s + 9u]);
+    if views.extras == INVERSE_DEPTH {
+        d_p.z *= -e.inv_z * e.inv_z;
+    }
     let third = view.rows[2].xyz;
     let d_t = array<vec3<f32>, 2>(d_t0, d_t1);
     for (var r = 0u; r < 2u; r++) {

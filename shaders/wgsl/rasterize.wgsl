@@ -67,6 +67,9 @@ fn rasterize(
             means_ab[local] = record.mean_ab;
             c_opacities[local] = record.c_opacity_extent.xy;
             colours_depths[local] = record.colour_depth;
+            if views.extras == INVERSE_DEPTH {
+                colours_depths[local].w = 1.0 / record.colour_depth.w;
+            }
             is_trainable[local] = f32(i < views.trainable_entries);
         }
         workgroupBarrier();

@@ -97,6 +97,9 @@ fn rasterize_backward(
             means_ab[local] = record.mean_ab;
             c_opacities[local] = record.c_opacity_extent.xy;
             colours_depths[local] = record.colour_depth;
+            if views.extras == INVERSE_DEPTH {
+                colours_depths[local].w = 1.0 / record.colour_depth.w;
+            }
             output_slots[local] = output_slot(pair, i);
             is_trainable[local] = u32(i < views.trainable_entries);
         }

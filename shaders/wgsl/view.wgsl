@@ -91,6 +91,9 @@ fn thread_number(group: vec3<u32>, groups: vec3<u32>, local: u32) -> u32 {
     return (group.y * groups.x + group.x) * WORKGROUP_SIZE + local;
 }
 
+// Value of `Views::extras` for a plane of inverse depths.
+const INVERSE_DEPTH = 2u;
+
 // Number of planes of a frame.
 fn frame_planes(extras: u32) -> u32 {
     return select(4u, 6u, extras != 0u);

@@ -1,7 +1,9 @@
-//! The depth loss: smooth L1 of the relative error of the rendered depth against sparse target depths, and its gradient.
+//! The depth loss: smooth L1 of the relative error of the rendered inverse depth against sparse target depths, and its
+//! gradient.
 //!
-//! The rendered depth of a pixel is the expected depth `D = Σ αTz / (1 - T)`. The error `(D - d) / d` is relative to
-//! the target `d`, as the uncertainty of triangulated points grows with their distance.
+//! The inverse depth of a pixel is the mean `I = (Σ αT/z) / (1 - T)`. The error `I d - 1` is relative to the target `d`,
+//! as the uncertainty of triangulated points grows with their distance. The mean of `z` itself would not do: two percent
+//! of a sky at 500 m double it, and splats move towards the camera to make up for that (docs/decisions/0057).
 
 use render::{Frame, Upstream};
 
@@ -13,7 +15,7 @@ const MIN_ALPHA: f32 = 0.5;
 /// Returns `factor` times the mean loss over the pixels with a target (`target`, one plane of metres, 0 = none) and
 /// enough alpha, weighted by `weights` (one plane, or empty for all ones), and writes its gradient to the planes
 /// `depth` and `transmittance` of `upstream`. Zero without such pixels. The frame needs
-/// [`Options::extras`](render::Options::extras).
+/// [`Options::extras`](render::Options::extras) and [`Options::inverse_depth`](render::Options::inverse_depth).
 pub(crate) fn depth_loss(frame: &Frame, target: &[f32], weights: &[f32], factor: f32, upstream: &mut Upstream) -> f64 {
     let area = frame.transmittance.len();
     assert!(target.len() == area && frame.depth.len() == area && (weights.is_empty() || weights.len() == area));
@@ -31,14 +33,14 @@ pub(crate) fn depth_loss(frame: &Frame, target: &[f32], weights: &[f32], factor:
     let mut loss = 0.0;
     for i in used() {
         let alpha = 1.0 - frame.transmittance[i];
-        let depth = frame.depth[i] / alpha;
-        let error = depth / target[i] - 1.0;
+        let inverse = frame.depth[i] / alpha;
+        let error = inverse * target[i] - 1.0;
         let size = error.abs();
         let value = if size < BETA { 0.5 * size * size / BETA } else { size - 0.5 * BETA };
         loss += f64::from(weight(i)) * f64::from(value);
-        let d_depth = scale * weight(i) * (error / BETA).clamp(-1.0, 1.0) / target[i];
-        upstream.depth[i] = d_depth / alpha;
-        upstream.transmittance[i] = d_depth * depth / alpha;
+        let d_inverse = scale * weight(i) * (error / BETA).clamp(-1.0, 1.0) * target[i];
+        upstream.depth[i] = d_inverse / alpha;
+        upstream.transmittance[i] = d_inverse * inverse / alpha;
     }
     f64::from(factor) * loss / total_weight
 }
@@ -77,7 +79,7 @@ mod tests {
     fn render<'a>(renderer: &'a mut Renderer, splats: &Splats) -> &'a Frame {
         let pinhole = Pinhole { width: WIDTH, height: HEIGHT, fx: 20.0, fy: 20.0, cx: 12.0, cy: 10.0 };
         let camera_from_world = Rigid { rotation: DQuat::IDENTITY, translation: DVec3::ZERO };
-        let options = Options { extras: true, sh_degree: 0, ..Options::default() };
+        let options = Options { extras: true, inverse_depth: true, sh_degree: 0, ..Options::default() };
         renderer.forward(splats, None, &Camera { pinhole, camera_from_world }, &options)
     }
 

@@ -177,7 +177,13 @@ impl<'a> EvaluationViews<'a> {
             let photo = photo.map_err(TrainError::Source)?;
             let extras = self.context.is_some();
             let sh_degree = splats.sh_degree();
-            let options = Options { antialiased: self.antialiased, sh_degree, background: [0.0; 3], extras };
+            let options = Options {
+                antialiased: self.antialiased,
+                sh_degree,
+                background: [0.0; 3],
+                extras,
+                ..Options::default()
+            };
             let frame = renderer.forward(splats, self.context, &camera, &options);
             pixel_weights(frame, &photo, fixed.and_then(|fixed| fixed.0.get(n)), &mut weights);
             let area = photo.area();

@@ -219,6 +219,7 @@ impl<'a> Trainer<'a> {
             sh_degree: sh_degree.min(self.state.splats.sh_degree()),
             background: [0.0; 3],
             extras: context.is_some() || depth_weight > 0.0,
+            inverse_depth: depth_weight > 0.0,
         };
         let visits = (steps as f32 / views.len() as f32).max(1.0);
         let inputs = Step {

@@ -443,7 +443,13 @@ fn lidar_measures_the_depths_that_photos_show() {
     }
     errors.sort_by(f32::total_cmp);
     let within = |share: f32| errors.partition_point(|error| *error <= share) as f64 / errors.len() as f64;
-    println!("{} samples, median {}, within 5 % {}, 20 % {}", errors.len(), errors[errors.len() / 2], within(0.05), within(0.2));
+    println!(
+        "{} samples, median {}, within 5 % {}, 20 % {}",
+        errors.len(),
+        errors[errors.len() / 2],
+        within(0.05),
+        within(0.2)
+    );
     assert!(errors.len() > 2000 && errors[errors.len() / 2] < 0.01, "{} {}", errors.len(), errors[errors.len() / 2]);
     assert!(within(0.05) > 0.9 && within(0.2) > 0.95, "{} {}", within(0.05), within(0.2));
 }

@@ -154,7 +154,13 @@ impl Renderer {
         bin::sort_by_depth(&self.records, &self.seen, &mut self.order, &mut self.sort);
         self.ranked.resize(self.order.len(), Projected::default());
         self.ranked.par_chunks_mut(CHUNK).zip(self.order.par_chunks(CHUNK)).for_each(|(ranked, order)| {
-            ranked.iter_mut().zip(order).for_each(|(ranked, &i)| *ranked = self.records[i as usize]);
+            for (ranked, &i) in ranked.iter_mut().zip(order) {
+                *ranked = self.records[i as usize];
+                // The rasterizers blend what is in the place of the depth.
+                if options.inverse_depth {
+                    ranked.0[project::at::Z] = 1.0 / ranked.0[project::at::Z];
+                }
+            }
         });
         done(Stage::Sort);
         let (width, height) = (camera.pinhole.width as usize, camera.pinhole.height as usize);

@@ -156,7 +156,8 @@ fn backward_group<L: Lanes>(
 
     // Chain rule through T = J W and the projection of the centre.
     let rows = unroll!(r in [0, 1, 2] => unroll!(c in [0, 1, 2] => L::splat(view.rotation[r][c])));
-    let mut d_p = [L::zero(), L::zero(), s[moment::Z]];
+    let d_depth = if options.inverse_depth { -(s[moment::Z] * inv_z * inv_z) } else { s[moment::Z] };
+    let mut d_p = [L::zero(), L::zero(), d_depth];
     for r in 0..2 {
         let f_z = L::splat(view.focal[r]) * inv_z;
         let d_j0 = dot(d_t[r], rows[r]);

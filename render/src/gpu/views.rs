@@ -40,7 +40,7 @@ pub(super) fn views_of(
         entries: entries(trainable + context)?,
         pair_capacity: pair_capacity as u32,
         antialiased: options.antialiased.into(),
-        extras: options.extras.into(),
+        extras: if options.inverse_depth { 2 } else { 1 } * u32::from(options.extras),
         ..Views::zeroed()
     };
     for (view, camera) in views.view.iter_mut().zip(cameras) {

@@ -70,7 +70,8 @@ fn gradients_agree_with_the_cpu() {
                 let splats = mixture(&mut random, &camera, kind, 150);
                 let context = mixture(&mut random, &camera, Kind::Common, 70);
                 for (context, extras) in [(None, false), (Some(&context), true)] {
-                    let options = Options { extras, ..options(antialiased) };
+                    // Half of the cases are of inverse depths.
+                    let options = Options { extras, inverse_depth: antialiased, ..options(antialiased) };
                     let upstream = noise(&camera, &options);
                     let [cpu, portable] = [Isa::detect(), *Isa::available().last().expect("one")]
                         .map(|isa| on_cpu(isa, &splats, context, &camera, &options, &upstream).gradients);

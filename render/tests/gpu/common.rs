@@ -37,7 +37,7 @@ pub(crate) fn gpus() -> Vec<Arc<Gpu>> {
 }
 
 pub(crate) fn options(antialiased: bool) -> Options {
-    Options { antialiased, sh_degree: 2, background: [0.2, 0.4, 0.1], extras: true }
+    Options { antialiased, sh_degree: 2, background: [0.2, 0.4, 0.1], extras: true, inverse_depth: false }
 }
 
 /// A frame and its gradients.

@@ -85,7 +85,7 @@ pub(crate) fn case(name: &str) -> Option<Case> {
     };
     let bg = get("bg");
     let background = [bg[0] as f32, bg[1] as f32, bg[2] as f32];
-    let options = Options { antialiased: false, sh_degree, background, extras: true };
+    let options = Options { antialiased: false, sh_degree, background, extras: true, inverse_depth: false };
     Some(Case { splats, camera, options, arrays })
 }
 

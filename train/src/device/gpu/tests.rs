@@ -135,7 +135,8 @@ fn stages_agree_with_the_cpu() {
             let mut step = step(masked, extras, key);
             if depth_weight > 0.0 {
                 step.samples = step.samples.into_iter().map(|sample| with_weights_and_depth(sample, key)).collect();
-                (step.options.extras, step.depth_weight) = (true, depth_weight);
+                (step.options.extras, step.options.inverse_depth) = (true, true);
+                step.depth_weight = depth_weight;
             }
             let photo = &step.samples[0].photo;
             device.download(&mut state, StatePart::All).unwrap();
