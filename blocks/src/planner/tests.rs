@@ -103,7 +103,8 @@ fn heights_get_work_for_what_they_are_the_first_to_see() {
     };
     let whole = 4000.0 / plan.tasks[0].views.len() as f64;
     let ratios = [0, 1, 2].map(|level| epochs(level) / whole);
-    assert!(ratios.iter().all(|ratio| (0.5..1.0).contains(ratio)), "{ratios:?}");
+    let [least, most] = [f64::min, f64::max].map(|of| ratios.into_iter().fold(ratios[0], of));
+    assert!(least > 0.5 && most < 1.0 && most < 1.6 * least, "{ratios:?}");
 }
 
 /// Along a street the root sees everything as finely as the leaves, but only the leaves have all splats.
@@ -120,7 +121,7 @@ fn leaves_of_a_street_are_trained_though_their_parents_saw_their_pixels() {
         let leaves = visits(&|task| task.block.level == plan.levels) / whole;
         let inner = visits(&|task| task.block.level < plan.levels) / whole;
         println!("{levels} levels: leaves {leaves:.2}, inner {inner:.2} of the visits of a whole scene");
-        assert!(leaves > 0.1 && inner > leaves, "{levels}: {leaves} {inner}");
+        assert!(leaves > 0.28 && inner > leaves, "{levels}: {leaves} {inner}");
     }
 }
 
