@@ -106,7 +106,6 @@ fn training_without_an_adapter_is_refused_in_one_line() {
     common::city(at, 16, 64, 48);
     let mut elsewhere = job(at, "gpu", &["--out", "o"]);
     common::stopped(elsewhere.env("PLAT_GPU_ADAPTER", "no such adapter"), 2, "--backend");
-    common::stopped(&mut job(at, "gpu", &["--out", "o", "--exposure"]), 2, "--exposure");
 }
 
 /// A trained model in the folder `model`.

@@ -1,4 +1,4 @@
-//! The GPU stages of training: loss, Adam and densification statistics, with their layouts.
+//! The GPU stages of training: loss, Adam, exposures and densification statistics, with their layouts.
 
 use bytemuck::{Pod, Zeroable};
 
@@ -6,16 +6,26 @@ use crate::{MAX_VIEWS, Stage, VIEW};
 
 /// Structs and constants of the training stages.
 const TRAIN: &str = include_str!("../wgsl/train.wgsl");
+/// The sum over a workgroup.
+const SUM: &str = include_str!("../wgsl/workgroup_sum.wgsl");
+/// Constants of Adam, and powers.
+const POWER: &str = include_str!("../wgsl/power.wgsl");
 
 /// `loss.wgsl`
 pub const LOSS: Stage = Stage::new(
     "loss",
-    &[VIEW, TRAIN, include_str!("../wgsl/loss.wgsl")],
+    &[VIEW, TRAIN, SUM, include_str!("../wgsl/loss.wgsl")],
     &["loss_forward", "finish_loss", "loss_backward"],
 );
 /// `adam.wgsl`
 pub const ADAM: Stage =
-    Stage::new("adam", &[VIEW, TRAIN, include_str!("../wgsl/adam.wgsl")], &["adam_shape", "adam_colour"]);
+    Stage::new("adam", &[VIEW, TRAIN, POWER, include_str!("../wgsl/adam.wgsl")], &["adam_shape", "adam_colour"]);
+/// `exposure.wgsl`
+pub const EXPOSURE: Stage = Stage::new(
+    "exposure",
+    &[VIEW, TRAIN, SUM, POWER, include_str!("../wgsl/exposure.wgsl")],
+    &["expose_backward", "exposure_step"],
+);
 /// `densification_stats.wgsl`
 pub const DENSIFICATION_STATS: Stage = Stage::new(
     "densification_stats",
@@ -23,7 +33,7 @@ pub const DENSIFICATION_STATS: Stage = Stage::new(
     &["densification_stats"],
 );
 /// Every stage of training.
-pub const STAGES: &[Stage] = &[LOSS, ADAM, DENSIFICATION_STATS];
+pub const STAGES: &[Stage] = &[LOSS, ADAM, EXPOSURE, DENSIFICATION_STATS];
 
 /// Counters and losses that stay on the device between steps.
 ///
@@ -77,8 +87,10 @@ pub struct Photo {
     pub first_weight: u32,
     /// Word of the first target depth; 0: the photo has none.
     pub first_depth: u32,
+    /// Number of the exposure, from 1; 0: the render is shown as it is.
+    pub exposure: u32,
     /// Padding.
-    pub padding: [u32; 2],
+    pub padding: u32,
 }
 
 /// The target photos of a step. Uniform.
@@ -101,6 +113,18 @@ pub struct Photos {
     pub padding: [u32; 2],
     /// The photos; only the first `count` are defined.
     pub photo: [Photo; MAX_VIEWS],
+}
+
+/// Constants of a step of the exposures. Uniform.
+#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
+#[repr(C)]
+pub struct ExposureConstants {
+    /// Number of exposures.
+    pub rows: u32,
+    /// Learning rate.
+    pub rate: f32,
+    /// Padding.
+    pub padding: [u32; 2],
 }
 
 /// Learning rates and regulariser weights of one step, for one bank of columns. Uniform.

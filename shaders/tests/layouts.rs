@@ -5,7 +5,7 @@ use std::mem::offset_of;
 
 use naga::valid::{Capabilities, ValidationFlags, Validator};
 use naga::{Module, TypeInner};
-use shaders::train::{self, AdamConstants, OptimiserState, Photo, Photos};
+use shaders::train::{self, AdamConstants, ExposureConstants, OptimiserState, Photo, Photos};
 use shaders::{
     HALF, PassConstants, RASTERIZE_BACKWARD_ATOMICS, STAGES, SUBGROUPS, SplatSet, Stage, Status, UpstreamPlanes, View,
     Views,
@@ -33,8 +33,9 @@ fn rust_layouts() -> BTreeMap<&'static str, Layout> {
         layout!(OptimiserState: steps_done, adam_steps, steps_skipped, epoch_views, epoch_l1, loss, is_step_valid, padding,
             gradient_scales, depth_scales),
         layout!(Photo: width, height, tiles_x, tiles_y, first_tile, first_pixel, first_byte, masked,
-            first_weight, first_depth, padding),
+            first_weight, first_depth, exposure, padding),
         layout!(Photos: count, tiles, lambda, share_weighted, extras, depth_weight, padding, photo),
+        layout!(ExposureConstants: rows, rate, padding),
         layout!(AdamConstants: mean, log_scale, quat, opacity, sh_dc, sh_rest, beta2, opacity_reg, needle_reg, log_scale_min,
             log_scale_max, columns, stride, views, padding),
     ]

@@ -11,25 +11,10 @@
 @group(0) @binding(6) var<storage, read_write> second_moment: array<f32>;
 @group(0) @binding(7) var<storage, read> gradients: array<f32>;
 
-const BETA1: f32 = 0.9;
-const EPSILON: f32 = 1e-15;
 const F32_MAX: f32 = 3.4028234e38;
 const LN_10: f32 = 2.3025851;
 // Marks a thread without a splat.
 const NO_SPLAT: u32 = 0xffffffffu;
-
-// base^exponent by multiplications only, which rounds alike on every device.
-fn power(base: f32, exponent: u32) -> f32 {
-    var result = 1.0;
-    var square = base;
-    for (var n = exponent; n > 0u; n >>= 1u) {
-        if (n & 1u) == 1u {
-            result *= square;
-        }
-        square *= square;
-    }
-    return result;
-}
 
 // Bias corrections 1 / (1 - beta^t) of both moments.
 fn corrections() -> vec2<f32> {

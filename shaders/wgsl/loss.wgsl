@@ -3,6 +3,8 @@
 // in workgroup memory.
 //
 //   loss_forward → SSIM derivatives, sums per tile → finish_loss → loss, gradient scales → loss_backward → upstream
+//
+// The loss is that of the exposed render where the view has an exposure, and so is the gradient.
 
 @group(0) @binding(0) var<uniform> photos: Photos;
 // Planes per view: red, green, blue, transmittance and, with extras, depth and trainable alpha.
@@ -18,6 +20,8 @@
 @group(0) @binding(5) var<storage, read_write> state: OptimiserState;
 @group(0) @binding(6) var<storage, read_write> upstream: array<f32>;
 @group(0) @binding(7) var<storage, read> status: Status;
+// Three rows per exposure.
+@group(0) @binding(8) var<storage, read> exposures: array<vec4<f32>>;
 
 // The photo of this workgroup.
 var<private> photo: Photo;
@@ -30,7 +34,6 @@ var<workgroup> halo_y: array<f32, 676>;
 var<workgroup> halo_z: array<f32, 676>;
 // After the row pass: 26 rows of 16, of five quantities (forward) or three (backward).
 var<workgroup> rows: array<array<f32, 416>, 5>;
-var<workgroup> totals: array<vec4<f32>, 256>;
 
 fn photo_byte(i: u32) -> u32 {
     let at = photo.first_byte + i;
@@ -40,6 +43,17 @@ fn photo_byte(i: u32) -> u32 {
 // Value i of the planes of this view.
 fn frame_value(i: u32) -> f32 {
     return frame[frame_planes(photos.extras) * photo.first_pixel + i];
+}
+
+// Pixel of a colour plane as the photo's exposure shows it.
+fn shown(colour: u32, pixel: u32) -> f32 {
+    let area = photo.width * photo.height;
+    if photo.exposure == 0u {
+        return frame_value(colour * area + pixel);
+    }
+    let row = exposures[3u * (photo.exposure - 1u) + colour];
+    let drawn = vec3<f32>(frame_value(pixel), frame_value(area + pixel), frame_value(2u * area + pixel));
+    return row.x * drawn.x + row.y * drawn.y + row.z * drawn.z + row.w;
 }
 
 // Value i of the colour planes of the photo, 0 to 1.
@@ -164,7 +178,7 @@ fn loss_forward(
         var y = 0.0;
         // Masked pixels are zero in both images, like pixels outside them.
         if i < area && !is_masked(i) {
-            x = frame_value(at.colour * area + i);
+            x = shown(at.colour, i);
             y = photo_value(at.colour * area + i);
         }
         halo_x[k] = x;
@@ -222,7 +236,7 @@ fn loss_forward(
         partials[to] = w * (2.0 * my * (a2 - a1) * i12 - 2.0 * mx * ssim * (i1 - i2));
         partials[3u * area + to] = -w * (ssim * i2);
         partials[6u * area + to] = w * (2.0 * a1 * i12);
-        let difference = frame_value(out) - photo_value(out);
+        let difference = shown(at.colour, i) - photo_value(out);
         total = vec4<f32>(w * abs(difference), w * ssim, select(0.0, w, at.colour == 0u), 0.0);
         if photos.depth_weight > 0.0 && at.colour < 2u {
             let depth = depth_error(i);
@@ -235,19 +249,6 @@ fn loss_forward(
     if local == 0u {
         sums[group.y * groups.x + group.x] = total;
     }
-}
-
-// Sum over a workgroup by halving, in a fixed order.
-fn workgroup_sum(value: vec4<f32>, local: u32) -> vec4<f32> {
-    totals[local] = value;
-    workgroupBarrier();
-    for (var half = WORKGROUP_SIZE / 2u; half > 0u; half /= 2u) {
-        if local < half {
-            totals[local] += totals[local + half];
-        }
-        workgroupBarrier();
-    }
-    return totals[0];
 }
 
 // One workgroup: the loss, and whether the step is valid. After an overflow of pairs the step is not done, and the host
@@ -379,7 +380,7 @@ fn loss_backward(
         }
         means[q] = sum;
     }
-    let x = frame_value(plane + i);
+    let x = shown(at.colour, i);
     let y = photo_value(plane + i);
     let w = weight(i);
     let scales = state.gradient_scales[at.view];

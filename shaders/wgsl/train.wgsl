@@ -37,7 +37,9 @@ struct Photo {
     // Words of the first pixel weight and of the first target depth; 0: the photo has none.
     first_weight: u32,
     first_depth: u32,
-    padding: vec2<u32>,
+    // Number of the exposure, from 1; 0: the render is shown as it is.
+    exposure: u32,
+    padding: u32,
 }
 
 // The target photos of a step.
@@ -76,6 +78,15 @@ struct AdamConstants {
     stride: u32,
     // Views of the step.
     views: u32,
+    padding: vec2<u32>,
+}
+
+// Constants of a step of the exposures.
+struct ExposureConstants {
+    // Number of exposures.
+    rows: u32,
+    // Learning rate.
+    rate: f32,
     padding: vec2<u32>,
 }
 

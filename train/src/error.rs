@@ -15,9 +15,6 @@ pub enum TrainError {
     /// The device has too little memory for the block. A larger device may train it.
     #[error("{0}")]
     OutOfMemory(String),
-    /// Only the CPU supports exposures.
-    #[error("exposures are not trained on a GPU: use --backend cpu, or leave --exposure")]
-    Exposures,
     /// Only the CPU refines poses.
     #[error("poses are not refined on a GPU: use --backend cpu, or leave --refine-poses")]
     Poses,

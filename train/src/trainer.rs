@@ -109,9 +109,6 @@ pub fn train_from(
     if job.views.is_empty() {
         return Err(TrainError::NoViews);
     }
-    if job.backend.is_gpu() && (job.trains_exposures || job.exposures.is_some()) {
-        return Err(TrainError::Exposures);
-    }
     if job.backend.is_gpu() && job.trains_poses {
         return Err(TrainError::Poses);
     }

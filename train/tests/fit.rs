@@ -5,11 +5,11 @@ mod common;
 use std::sync::{Arc, Mutex};
 
 use common::*;
-use glam::{DQuat, DVec3, Vec3};
+use glam::Vec3;
 use render::Options;
 use render::cpu::Renderer;
-use scene::{Camera, Exposure, Exposures, Pixels, Rect, Rigid, Splat, Splats, column};
-use train::{Backend, Flow, Job, Recipe, State, TrainError, TrainView, WindowSource, metrics, random, train};
+use scene::{Pixels, Rect, Splat, Splats, column};
+use train::{Backend, Flow, Job, Recipe, TrainError, TrainView, WindowSource, random, train};
 
 #[test]
 fn perturbed_points_reach_30_db() {
@@ -262,170 +262,6 @@ fn blocks_do_not_correct_their_neighbours_region() {
     );
     assert!(unguarded > 0.1, "without a context the block must spread: {unguarded}");
     assert!(disagreed < 0.1 * unguarded, "alpha of {disagreed} in the neighbour's pixels");
-}
-
-/// Multiplies each photo by its gain.
-fn exposed(photos: &Photos, gains: &[f32]) -> Photos {
-    let mut out = photos.clone();
-    for (photo, gain) in out.0.iter_mut().zip(gains) {
-        photo.rgb.iter_mut().for_each(|byte| *byte = (f32::from(*byte) * gain).round().min(255.0) as u8);
-    }
-    out
-}
-
-/// Gains from 0.6 to 1.
-fn gains() -> Vec<f32> {
-    (0..12).map(|view| 0.6 + 0.4 * random::uniform(41, view)).collect()
-}
-
-#[test]
-fn exposures_are_recovered_relative_to_their_mean() {
-    let (ground_truth, gains) = (cloud(10, 200, 0.8), gains());
-    let mean = gains.iter().sum::<f32>() / gains.len() as f32;
-    let given = photos(&ground_truth);
-    let shown = exposed(&given, &gains);
-    let all_alike = exposed(&given, &[mean; 12]);
-    let run = |trains_exposures| {
-        let setup = Setup { trains_exposures, steps: 600, ..Setup::new(perturbed(&ground_truth), &shown) };
-        setup.try_run_on(None, &|_| true, &mut |_| Flow::Continue).unwrap()
-    };
-    let (without, with) = (run(false), run(true));
-    assert_eq!(without.exposures, None);
-    let exposures = with.exposures.unwrap();
-    let [without, with] = [without.splats, with.splats].map(|splats| psnr(&splats, &all_alike, |_| true));
-    println!("{without:.2} dB without exposures, {with:.2} dB with");
-    assert!(with > without + 2.0, "{without} {with}");
-    for (view, gain) in gains.iter().enumerate() {
-        let found = exposures.of(view as u32).unwrap().gain();
-        assert!((found - gain / mean).abs() < 0.1, "view {view}: {found} instead of {}", gain / mean);
-    }
-}
-
-#[test]
-fn fixed_exposures_are_applied() {
-    let (ground_truth, gains) = (cloud(11, 150, 0.8), gains());
-    let shown = exposed(&photos(&ground_truth), &gains);
-    let grey = |gain: f32| Exposure(Exposure::IDENTITY.0.map(|row| row.map(|value| gain * value)));
-    // View 11 has no exposure and is rendered as it is.
-    let given: Exposures = (0..11).map(|view| (view, grey(gains[view as usize]))).collect();
-    let of_most = |photos: &Photos| Photos(photos.0.iter().take(11).cloned().collect());
-    let run = |exposures| Setup { exposures, ..Setup::new(ground_truth.clone(), &shown) }.run();
-    let [with, without] = [run(Some(&given)), run(None)].map(|splats| {
-        let photos = of_most(&photos(&ground_truth));
-        let views = views();
-        let of = |(view, photo): (&TrainView, &Pixels)| {
-            let expected: Vec<f32> = photo.rgb.iter().map(|&b| f32::from(b) / 255.0).collect();
-            metrics::psnr(&self::photo(&splats, view), &expected, None).unwrap()
-        };
-        views.iter().zip(&photos.0).map(of).sum::<f64>() / 11.0
-    });
-    println!("{with:.2} dB with, {without:.2} without");
-    assert!(with > without + 4.0, "{with} {without}");
-}
-
-#[test]
-fn exposures_do_not_depend_on_threads_or_interruptions() {
-    let (ground_truth, gains) = (cloud(12, 120, 0.8), gains());
-    let shown = exposed(&photos(&ground_truth), &gains);
-    let setup =
-        || Setup { trains_exposures: true, budget: 200, steps: 120, ..Setup::new(perturbed(&ground_truth), &shown) };
-    let run = |threads: usize, from: Option<State>, until: u32| {
-        let mut left = None;
-        let mut report = |mut now: train::Progress| {
-            left = (now.step == until).then(|| now.state().unwrap().to_frame());
-            if left.is_some() { Flow::Stop } else { Flow::Continue }
-        };
-        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-        let done = pool.install(|| setup().try_run_on(from, &|_| true, &mut report)).unwrap();
-        (done, left)
-    };
-    let uninterrupted = run(1, None, u32::MAX).0;
-    assert!(uninterrupted.exposures.as_ref().unwrap().iter().any(|(_, exposure)| *exposure != Exposure::IDENTITY));
-    assert!(uninterrupted == run(2, None, u32::MAX).0, "two threads give another result");
-    // In the middle of an epoch, after some densification.
-    let left = run(2, None, 67).1.unwrap();
-    assert!(
-        uninterrupted == run(1, Some(State::from_frame(&left).unwrap()), u32::MAX).0,
-        "a resumed run gives another result"
-    );
-}
-
-/// The views with poses off by up to 1.4° and 0.12 m, of 5 m from the scene, on each axis.
-fn disturbed(views: &[TrainView]) -> Vec<TrainView> {
-    let noise = |view: u32, k: u64| f64::from(random::uniform(61, 6 * u64::from(view) + k)) - 0.5;
-    let disturb = |view: &TrainView| {
-        let vector = |first: u64| DVec3::from_array([0, 1, 2].map(|k| noise(view.view, first + k)));
-        let error = Rigid { rotation: DQuat::from_scaled_axis(0.05 * vector(0)), translation: 0.25 * vector(3) };
-        let camera_from_world = error.after(&view.camera.camera_from_world);
-        TrainView { camera: Camera { camera_from_world, ..view.camera }, ..*view }
-    };
-    views.iter().map(disturb).collect()
-}
-
-/// Root mean square distance, in pixels, between the images of a few points of the scene in cameras of these views and in true ones.
-fn pixel_error(views: &[TrainView], truth: &[TrainView]) -> f64 {
-    let points = [DVec3::ZERO, DVec3::X, DVec3::Y, DVec3::Z, -DVec3::X, -DVec3::Y, -DVec3::Z];
-    let pairs = views.iter().zip(truth).flat_map(|pair| points.map(|point| (pair, point)));
-    let squares = pairs.map(|((a, b), point)| (a.camera.project(point).0 - b.camera.project(point).0).length_squared());
-    (squares.sum::<f64>() / (points.len() * views.len()) as f64).sqrt()
-}
-
-#[test]
-fn disturbed_poses_are_refined_with_the_splats() {
-    let ground_truth = cloud(13, 200, 0.8);
-    let (photos, truth) = (photos(&ground_truth), views());
-    let given = disturbed(&truth);
-    let run = |trains_poses| {
-        let setup =
-            Setup { trains_poses, steps: 1200, views: given.clone(), ..Setup::new(perturbed(&ground_truth), &photos) };
-        setup.try_run_on(None, &|_| true, &mut |_| Flow::Continue).unwrap()
-    };
-    let (without, with) = (run(false), run(true));
-    assert_eq!(without.poses, None);
-    let poses = with.poses.unwrap();
-    assert_eq!(poses.iter().map(|(view, _)| view).collect::<Vec<_>>(), (0..12).collect::<Vec<u32>>());
-    let refined: Vec<TrainView> =
-        given.iter().map(|view| TrainView { camera: poses.apply(view.view, view.camera), ..*view }).collect();
-    let [before, after] = [&given, &refined].map(|views| pixel_error(views, &truth));
-    // Photos from the poses that the splats were trained with.
-    let fits = |splats: &Splats, views: &[TrainView]| {
-        let of = |view: &TrainView| {
-            let expected: Vec<f32> = photos.0[view.view as usize].rgb.iter().map(|&b| f32::from(b) / 255.0).collect();
-            metrics::psnr(&photo(splats, view), &expected, None).unwrap()
-        };
-        views.iter().map(of).sum::<f64>() / views.len() as f64
-    };
-    let [without, with] = [fits(&without.splats, &given), fits(&with.splats, &refined)];
-    println!("{before:.2} pixels off before, {after:.2} after; {without:.2} dB without, {with:.2} dB with");
-    assert!(before > 1.0 && after < 0.5 * before, "{before} {after}");
-    assert!(with > without + 2.0, "{without} {with}");
-}
-
-#[test]
-fn poses_do_not_depend_on_threads_or_interruptions() {
-    let ground_truth = cloud(14, 120, 0.8);
-    let photos = photos(&ground_truth);
-    let run = |threads: usize, from: Option<State>, until: u32| {
-        let mut left = None;
-        let mut report = |mut now: train::Progress| {
-            left = (now.step == until).then(|| now.state().unwrap().to_frame());
-            if left.is_some() { Flow::Stop } else { Flow::Continue }
-        };
-        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-        let setup = Setup {
-            trains_poses: true,
-            steps: 120,
-            views: disturbed(&views()),
-            ..Setup::new(perturbed(&ground_truth), &photos)
-        };
-        let done = pool.install(|| setup.try_run_on(from, &|_| true, &mut report)).unwrap();
-        (done, left)
-    };
-    let uninterrupted = run(1, None, u32::MAX).0;
-    assert!(uninterrupted == run(2, None, u32::MAX).0, "two threads give another result");
-    let left = run(2, None, 67).1.unwrap();
-    let resumed = run(1, Some(State::from_frame(&left).unwrap()), u32::MAX).0;
-    assert!(uninterrupted == resumed, "a resumed run gives another result");
 }
 
 #[test]

@@ -6,7 +6,7 @@ mod common;
 
 use common::*;
 use render::gpu::{Gpu, GpuError, GpuOptions, Path};
-use scene::{Exposures, Splats};
+use scene::Splats;
 use train::{Backend, Flow, Recipe, State, TrainError};
 
 /// The GPU, or `None` after printing why the test is skipped. PLAT_GPU=required makes a missing GPU a failure.
@@ -246,17 +246,9 @@ fn steps_with_a_non_finite_loss_are_skipped_and_counted() {
 }
 
 #[test]
-fn exposures_on_a_gpu_are_refused() {
+fn training_without_splats_is_refused() {
     let Some(gpu) = gpu() else { return };
-    let ground_truth = cloud(9, 60, 0.8);
-    let photos = photos(&ground_truth);
-    let exposures = Exposures::default();
-    let setup = || Setup { backend: gpu.clone(), ..Setup::new(perturbed(&ground_truth), &photos) };
-    for setup in [Setup { trains_exposures: true, ..setup() }, Setup { exposures: Some(&exposures), ..setup() }] {
-        let refused = setup.try_run(&|_| true, &mut |_| Flow::Continue).unwrap_err();
-        assert_eq!(refused, TrainError::Exposures);
-        assert!(refused.to_string().contains("--backend cpu"));
-    }
-    let empty = Setup { backend: gpu.clone(), ..Setup::new(Splats::new(1), &photos) };
+    let photos = photos(&cloud(9, 60, 0.8));
+    let empty = Setup { backend: gpu, ..Setup::new(Splats::new(1), &photos) };
     assert_eq!(empty.try_run(&|_| true, &mut |_| Flow::Continue), Err(TrainError::Empty(0)));
 }

@@ -171,10 +171,6 @@ fn backend_of(args: &SubmitArgs, about: &proto::AboutReply, output: &Output) -> 
             name
         }
     };
-    if args.plan.exposure && !is_cpu(&name) {
-        let advice = "leave it, or give --backend cpu";
-        return Err(BadInput::new("--exposure", format!("is not trained on {name}"), advice).into());
-    }
     if args.plan.refine_poses && !is_cpu(&name) {
         let advice = "leave it, or give --backend cpu";
         return Err(BadInput::new("--refine-poses", format!("is not done on {name}"), advice).into());

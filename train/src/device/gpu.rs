@@ -4,7 +4,8 @@
 //! ```text
 //! photos ┐
 //! splats ┴forward→ frames ─loss_forward→ sums ─finish_loss→ optimiser state
-//!         ─loss_backward→ upstream ─backward→ gradients ─adam→ splats
+//!         ─loss_backward→ upstream ─expose_backward→ upstream ─backward→ gradients ─adam→ splats
+//!                                                └→ sums ─exposure_step→ exposures
 //! ```
 //! A step reads nothing back. The device itself checks that the loss is finite and counts finished steps in its
 //! optimiser state. When a step has more tile pairs than the pair buffer holds, that step and all after it change
@@ -22,12 +23,15 @@ use scene::{Camera, Splats, column};
 use shaders::train::{ADAM, AdamConstants, DENSIFICATION_STATS, LOSS, OptimiserState, Photo, Photos};
 use shaders::{MAX_VIEWS, TILE, args};
 
+use self::exposures::{GpuExposures, LossBuffers};
 use super::step::{MAX_VIEWS_PER_STEP, StatePart, Step, TrainDevice, ViewSample};
 use crate::checkpoint::State;
 use crate::coarse_to_fine::Tally;
 use crate::error::TrainError;
 use crate::growth::DensificationStats;
 use crate::optimiser::{self, Adam};
+
+mod exposures;
 
 /// Steps in flight on the device while the host reads the next photo.
 const IN_FLIGHT: usize = 2;
@@ -60,6 +64,7 @@ pub(crate) struct GpuDevice {
     partials: GrowableBuffer,
     /// Partial sums of the loss, per tile.
     sums: GrowableBuffer,
+    exposures: GpuExposures,
     /// Submitted steps that are not known to be finished.
     pending: VecDeque<Step>,
     /// Finished steps at the last synchronisation.
@@ -107,6 +112,7 @@ impl GpuDevice {
             photo: GrowableBuffer::new(g, "photo")?,
             partials: GrowableBuffer::new(g, "derivatives of SSIM")?,
             sums: GrowableBuffer::new(g, "sums of tiles")?,
+            exposures: GpuExposures::new(g)?,
             pending: VecDeque::new(),
             done: 0,
             in_flight: VecDeque::new(),
@@ -129,6 +135,7 @@ impl GpuDevice {
             }
             moments.write(gpu, columns)?;
         }
+        self.exposures.upload(gpu, state.exposures.as_ref())?;
         self.stats.reserve(gpu, 8 * stride as u64)?;
         self.views.reserve(gpu, 4 * stride as u64)?;
         let n = state.splats.len();
@@ -156,16 +163,17 @@ impl GpuDevice {
     /// Submits a step.
     fn submit(&mut self, step: &Step) -> Result<(), GpuError> {
         let gpu = Arc::clone(&self.gpu);
-        let Step { samples, options, rates, depth_weight, .. } = step;
+        let Step { samples, options, rates, depth_weight, exposure_rate, .. } = step;
         let (photos, bytes) = self.photos(samples, options.extras, *depth_weight);
         let area: usize = samples.iter().map(|sample| sample.photo.area()).sum();
-        let tiles = 3 * photos.tiles;
+        let (of_photos, tiles) = (photos.tiles, 3 * photos.tiles);
         self.photo.reserve(&gpu, bytes.len() as u64)?;
         self.partials.reserve(&gpu, 4 * 9 * area as u64)?;
         self.sums.reserve(&gpu, 16 * u64::from(tiles))?;
 
         let mut encoder = gpu.encoder();
         gpu.write(&mut encoder, &self.photo, 0, &bytes);
+        self.exposures.prepare(&gpu, &mut encoder, samples, of_photos)?;
         let cameras: Vec<Camera> = samples.iter().map(|sample| sample.camera).collect();
         self.renderer.forward(&mut encoder, &self.splats, self.context.as_ref(), &cameras, options)?;
         let photos = gpu.uniform(&photos);
@@ -173,12 +181,14 @@ impl GpuDevice {
             let pass = &mut encoder.begin_compute_pass(&wgpu::ComputePassDescriptor::default());
             let Kernels { loss_forward, finish_loss, loss_backward, .. } = &self.kernels;
             let (frame, status) = (self.renderer.frame(), self.renderer.status_buffer());
-            let bindings = [(0, &photos), (1, frame), (2, &*self.photo), (3, &*self.partials), (4, &*self.sums)];
-            loss_forward.run(&gpu, pass, &bindings, tiles);
+            let exposures = (8, self.exposures.values());
+            let bindings = [(0, &photos), (1, frame), (2, &*self.photo), (3, &*self.partials), exposures];
+            loss_forward.run(&gpu, pass, &[&bindings[..], &[(4, &*self.sums)]].concat(), tiles);
             finish_loss.run(&gpu, pass, &[(0, &photos), (4, &self.sums), (5, &self.optimiser), (7, status)], 1);
             let upstream = self.renderer.upstream();
-            let bindings = [bindings[0], bindings[1], bindings[2], bindings[3], (5, &self.optimiser), (6, upstream)];
-            loss_backward.run(&gpu, pass, &bindings, tiles);
+            loss_backward.run(&gpu, pass, &[&bindings[..], &[(5, &self.optimiser), (6, upstream)]].concat(), tiles);
+            let buffers = LossBuffers { photos: &photos, frame, upstream, optimiser: &self.optimiser };
+            self.exposures.encode(&gpu, pass, &buffers, samples, of_photos, *exposure_rate);
         }
         let planes = match *depth_weight > 0.0 {
             true => UpstreamPlanes { transmittance: true, depth: true },
@@ -206,7 +216,8 @@ impl GpuDevice {
             depth_weight,
             ..Photos::zeroed()
         };
-        for (layout, ViewSample { photo, .. }) in photos.photo.iter_mut().zip(samples) {
+        for (n, (layout, sample)) in photos.photo.iter_mut().zip(samples).enumerate() {
+            let photo = &sample.photo;
             let (width, height) = (photo.width, photo.height);
             *layout = Photo {
                 width,
@@ -217,6 +228,7 @@ impl GpuDevice {
                 first_pixel,
                 first_byte: bytes.len() as u32,
                 masked: photo.mask.is_some().into(),
+                exposure: self.exposures.number(n, sample),
                 ..Photo::zeroed()
             };
             photos.tiles += layout.tiles_x * layout.tiles_y;
@@ -328,6 +340,7 @@ impl TrainDevice for GpuDevice {
         if part >= StatePart::Splats {
             // The device holds floats only. Rows change on the host alone, so its attributes still fit.
             state.splats = self.splats.download()?.with_attributes_of(&state.splats);
+            state.exposures = self.exposures.download(&self.gpu)?;
         }
         if part >= StatePart::All {
             let (gpu, n, stride) = (&*self.gpu, self.splats.len(), self.splats.columns().stride());

@@ -203,6 +203,17 @@ impl<'a> Setup<'a> {
     }
 }
 
+/// The CPU and, where there is one, a GPU. PLAT_GPU=required makes a missing GPU a failure.
+pub fn backends() -> Vec<Backend> {
+    #[cfg(feature = "gpu")]
+    match render::gpu::Gpu::open() {
+        Ok(gpu) => return vec![Backend::Cpu, Backend::Gpu(gpu)],
+        Err(error) if std::env::var("PLAT_GPU").is_ok_and(|value| value == "required") => panic!("{error}"),
+        Err(error) => println!("skipped on a GPU: no adapter ({error})"),
+    }
+    vec![Backend::Cpu]
+}
+
 /// A recipe without densification, so that rows keep their order.
 pub fn no_growth() -> Recipe {
     let mut recipe = Recipe::default();

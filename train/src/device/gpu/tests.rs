@@ -2,11 +2,12 @@
 
 use glam::{DQuat, DVec3, Vec3};
 use render::{Options, Upstream};
-use scene::{Camera, Pinhole, Pixels, Rigid, Splat};
+use scene::{Camera, Exposure, Pinhole, Pixels, Rigid, Splat};
 
 use super::*;
 use crate::coarse_to_fine::CoarseToFine;
 use crate::depth_loss::depth_loss;
+use crate::exposure::ExposureTraining;
 use crate::loss::PhotometricLoss;
 use crate::pose::GivenPoses;
 use crate::random::{bits, uniform};
@@ -274,6 +275,95 @@ fn several_samples_agree_with_the_cpu(depth_weight: f32) {
     }
 }
 
+/// An exposure with every number off the identity's by up to 0.1.
+fn exposure(key: u64) -> Exposure {
+    let mut exposure = Exposure::IDENTITY;
+    exposure.0.iter_mut().flatten().zip(0..).for_each(|(value, k)| *value += 0.2 * (uniform(key, k) - 0.5));
+    exposure
+}
+
+/// Samples of several sizes of views 2, 3, 5 and 9, one of them masked.
+fn samples_of_views() -> Vec<ViewSample> {
+    let sizes = [(2, [75, 53]), (9, [16, 16]), (3, [33, 90]), (5, [64, 48])];
+    let of = |(view, size)| ViewSample {
+        view,
+        ..sample(view == 3, u64::from(view), size, DVec3::new(0.2 * f64::from(view), 0.0, 0.5))
+    };
+    sizes.into_iter().map(of).collect()
+}
+
+/// Fixed exposures of three of four views: after a step, moments of splats differ from the CPU's by rounding only.
+#[test]
+fn fixed_exposures_agree_with_the_cpu() {
+    let Some(gpu) = gpu() else { return };
+    let begin = new_state(cloud(3, 300, 2));
+    let bare = samples_of_views();
+    let mut exposed = bare.clone();
+    exposed.iter_mut().filter(|sample| sample.view != 9).for_each(|sample| {
+        sample.exposure = Some(exposure(sample.view.into()));
+    });
+    let run = |device: &mut dyn TrainDevice, samples: &[ViewSample]| {
+        let mut state = begin.clone();
+        device.step(&mut state, Step { samples: samples.to_vec(), ..step(false, false, 1) }).unwrap();
+        device.download(&mut state, StatePart::All).unwrap();
+        state
+    };
+    let cpu = run(&mut super::super::cpu::CpuDevice::new(0.2, None, &none()), &exposed);
+    let mut device = GpuDevice::new(&gpu, &begin, 0.2, None).unwrap();
+    let on_gpu = run(&mut device, &exposed);
+    assert_eq!(on_gpu.exposures, None);
+    let moments_off = |a: &State, b: &State| {
+        let (a, b) = (a.adam.parts(), b.adam.parts());
+        a.1.iter().zip(b.1).map(|(a, b)| off(a, b)).fold(0.0, f32::max)
+    };
+    let (loss_off, moments) = ((on_gpu.loss - cpu.loss).abs() / cpu.loss, moments_off(&on_gpu, &cpu));
+    println!("loss {loss_off:.1e}, moments {moments:.1e}");
+    // As without exposures.
+    assert!(loss_off < 1e-5 && moments < 1e-4);
+    device.upload(&begin, StatePart::All).unwrap();
+    let without = run(&mut device, &bare);
+    assert!(moments_off(&without, &on_gpu) > 1e-2, "exposures have no effect");
+}
+
+/// After each of three steps the exposures in training, and their Adam state, are the CPU's but for rounding.
+#[test]
+fn trained_exposures_agree_with_the_cpu() {
+    let Some(gpu) = gpu() else { return };
+    let mut cpu = new_state(cloud(3, 300, 2));
+    let views = [2, 3, 4, 5, 9];
+    let rows = |key: u64, size: f32| views.map(|view| [(); 12].map(|()| size * uniform(key, view))).to_vec();
+    let values = views.map(|view| exposure(view).0.concat().try_into().unwrap()).to_vec();
+    let steps = vec![7, 0, 1, 3, 2];
+    let views = views.map(|view| view as u32).to_vec();
+    cpu.exposures = Some(ExposureTraining { views, steps, values: [values, rows(51, 1e-3), rows(52, 1e-6)] });
+    let mut on_gpu = cpu.clone();
+    let mut cpu_device = super::super::cpu::CpuDevice::new(0.2, None, &none());
+    let mut device = GpuDevice::new(&gpu, &cpu, 0.2, None).unwrap();
+    for n in 0..3 {
+        // Later steps have fewer samples, so that buffers are larger than the step needs.
+        let samples: Vec<ViewSample> = samples_of_views().into_iter().skip(n).collect();
+        let step = Step { samples, exposure_rate: 0.01, ..step(false, false, 1) };
+        cpu_device.step(&mut cpu, step.clone()).unwrap();
+        device.step(&mut on_gpu, step).unwrap();
+        device.download(&mut on_gpu, StatePart::Splats).unwrap();
+        let (found, expected) = (on_gpu.exposures.as_ref().unwrap(), cpu.exposures.as_ref().unwrap());
+        assert_eq!((&found.views, &found.steps), (&expected.views, &expected.steps));
+        let parts = found.values.iter().zip(&expected.values);
+        let by_part: Vec<f32> = parts.map(|(a, b)| off(a.as_flattened(), b.as_flattened())).collect();
+        println!("step {n}: exposures {:.1e}, moments {:.1e}, {:.1e}", by_part[0], by_part[1], by_part[2]);
+        // Moments differ as those of splats do; Adam turns that into less than a hundredth of its rate.
+        assert!(by_part[0] < 1e-5 && by_part[1] < 1e-4 && by_part[2] < 1e-4);
+    }
+    let before = on_gpu.exposures.clone();
+    // A loss that is not finite changes no exposure.
+    let mut device = GpuDevice::new(&gpu, &on_gpu, f32::NAN, None).unwrap();
+    device
+        .step(&mut on_gpu, Step { exposure_rate: 0.01, samples: samples_of_views(), ..step(false, false, 1) })
+        .unwrap();
+    device.download(&mut on_gpu, StatePart::All).unwrap();
+    assert_eq!((on_gpu.skipped, on_gpu.exposures), (1, before));
+}
+
 #[test]
 fn pair_buffer_size_changes_no_byte() {
     let Some(gpu) = gpu() else { return };
@@ -281,13 +371,16 @@ fn pair_buffer_size_changes_no_byte() {
     let mut splats = cloud(5, 20_000, 0);
     splats.columns_mut()[column::OPACITY].fill(-5.0);
     (0..3).for_each(|axis| splats.columns_mut()[column::LOG_SCALE + axis].fill(0.5));
-    let begin = new_state(splats);
+    let mut begin = new_state(splats);
+    let rows = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]].concat().try_into().unwrap();
+    let values = [vec![rows; 2], vec![[0.0; 12]; 2], vec![[0.0; 12]; 2]];
+    begin.exposures = Some(ExposureTraining { views: vec![0, 1], steps: vec![0; 2], values });
     let mut device = GpuDevice::new(&gpu, &begin, 0.2, None).unwrap();
     let mut run = |expect_overflow: bool| {
         let mut state = begin.clone();
         device.upload(&state, StatePart::All).unwrap();
         for key in 0..3 {
-            let mut step = step(false, false, key);
+            let mut step = Step { exposure_rate: 0.01, ..step(false, false, key) };
             step.rates.as_mut().unwrap().log_scale_bounds = [-5.0, 1.0];
             device.step(&mut state, step).unwrap();
         }
@@ -296,7 +389,8 @@ fn pair_buffer_size_changes_no_byte() {
         device.download(&mut state, StatePart::All).unwrap();
         let (steps, ..) = state.adam.parts();
         assert_eq!((steps, state.coarse_to_fine.tally.count, state.skipped), (3, 3, 0));
-        words(&state)
+        assert_eq!(state.exposures.as_ref().unwrap().steps, [3, 0]);
+        (words(&state), state.exposures)
     };
     assert!(run(true) == run(false), "resubmitted steps give other bytes");
 }
