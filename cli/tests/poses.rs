@@ -68,5 +68,4 @@ fn poses_come_from_the_root_and_do_not_change() {
     assert!(figure(&fitted, "psnr_fitted") > 5.0 && fitted.get("psnr_refined").is_none());
 
     refused(at, &["train", "city", "--out", "flat", "--blocks", "flat", "--refine-poses"], "--refine-poses");
-    refused(at, &["train", "city", "--out", "gpu", "--backend", "gpu", "--refine-poses"], "--backend cpu");
 }

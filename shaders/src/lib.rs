@@ -25,6 +25,8 @@ pub const TILE: u32 = 16;
 pub const MOMENTS: u32 = 13;
 /// Largest number of views in one dispatch.
 pub const MAX_VIEWS: usize = 16;
+/// Workgroups that sum the pose gradient of a view.
+pub const POSE_BLOCKS: u32 = 64;
 /// Entries that one workgroup of `reduce` handles.
 pub const REDUCE_SPLATS: u32 = 16;
 
@@ -66,6 +68,8 @@ const TILES: &str = include_str!("../wgsl/tiles.wgsl");
 /// The view of a tile, and alpha of a splat at a pixel.
 const BLEND: &str = include_str!("../wgsl/blend.wgsl");
 
+/// The sum over a workgroup.
+const SUM: &str = include_str!("../wgsl/workgroup_sum.wgsl");
 /// A thread's index in its workgroup.
 const THREAD_INDEX: [&str; 2] = snippet!("thread_index");
 /// The exclusive prefix sum over a workgroup.
@@ -108,6 +112,8 @@ stages! {
         [VIEW, BLEND, THREAD_INDEX[0], PIXEL_TERMS[0], REDUCE_PARTS[0], MOMENTS_PER_PAIR] ["rasterize_backward"];
     REDUCE "reduce" [VIEW] ["reduce"];
     PROJECT_BACKWARD "project_backward" [VIEW, SPLAT] ["project_backward"];
+    DISPLACE "displace" [VIEW] ["displace"];
+    REDUCE_POSE "reduce_pose" [VIEW, SUM] ["reduce_pose", "finish_pose"];
 }
 
 const SCAN_TEXT: &str = include_str!("../wgsl/scan.wgsl");
@@ -170,8 +176,10 @@ pub struct View {
     pub first_tile: u32,
     /// Number of pixels of the views before this one.
     pub first_pixel: u32,
+    /// Number of the camera's displacement, from 1; 0: it is not displaced, and there is no gradient of its pose.
+    pub displacement: u32,
     /// Padding.
-    pub padding: [u32; 2],
+    pub padding: u32,
 }
 
 /// The views of one dispatch and the sizes of their buffers. Uniform.

@@ -1,13 +1,11 @@
-//! The GPU stages of training: loss, Adam, exposures and densification statistics, with their layouts.
+//! The GPU stages of training: loss, Adam, exposures, poses and densification statistics, with their layouts.
 
 use bytemuck::{Pod, Zeroable};
 
-use crate::{MAX_VIEWS, Stage, VIEW};
+use crate::{MAX_VIEWS, SUM, Stage, VIEW};
 
 /// Structs and constants of the training stages.
 const TRAIN: &str = include_str!("../wgsl/train.wgsl");
-/// The sum over a workgroup.
-const SUM: &str = include_str!("../wgsl/workgroup_sum.wgsl");
 /// Constants of Adam, and powers.
 const POWER: &str = include_str!("../wgsl/power.wgsl");
 
@@ -32,8 +30,11 @@ pub const DENSIFICATION_STATS: Stage = Stage::new(
     &[VIEW, TRAIN, include_str!("../wgsl/densification_stats.wgsl")],
     &["densification_stats"],
 );
+/// `pose.wgsl`
+pub const POSE: Stage =
+    Stage::new("pose", &[VIEW, TRAIN, SUM, POWER, include_str!("../wgsl/pose.wgsl")], &["pose_step"]);
 /// Every stage of training.
-pub const STAGES: &[Stage] = &[LOSS, ADAM, EXPOSURE, DENSIFICATION_STATS];
+pub const STAGES: &[Stage] = &[LOSS, ADAM, EXPOSURE, POSE, DENSIFICATION_STATS];
 
 /// Counters and losses that stay on the device between steps.
 ///
@@ -125,6 +126,41 @@ pub struct ExposureConstants {
     pub rate: f32,
     /// Padding.
     pub padding: [u32; 2],
+}
+
+/// A camera as given, which its displacement refers to.
+#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
+#[repr(C)]
+pub struct GivenPose {
+    /// Rows of the rotation from world to camera, each with a component of the camera's offset from the mean of all, in
+    /// the world's axes, metres.
+    pub rows: [[f32; 4]; 3],
+    /// Learning rate of translations in metres, relative to that of rotations.
+    pub translation_rate: f32,
+    /// Padding.
+    pub padding: [f32; 3],
+}
+
+/// Constants of a step of the poses. Uniform.
+#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
+#[repr(C)]
+pub struct PoseConstants {
+    /// Learning rate of rotations, radians.
+    pub rate: f32,
+    /// Share of the displacement of a view in the step that is taken back.
+    pub decay: f32,
+    /// Sum of the squared offsets of the cameras, m².
+    pub spread: f32,
+    /// Number of cameras.
+    pub cameras: u32,
+    /// Views of the step.
+    pub views: u32,
+    /// 1: the common motion of all cameras is removed.
+    pub is_anchored: u32,
+    /// Padding.
+    pub padding: [u32; 2],
+    /// Number of the displacement of each view of the step, from 1; 0: it has none.
+    pub row: [u32; MAX_VIEWS],
 }
 
 /// Learning rates and regulariser weights of one step, for one bank of columns. Uniform.

@@ -5,7 +5,7 @@ use std::mem::offset_of;
 
 use naga::valid::{Capabilities, ValidationFlags, Validator};
 use naga::{Module, TypeInner};
-use shaders::train::{self, AdamConstants, ExposureConstants, OptimiserState, Photo, Photos};
+use shaders::train::{self, AdamConstants, ExposureConstants, GivenPose, OptimiserState, Photo, Photos, PoseConstants};
 use shaders::{
     HALF, PassConstants, RASTERIZE_BACKWARD_ATOMICS, STAGES, SUBGROUPS, SplatSet, Stage, Status, UpstreamPlanes, View,
     Views,
@@ -22,7 +22,7 @@ macro_rules! layout {
 
 fn rust_layouts() -> BTreeMap<&'static str, Layout> {
     [
-        layout!(View: rows, centre, focal, principal, cone_min, cone_max, pixels, tiles, first_tile, first_pixel, padding),
+        layout!(View: rows, centre, focal, principal, cone_min, cone_max, pixels, tiles, first_tile, first_pixel, displacement, padding),
         layout!(Views: background, count, tiles, pixels, trainable_entries, entries, pair_capacity,
             antialiased, extras, view),
         layout!(SplatSet: first, count, stride, sh_degree),
@@ -36,6 +36,8 @@ fn rust_layouts() -> BTreeMap<&'static str, Layout> {
             first_weight, first_depth, exposure, padding),
         layout!(Photos: count, tiles, lambda, share_weighted, extras, depth_weight, padding, photo),
         layout!(ExposureConstants: rows, rate, padding),
+        layout!(GivenPose: rows, translation_rate, padding),
+        layout!(PoseConstants: rate, decay, spread, cameras, views, is_anchored, padding, row),
         layout!(AdamConstants: mean, log_scale, quat, opacity, sh_dc, sh_rest, beta2, opacity_reg, needle_reg, log_scale_min,
             log_scale_max, columns, stride, views, padding),
     ]
@@ -141,6 +143,7 @@ fn wgsl_constants_match_rust() {
         ("SCAN_BLOCK", shaders::SCAN_BLOCK),
         ("RADIX_BLOCK", shaders::RADIX_BLOCK),
         ("RADIX_BINS", shaders::RADIX_BINS),
+        ("POSE_BLOCKS", shaders::POSE_BLOCKS),
         ("REDUCE_SPLATS", shaders::REDUCE_SPLATS),
     ]
     .into();

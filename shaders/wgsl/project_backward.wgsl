@@ -11,7 +11,8 @@
 @group(0) @binding(11) var<storage, read_write> out_c: array<f32>;
 @group(0) @binding(12) var<storage, read_write> out_d: array<f32>;
 // For each visible trainable entry: norm of the mean's gradient in pixels, the same with absolute values summed, sum of
-// alpha T, pixels of the view.
+// alpha T, pixels of the view. After one of these per trainable entry, two vectors for each visible trainable entry of a
+// view with a displacement: the six terms of the gradient of its pose.
 @group(0) @binding(13) var<storage, read_write> statistics: array<vec4<f32>>;
 
 // Whether an earlier view has written the gradient, so that this view adds to it.
@@ -224,6 +225,22 @@ fn splat_gradient(i: u32, visible_at: u32) {
             s10 * xy + 8.0 * s11 * yz + s12 * (6.0 * q.z - 3.0 * (q.x + q.y)) + 8.0 * s13 * xz + s14 * (q.x - q.y),
         );
     }
-    d_world += (d_direction - d * dot3(d_direction, d)) * to_splat.w;
-    write_gradient3(0u, i, d_world);
+    d_direction = (d_direction - d * dot3(d_direction, d)) * to_splat.w;
+    write_gradient3(0u, i, d_world + d_direction);
+
+    if view.displacement != 0u {
+        // A translation moves the splat's centre and the camera's centre, a rotation the splat's centre and the axes W.
+        var shift = d_p;
+        var turn = cross(p, d_p);
+        for (var r = 0u; r < 3u; r++) {
+            shift[r] += dot3(view.rows[r].xyz, d_direction);
+            let j = view.focal * e.inv_z * vec2<f32>(d_t0[r], d_t1[r]);
+            // Column r of W, and of dL/dW = J^T dL/dT.
+            let column = vec3<f32>(view.rows[0][r], view.rows[1][r], third[r]);
+            turn += cross(column, vec3<f32>(j, -(e.u.x * j.x + e.u.y * j.y)));
+        }
+        let to = views.trainable_entries + 2u * visible_at;
+        statistics[to] = vec4<f32>(shift, turn.x);
+        statistics[to + 1u] = vec4<f32>(turn.yz, 0.0, 0.0);
+    }
 }

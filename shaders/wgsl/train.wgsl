@@ -90,6 +90,31 @@ struct ExposureConstants {
     padding: vec2<u32>,
 }
 
+// A camera as given.
+struct GivenPose {
+    // Rows of the rotation from world to camera, each with a component of the offset from the mean camera, metres.
+    rows: array<vec4<f32>, 3>,
+    // Learning rate of translations in metres, relative to that of rotations.
+    translation_rate: f32,
+    padding: array<f32, 3>,
+}
+
+// Constants of a step of the poses.
+struct PoseConstants {
+    rate: f32,
+    decay: f32,
+    // Sum of the squared offsets, m^2.
+    spread: f32,
+    cameras: u32,
+    // Views of the step.
+    views: u32,
+    // 1: the common motion of all cameras is removed.
+    is_anchored: u32,
+    padding: vec2<u32>,
+    // Number of the displacement of each view, from 1; 0: it has none.
+    row: array<vec4<u32>, 4>,
+}
+
 // SSIM's 11-tap window: exp(-d^2 / (2 1.5^2)) for d = 0, 1, .. 5, normalised to a sum of one over the eleven taps.
 const TAPS = array<f32, 6>(0.26601172, 0.21300554, 0.10936069, 0.036000773, 0.007598758, 0.00102838);
 const RADIUS: u32 = 5u;

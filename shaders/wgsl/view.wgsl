@@ -29,7 +29,9 @@ struct View {
     // Tiles and pixels of the views before this one.
     first_tile: u32,
     first_pixel: u32,
-    padding: vec2<u32>,
+    // Number of the camera's displacement, from 1; 0: it is not displaced, and there is no gradient of its pose.
+    displacement: u32,
+    padding: u32,
 }
 
 // The views of a dispatch. Entry i of `count` views is splat i / count in view i % count, so the entries of a splat are

@@ -38,14 +38,9 @@ impl Backend {
         }
     }
 
-    /// True for every backend but the CPU.
-    pub(crate) fn is_gpu(&self) -> bool {
-        !matches!(self, Self::Cpu)
-    }
-
     /// Sets up a device that continues from `state`; the CPU works on the host's state directly. `lambda` is the weight of D-SSIM
     /// in the loss. `context` are frozen splats of other blocks, rendered but not trained. `given` are the poses that displacements
-    /// of the state refer to; only the CPU trains them.
+    /// of the state refer to.
     ///
     /// # Errors
     /// A GPU that fails or has too little memory.
@@ -60,7 +55,7 @@ impl Backend {
         Ok(match self {
             Self::Cpu => Box::new(cpu::CpuDevice::new(lambda, context, given)),
             #[cfg(feature = "gpu")]
-            Self::Gpu(gpu) => Box::new(gpu::GpuDevice::new(gpu, state, lambda, context)?),
+            Self::Gpu(gpu) => Box::new(gpu::GpuDevice::new(gpu, state, lambda, context, given)?),
         })
     }
 }

@@ -15,9 +15,6 @@ pub enum TrainError {
     /// The device has too little memory for the block. A larger device may train it.
     #[error("{0}")]
     OutOfMemory(String),
-    /// Only the CPU refines poses.
-    #[error("poses are not refined on a GPU: use --backend cpu, or leave --refine-poses")]
-    Poses,
     /// All splats were removed after this number of steps.
     #[error("every splat was removed after {0} steps: the views and the points do not agree, or poses are wrong")]
     Empty(u32),

@@ -25,7 +25,7 @@ const EPSILON: f32 = 1e-15;
 /// Learning rate of translations in units of the depth, relative to that of rotations. Either explains nearly the same
 /// motion of an image, and the error of a measured translation is the smaller one seen from a distance. At 1 the
 /// translations of a city with errors of 0.15 m and 0.6° got twice as wrong; at 0.2 they stayed as they were.
-const TRANSLATION_RATE: f32 = 0.3;
+pub(crate) const TRANSLATION_RATE: f32 = 0.3;
 /// Splats whose depths a view's median is taken of.
 const SAMPLED_SPLATS: usize = 4096;
 

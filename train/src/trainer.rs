@@ -109,9 +109,6 @@ pub fn train_from(
     if job.views.is_empty() {
         return Err(TrainError::NoViews);
     }
-    if job.backend.is_gpu() && job.trains_poses {
-        return Err(TrainError::Poses);
-    }
     let mut trainer = Trainer::new(job, from)?;
     let steps = trainer.job.steps;
     while trainer.state.step < steps {

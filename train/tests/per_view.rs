@@ -133,18 +133,12 @@ fn disturbed_poses_are_refined_with_the_splats() {
     let ground_truth = cloud(13, 200, 0.8);
     let (photos, truth) = (photos(&ground_truth), views());
     let given = disturbed(&truth);
-    let run = |trains_poses| {
+    let run = |backend: &Backend, trains_poses| {
         let setup =
             Setup { trains_poses, steps: 1200, views: given.clone(), ..Setup::new(perturbed(&ground_truth), &photos) };
+        let setup = Setup { backend: backend.clone(), ..setup };
         setup.try_run_on(None, &|_| true, &mut |_| Flow::Continue).unwrap()
     };
-    let (without, with) = (run(false), run(true));
-    assert_eq!(without.poses, None);
-    let poses = with.poses.unwrap();
-    assert_eq!(poses.iter().map(|(view, _)| view).collect::<Vec<_>>(), (0..12).collect::<Vec<u32>>());
-    let refined: Vec<TrainView> =
-        given.iter().map(|view| TrainView { camera: poses.apply(view.view, view.camera), ..*view }).collect();
-    let [before, after] = [&given, &refined].map(|views| pixel_error(views, &truth));
     // Photos from the poses that the splats were trained with.
     let fits = |splats: &Splats, views: &[TrainView]| {
         let of = |view: &TrainView| {
@@ -153,17 +147,30 @@ fn disturbed_poses_are_refined_with_the_splats() {
         };
         views.iter().map(of).sum::<f64>() / views.len() as f64
     };
-    let [without, with] = [fits(&without.splats, &given), fits(&with.splats, &refined)];
-    println!("{before:.2} pixels off before, {after:.2} after; {without:.2} dB without, {with:.2} dB with");
-    assert!(before > 1.0 && after < 0.5 * before, "{before} {after}");
-    assert!(with > without + 2.0, "{without} {with}");
+    let without = run(&Backend::Cpu, false);
+    assert_eq!(without.poses, None);
+    for backend in backends() {
+        let with = run(&backend, true);
+        let poses = with.poses.unwrap();
+        assert_eq!(poses.iter().map(|(view, _)| view).collect::<Vec<_>>(), (0..12).collect::<Vec<u32>>());
+        let refined: Vec<TrainView> =
+            given.iter().map(|view| TrainView { camera: poses.apply(view.view, view.camera), ..*view }).collect();
+        let [before, after] = [&given, &refined].map(|views| pixel_error(views, &truth));
+        let [without, with] = [fits(&without.splats, &given), fits(&with.splats, &refined)];
+        println!(
+            "{}: {before:.2} pixels off before, {after:.2} after; {without:.2} dB without, {with:.2} dB with",
+            backend.name()
+        );
+        assert!(before > 1.0 && after < 0.5 * before, "{before} {after}");
+        assert!(with > without + 2.0, "{without} {with}");
+    }
 }
 
 #[test]
 fn poses_do_not_depend_on_threads_or_interruptions() {
     let ground_truth = cloud(14, 120, 0.8);
     let photos = photos(&ground_truth);
-    let run = |threads: usize, from: Option<State>, until: u32| {
+    let run = |backend: &Backend, threads: usize, from: Option<State>, until: u32| {
         let mut left = None;
         let mut report = |mut now: train::Progress| {
             left = (now.step == until).then(|| now.state().unwrap().to_frame());
@@ -173,15 +180,18 @@ fn poses_do_not_depend_on_threads_or_interruptions() {
         let setup = Setup {
             trains_poses: true,
             steps: 120,
+            backend: backend.clone(),
             views: disturbed(&views()),
             ..Setup::new(perturbed(&ground_truth), &photos)
         };
         let done = pool.install(|| setup.try_run_on(from, &|_| true, &mut report)).unwrap();
         (done, left)
     };
-    let uninterrupted = run(1, None, u32::MAX).0;
-    assert!(uninterrupted == run(2, None, u32::MAX).0, "two threads give another result");
-    let left = run(2, None, 67).1.unwrap();
-    let resumed = run(1, Some(State::from_frame(&left).unwrap()), u32::MAX).0;
-    assert!(uninterrupted == resumed, "a resumed run gives another result");
+    for backend in backends() {
+        let uninterrupted = run(&backend, 1, None, u32::MAX).0;
+        assert!(uninterrupted == run(&backend, 2, None, u32::MAX).0, "two threads give another result");
+        let left = run(&backend, 2, None, 67).1.unwrap();
+        let resumed = run(&backend, 1, Some(State::from_frame(&left).unwrap()), u32::MAX).0;
+        assert!(uninterrupted == resumed, "a resumed run gives another result");
+    }
 }

@@ -280,7 +280,7 @@ impl Block<'_> {
     /// The failure class of a training error.
     fn failure(&self, error: TrainError) -> ExecuteError {
         let kind = match error {
-            TrainError::NoViews | TrainError::Poses | TrainError::Empty(_) => FailureKind::Input,
+            TrainError::NoViews | TrainError::Empty(_) => FailureKind::Input,
             TrainError::Device(_) => FailureKind::Work,
             TrainError::OutOfMemory(_) => FailureKind::OutOfMemory,
             // Windows carry checksums: an unreadable one is unreachable or damaged, which the input does not explain.

@@ -171,9 +171,5 @@ fn backend_of(args: &SubmitArgs, about: &proto::AboutReply, output: &Output) -> 
             name
         }
     };
-    if args.plan.refine_poses && !is_cpu(&name) {
-        let advice = "leave it, or give --backend cpu";
-        return Err(BadInput::new("--refine-poses", format!("is not done on {name}"), advice).into());
-    }
     Ok(name)
 }

@@ -259,9 +259,6 @@ fn time_limit_of(minutes: f64, clock: Stopwatch, plan: &Plan, workers: u32) -> T
 
 /// The backend that trains.
 fn backend_of(args: &TrainArgs) -> Result<train::Backend, BadInput> {
-    if args.backend == Backend::Gpu && args.plan.refine_poses {
-        return Err(BadInput::new("--refine-poses", "is not done on a GPU", "leave it, or give --backend cpu"));
-    }
     backend::open(args.backend)
 }
 

@@ -1,9 +1,10 @@
 //! The backward pass: from the gradient of a frame to the gradients of the splats.
 
-use shaders::{MOMENTS, args};
+use shaders::{MOMENTS, POSE_BLOCKS, args};
 
 use super::error::GpuError;
 use super::renderer::{GpuRenderer, LastForward, UpstreamPlanes};
+use super::sizes::is_displaced;
 use super::splats::GpuSplats;
 
 /// How the moments of a splat's pairs are summed.
@@ -18,7 +19,7 @@ pub enum Reduction {
 impl GpuRenderer {
     /// Encodes a backward pass of the last [`forward`](Self::forward): gradients of the trainable splats, summed over
     /// its views, from the content of [`upstream`](Self::upstream). `splats` must be those of the forward pass,
-    /// unchanged. There is no pose gradient.
+    /// unchanged. After a forward pass with displacements also [`pose_gradients`](Self::pose_gradients).
     ///
     /// # Errors
     /// Without a forward pass before, or with another number of splats; and as `forward`.
@@ -29,7 +30,7 @@ impl GpuRenderer {
         planes: UpstreamPlanes,
     ) -> Result<(), GpuError> {
         let same_splats = |last: &LastForward| last.set.count as usize == splats.len();
-        let Some(LastForward { set, .. }) = self.last_forward.filter(same_splats) else {
+        let Some(LastForward { set, views, .. }) = self.last_forward.filter(same_splats) else {
             return Err(GpuError::Failed("backward needs the splats of the last forward pass".into()));
         };
         self.reduce_moments(encoder, planes, Reduction::Ordered)?;
@@ -55,6 +56,14 @@ impl GpuRenderer {
             (13, &*self.statistics),
         ];
         self.kernels.project_backward.run_indirect(gpu, pass, &bindings, &self.args, args::VISIBLE_TRAINABLE);
+        if is_displaced(&views) {
+            let (views_of, partials) = ((0, &self.views), (4, &*self.pose_partials));
+            let entries = [(1, &*self.status), (2, &*self.entries.visible), (3, &*self.statistics)];
+            let groups = views.count * POSE_BLOCKS;
+            let reduce = &self.kernels.reduce_pose;
+            reduce.run(gpu, pass, &[&[views_of, partials][..], &entries].concat(), groups);
+            self.kernels.finish_pose.run(gpu, pass, &[views_of, partials, (5, &*self.pose_gradients)], 1);
+        }
         Ok(())
     }
 

@@ -100,12 +100,12 @@ impl Gpu {
         self.initialised("uniform", bytemuck::bytes_of(value), wgpu::BufferUsages::UNIFORM)
     }
 
-    /// A uniform buffer that [`write`](Self::write) fills.
+    /// A uniform buffer that [`write`](Self::write) fills and a stage may change.
     pub(super) fn writable_uniform(&self, label: &str, bytes: usize) -> wgpu::Buffer {
         self.device().create_buffer(&wgpu::BufferDescriptor {
             label: Some(label),
             size: bytes as u64,
-            usage: wgpu::BufferUsages::UNIFORM | wgpu::BufferUsages::COPY_DST,
+            usage: wgpu::BufferUsages::UNIFORM | wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_DST,
             mapped_at_creation: false,
         })
     }

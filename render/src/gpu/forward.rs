@@ -4,7 +4,7 @@ use scene::Camera;
 use shaders::{SCAN_BLOCK, SplatSet, Views, WORKGROUP_SIZE, args, status_word};
 
 use super::error::GpuError;
-use super::renderer::{GpuRenderer, LastForward};
+use super::renderer::{Displacements, GpuRenderer, LastForward};
 use super::sort::{Groups, SortInput};
 use super::splats::GpuSplats;
 use super::views::views_of;
@@ -24,8 +24,28 @@ impl GpuRenderer {
         cameras: &[Camera],
         options: &Options,
     ) -> Result<(), GpuError> {
+        self.forward_displaced(encoder, splats, context, cameras, options, None)
+    }
+
+    /// As [`forward`](Self::forward), of cameras that are first moved in their own axes, on the device, where there are displacements. A backward pass
+    /// then also computes [`pose_gradients`](Self::pose_gradients).
+    ///
+    /// # Errors
+    /// As `forward`.
+    pub fn forward_displaced(
+        &mut self,
+        encoder: &mut wgpu::CommandEncoder,
+        splats: &GpuSplats,
+        context: Option<&GpuSplats>,
+        cameras: &[Camera],
+        options: &Options,
+        displacements: Option<Displacements>,
+    ) -> Result<(), GpuError> {
         let counts = [splats.len(), context.map_or(0, GpuSplats::len)];
-        let views = views_of(cameras, options, counts, self.pair_capacity, self.gpu.max_binding_bytes())?;
+        let mut views = views_of(cameras, options, counts, self.pair_capacity, self.gpu.max_binding_bytes())?;
+        for (view, row) in views.view.iter_mut().zip(displacements.map_or(&[][..], |of| of.of_camera)) {
+            view.displacement = row.map_or(0, |row| row + 1);
+        }
         let set = set_of(splats, 0, options.sh_degree.min(splats.sh_degree()));
         self.last_forward = None;
         self.reserve(&views, splats)?;
@@ -35,6 +55,9 @@ impl GpuRenderer {
         // The context is frozen: it is drawn at its full SH degree, whatever degree training has reached.
         let context = context.map(|context| (context, set_of(context, splats.len(), context.sh_degree())));
         let pass = &mut encoder.begin_compute_pass(&wgpu::ComputePassDescriptor::default());
+        if let Some(Displacements { rows, .. }) = displacements {
+            self.kernels.displace.run(&self.gpu, pass, &[(0, &self.views), (1, rows)], 1);
+        }
         self.encode_project(pass, &views, [Some((splats, set)), context].into_iter().flatten());
         let sorted = self.encode_sort_and_bin(pass, views.tiles);
         self.encode_rasterize(pass, views.tiles, sorted);

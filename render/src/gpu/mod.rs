@@ -5,6 +5,9 @@
 //! splats ─project→ records ─compact→ visible ─sort by depth→ order ─emit→ pairs ─sort by tile→ ranges ─rasterize→ frame
 //! upstream ─rasterize_backward→ moments per pair ─reduce→ moments per splat ─project_backward→ gradients
 //! ```
+//! A displacement of a camera is applied on the device, by `displace` before `project`; `reduce_pose` sums its gradient
+//! after `project_backward`.
+//!
 //! Several views share each dispatch. An *entry* is one splat in one view; the entries of a splat are adjacent, and the
 //! tiles of the views are numbered consecutively. All entries are sorted together, which keeps the order within each
 //! tile, so every view is bit-identical to a pass over that view alone.
@@ -42,7 +45,7 @@ pub use device::Gpu;
 pub use error::GpuError;
 pub use kernel::Kernel;
 pub use options::{GpuOptions, Path};
-pub use renderer::{GpuRenderer, UpstreamPlanes};
+pub use renderer::{Displacements, GpuRenderer, UpstreamPlanes};
 pub use splats::{Columns, GpuSplats};
 pub use timestamps::TimedDispatch;
 

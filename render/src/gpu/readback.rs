@@ -124,7 +124,8 @@ impl GpuRenderer {
     }
 
     /// Waits for all submitted work and reads the gradients in the CPU backend's form, summed over the views; zero
-    /// where no view sees a splat. The pose gradient is always zero.
+    /// where no view sees a splat. The pose gradient is zero; see
+    /// [`pose_gradients`](Self::pose_gradients).
     ///
     /// # Errors
     /// Any error of the submitted work, or no forward pass before.

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use shaders::{MOMENTS, SplatSet, Status, Views, args};
+use shaders::{MAX_VIEWS, MOMENTS, POSE_BLOCKS, SplatSet, Status, Views, args};
 
 use super::buffer::{Buffer, GrowableBuffer};
 use super::device::Gpu;
@@ -22,6 +22,15 @@ pub struct UpstreamPlanes {
     pub transmittance: bool,
     /// dL/d depth.
     pub depth: bool,
+}
+
+/// Rigid motions of the cameras of a forward pass, on the device.
+#[derive(Debug, Clone, Copy)]
+pub struct Displacements<'a> {
+    /// Rows of six floats: translation in metres and rotation vector in radians, in the camera's axes.
+    pub rows: &'a wgpu::Buffer,
+    /// Row of each camera; `None` leaves it where it is.
+    pub of_camera: &'a [Option<u32>],
 }
 
 /// A renderer that reuses its buffers from pass to pass.
@@ -44,6 +53,9 @@ pub struct GpuRenderer {
     pub(super) sums: GrowableBuffer,
     pub(super) gradients: Columns,
     pub(super) statistics: GrowableBuffer,
+    /// Sums of the pose gradient, two vectors per workgroup of `reduce_pose`.
+    pub(super) pose_partials: Buffer,
+    pub(super) pose_gradients: Buffer,
     pub(super) last_forward: Option<LastForward>,
 }
 
@@ -93,6 +105,9 @@ pub(super) struct Kernels {
     pub(super) rasterize_backward: Kernel,
     pub(super) reduce: Kernel,
     pub(super) project_backward: Kernel,
+    pub(super) displace: Kernel,
+    pub(super) reduce_pose: Kernel,
+    pub(super) finish_pose: Kernel,
 }
 
 impl Kernels {
@@ -110,6 +125,9 @@ impl Kernels {
             rasterize_backward: gpu.kernel(&shaders::RASTERIZE_BACKWARD, "rasterize_backward")?,
             reduce: gpu.kernel(&shaders::REDUCE, "reduce")?,
             project_backward: gpu.kernel(&shaders::PROJECT_BACKWARD, "project_backward")?,
+            displace: gpu.kernel(&shaders::DISPLACE, "displace")?,
+            reduce_pose: gpu.kernel(&shaders::REDUCE_POSE, "reduce_pose")?,
+            finish_pose: gpu.kernel(&shaders::REDUCE_POSE, "finish_pose")?,
         })
     }
 }
@@ -151,6 +169,8 @@ impl GpuRenderer {
             sums: GrowableBuffer::new(g, "moments of splats")?,
             gradients: Columns::new(g, "gradients", 0, 0)?,
             statistics: GrowableBuffer::new(g, "statistics")?,
+            pose_partials: g.buffer("sums of pose gradients", 32 * MAX_VIEWS as u64 * u64::from(POSE_BLOCKS))?,
+            pose_gradients: g.buffer("pose gradients", 32 * MAX_VIEWS as u64)?,
             last_forward: None,
             gpu,
         })
@@ -183,6 +203,12 @@ impl GpuRenderer {
     /// of [`Gradients`](crate::Gradients) in that view, and the view's number of pixels.
     pub fn statistics(&self) -> &wgpu::Buffer {
         &self.statistics
+    }
+
+    /// For each view of the last [`forward_displaced`](Self::forward_displaced) eight floats: the gradient of its pose as
+    /// in [`Gradients`](crate::Gradients), at the displaced camera, and padding. Zero for a view without a displacement.
+    pub fn pose_gradients(&self) -> &wgpu::Buffer {
+        &self.pose_gradients
     }
 
     /// Indices of the visible entries, ascending; the first [`Status::visible_trainable`] belong to trainable splats.

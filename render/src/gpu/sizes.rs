@@ -32,7 +32,7 @@ pub(super) struct Sizes {
     pub(super) upstream: u64,
     /// Moments per entry of a trainable splat.
     pub(super) splat_moments: u64,
-    /// Four words per entry of a trainable splat.
+    /// Four words per entry of a trainable splat, or twelve with displacements.
     pub(super) statistics: u64,
 }
 
@@ -54,9 +54,15 @@ impl Sizes {
             frame: 4 * area * if views.extras != 0 { 6 } else { 4 },
             upstream: 4 * area * 5,
             splat_moments: 4 * u64::from(MOMENTS) * trainable.next_multiple_of(REDUCE_SPLATS.into()),
-            statistics: 16 * trainable,
+            // With displacements, also two vectors of the pose gradient.
+            statistics: if is_displaced(views) { 3 * 16 * trainable } else { 16 * trainable },
         }
     }
+}
+
+/// Whether any view has a displacement.
+pub(super) fn is_displaced(views: &Views) -> bool {
+    views.view[..views.count as usize].iter().any(|view| view.displacement != 0)
 }
 
 /// Length of the radix histogram for so many entries.

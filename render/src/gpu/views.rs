@@ -73,6 +73,7 @@ fn view_of(camera: &Camera) -> View {
         tiles: [k.width.div_ceil(TILE), k.height.div_ceil(TILE)],
         first_tile: 0,
         first_pixel: 0,
-        padding: [0; 2],
+        displacement: 0,
+        padding: 0,
     }
 }

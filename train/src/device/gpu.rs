@@ -5,7 +5,7 @@
 //! photos ┐
 //! splats ┴forward→ frames ─loss_forward→ sums ─finish_loss→ optimiser state
 //!         ─loss_backward→ upstream ─expose_backward→ upstream ─backward→ gradients ─adam→ splats
-//!                                                └→ sums ─exposure_step→ exposures
+//!                        └→ sums ─exposure_step→ exposures   └→ pose gradients ─pose_step→ displacements
 //! ```
 //! A step reads nothing back. The device itself checks that the loss is finite and counts finished steps in its
 //! optimiser state. When a step has more tile pairs than the pair buffer holds, that step and all after it change
@@ -24,14 +24,17 @@ use shaders::train::{ADAM, AdamConstants, DENSIFICATION_STATS, LOSS, OptimiserSt
 use shaders::{MAX_VIEWS, TILE, args};
 
 use self::exposures::{GpuExposures, LossBuffers};
+use self::poses::GpuPoses;
 use super::step::{MAX_VIEWS_PER_STEP, StatePart, Step, TrainDevice, ViewSample};
 use crate::checkpoint::State;
 use crate::coarse_to_fine::Tally;
 use crate::error::TrainError;
 use crate::growth::DensificationStats;
 use crate::optimiser::{self, Adam};
+use crate::pose::GivenPoses;
 
 mod exposures;
+mod poses;
 
 /// Steps in flight on the device while the host reads the next photo.
 const IN_FLIGHT: usize = 2;
@@ -65,6 +68,7 @@ pub(crate) struct GpuDevice {
     /// Partial sums of the loss, per tile.
     sums: GrowableBuffer,
     exposures: GpuExposures,
+    poses: GpuPoses,
     /// Submitted steps that are not known to be finished.
     pending: VecDeque<Step>,
     /// Finished steps at the last synchronisation.
@@ -82,12 +86,13 @@ struct Kernels {
 }
 
 impl GpuDevice {
-    /// Uploads a state. `lambda` is the weight of D-SSIM in the loss.
+    /// Uploads a state. `lambda` is the weight of D-SSIM in the loss; `given` are the poses that displacements refer to.
     pub(crate) fn new(
         gpu: &Arc<Gpu>,
         state: &State,
         lambda: f32,
         context: Option<&Splats>,
+        given: &Arc<GivenPoses>,
     ) -> Result<Self, TrainError> {
         let g = &**gpu;
         let kernels = Kernels {
@@ -113,6 +118,7 @@ impl GpuDevice {
             partials: GrowableBuffer::new(g, "derivatives of SSIM")?,
             sums: GrowableBuffer::new(g, "sums of tiles")?,
             exposures: GpuExposures::new(g)?,
+            poses: GpuPoses::new(g, given)?,
             pending: VecDeque::new(),
             done: 0,
             in_flight: VecDeque::new(),
@@ -136,6 +142,7 @@ impl GpuDevice {
             moments.write(gpu, columns)?;
         }
         self.exposures.upload(gpu, state.exposures.as_ref())?;
+        self.poses.upload(gpu, state.poses.as_ref())?;
         self.stats.reserve(gpu, 8 * stride as u64)?;
         self.views.reserve(gpu, 4 * stride as u64)?;
         let n = state.splats.len();
@@ -163,7 +170,7 @@ impl GpuDevice {
     /// Submits a step.
     fn submit(&mut self, step: &Step) -> Result<(), GpuError> {
         let gpu = Arc::clone(&self.gpu);
-        let Step { samples, options, rates, depth_weight, exposure_rate, .. } = step;
+        let Step { samples, options, rates, depth_weight, exposure_rate, pose_rates } = step;
         let (photos, bytes) = self.photos(samples, options.extras, *depth_weight);
         let area: usize = samples.iter().map(|sample| sample.photo.area()).sum();
         let (of_photos, tiles) = (photos.tiles, 3 * photos.tiles);
@@ -175,7 +182,9 @@ impl GpuDevice {
         gpu.write(&mut encoder, &self.photo, 0, &bytes);
         self.exposures.prepare(&gpu, &mut encoder, samples, of_photos)?;
         let cameras: Vec<Camera> = samples.iter().map(|sample| sample.camera).collect();
-        self.renderer.forward(&mut encoder, &self.splats, self.context.as_ref(), &cameras, options)?;
+        let rows = self.poses.rows(samples);
+        let (context, displacements) = (self.context.as_ref(), self.poses.displacements(&rows));
+        self.renderer.forward_displaced(&mut encoder, &self.splats, context, &cameras, options, displacements)?;
         let photos = gpu.uniform(&photos);
         {
             let pass = &mut encoder.begin_compute_pass(&wgpu::ComputePassDescriptor::default());
@@ -195,6 +204,10 @@ impl GpuDevice {
             false => UpstreamPlanes::default(),
         };
         self.renderer.backward(&mut encoder, &self.splats, planes)?;
+        if let Some(rates) = pose_rates {
+            let buffers = [self.renderer.pose_gradients(), &self.optimiser];
+            self.poses.encode(&gpu, &mut encoder, buffers, &rows, rates);
+        }
         if let Some(rates) = rates {
             self.update_splats(&mut encoder, options.sh_degree, rates, samples.len());
         }
@@ -341,6 +354,7 @@ impl TrainDevice for GpuDevice {
             // The device holds floats only. Rows change on the host alone, so its attributes still fit.
             state.splats = self.splats.download()?.with_attributes_of(&state.splats);
             state.exposures = self.exposures.download(&self.gpu)?;
+            state.poses = self.poses.download(&self.gpu)?;
         }
         if part >= StatePart::All {
             let (gpu, n, stride) = (&*self.gpu, self.splats.len(), self.splats.columns().stride());

@@ -51,7 +51,7 @@ pub(crate) struct ViewSample {
 pub(crate) enum StatePart {
     /// Last loss, errors of the epoch, number of skipped steps.
     Tally,
-    /// The splats, and the exposures in training.
+    /// The splats, and the exposures and poses in training.
     Splats,
     /// Everything that the next step depends on.
     All,
