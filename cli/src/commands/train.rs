@@ -24,7 +24,7 @@ use worker::speed::relative_speed;
 use worker::time_limit::TimeLimit;
 use worker::{PlanExecutor, Shared, TrainerOptions};
 
-use crate::args::{Backend, TrainArgs};
+use crate::args::TrainArgs;
 use crate::captures::ingest_photos;
 use crate::clock::Stopwatch;
 use crate::eval_results;
@@ -184,7 +184,7 @@ fn prepare(args: &TrainArgs, clock: &Stopwatch, output: &Output) -> Result<Prepa
     let source = captures::open_to_plan(&args.capture, &args.plan, output)?;
     // The plan is checked before any photo is read.
     let (planned_for, plan) = plan_of(&source, &args.plan)?;
-    let backend = backend_of(args)?;
+    let backend = backend::open(args.backend)?;
     let plan = Plan { backend: backend.name(), ..plan };
     check_plan(&plan, &planned_for, output)?;
     make_folder(&args.out)?;
@@ -255,11 +255,6 @@ fn time_limit_of(minutes: f64, clock: Stopwatch, plan: &Plan, workers: u32) -> T
     let seconds = 60.0 * minutes;
     let writing = SECONDS_PER_SPLAT * f64::from(plan.settings.budget);
     TimeLimit::new(clock, seconds - writing.min(0.1 * seconds), workers)
-}
-
-/// The backend that trains.
-fn backend_of(args: &TrainArgs) -> Result<train::Backend, BadInput> {
-    backend::open(args.backend)
 }
 
 /// The configuration file of a run, with the values that the plan chose for `auto`, and the file's hash.
