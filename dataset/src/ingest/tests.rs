@@ -27,6 +27,7 @@ fn source(folder: &Path, count: u32) -> Source {
         let photo = Photo {
             path: folder.join(&name),
             mask: None,
+            depth: None,
             model: model(),
             width: WIDTH,
             height: HEIGHT,
@@ -164,6 +165,7 @@ fn windows_are_crops_of_the_mips_and_the_cache_keeps_its_limit() {
         height: HEIGHT,
         rgb: crate::photo::planes(&photo.rgb),
         mask: None,
+        depth: None,
         weights: None,
         depth: None,
     };

@@ -163,6 +163,7 @@ impl Corpus {
         let frames = source.capture.views.iter().zip(&source.photos).map(|(view, photo)| Frame {
             file_path: format!("images/{}", view.name),
             mask_path: None,
+            depth_file_path: None,
             intrinsics: Intrinsics::from_model(&photo.model, Some((photo.width, photo.height))),
             camera_from_world: view.camera.camera_from_world,
         });
@@ -205,6 +206,7 @@ impl Corpus {
         let frames = (source.capture.views.iter().zip(&source.photos).enumerate()).map(|(i, (view, photo))| Frame {
             file_path: format!("images/{}", view.name),
             mask_path: (i == 1).then(|| "masks/a.png".to_string()),
+            depth_file_path: (i == 2).then(|| "depths/a.npy".to_string()),
             intrinsics: Intrinsics::from_model(&lens(i, &photo.model), (i % 2 == 0).then_some((48, 32))),
             camera_from_world: view.camera.camera_from_world,
         });

@@ -196,6 +196,7 @@ pub(crate) fn photo_codec(as_mask: bool) -> Read {
     let frame = |x: f64, mask: bool| Frame {
         file_path: if mask { "good.png" } else { "photo" }.into(),
         mask_path: mask.then(|| "photo".to_string()),
+        depth_file_path: None,
         intrinsics: Intrinsics::from_model(&CameraModel::Pinhole([90.0, 90.0, 50.0, 50.0]), None),
         camera_from_world: Rigid { rotation: DQuat::IDENTITY, translation: DVec3::new(x, 0.0, 0.0) },
     };
