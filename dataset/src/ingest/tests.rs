@@ -165,7 +165,6 @@ fn windows_are_crops_of_the_mips_and_the_cache_keeps_its_limit() {
         height: HEIGHT,
         rgb: crate::photo::planes(&photo.rgb),
         mask: None,
-        depth: None,
         weights: None,
         depth: None,
     };
