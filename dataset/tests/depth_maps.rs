@@ -123,7 +123,10 @@ fn relative_maps_are_aligned_to_the_sparse_points_of_each_view() {
         let (maps, count) = (found.depth_maps.maps, errors.len());
         println!("{kind:?}: {maps} maps, {count} targets, off by {} in the median, 95 %: {}", at(0.5), at(0.95));
         println!("left out: {:?}", found.depth_maps.left_out);
-        assert!(maps >= 18 && maps + found.depth_maps.left_out.len() == 24, "{:?}", found.depth_maps);
+        // Some street photos see too few of this small city's points.
+        let left_out = &found.depth_maps.left_out;
+        assert!(maps >= 12 && maps + left_out.len() == 24, "{left_out:?}");
+        assert!(left_out.iter().all(|(_, reason)| reason.contains("of 20 needed")), "{left_out:?}");
         assert!(at(0.95) < 0.01, "{kind:?}: {}", at(0.95));
         // The other kind does not fit, and a falling map is refused.
         let falling = capture.join("falling");
@@ -159,7 +162,7 @@ fn maps_are_found_where_the_capture_has_them_and_may_be_missing() {
     file.frames[0].depth_file_path = Some("../outside.npy".into());
     fs::write(&path, scene::transforms::write(&file)).unwrap();
     let line = ingested(&path, &store, &DepthMapOptions::default(), 1).unwrap_err();
-    assert!(line.contains("outside.npy lies outside of the capture"), "{line}");
+    assert!(line.contains("outside.npy: lies outside of the capture"), "{line}");
 
     let empty = capture.join("empty");
     fs::create_dir(&empty).unwrap();
