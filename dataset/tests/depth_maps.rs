@@ -132,7 +132,7 @@ fn relative_maps_are_aligned_to_the_sparse_points_of_each_view() {
         let falling = capture.join("falling");
         write_maps(&falling, &truth, |number, d| 1000.0 - value(number, d));
         let line = ingested(capture, &store, &maps_in(&falling, kind), 1).unwrap_err();
-        assert!(line.contains("falling has no depth map that can be aligned") && line.contains("fall"), "{line}");
+        assert!(line.contains("falling: has no depth map that can be aligned") && line.contains("fall"), "{line}");
     }
 }
 
@@ -169,7 +169,7 @@ fn maps_are_found_where_the_capture_has_them_and_may_be_missing() {
     let line = ingested(capture, &store, &maps_in(&empty, DepthKind::Metric), 1).unwrap_err();
     assert!(line.contains("has no depth map of any photo") && line.contains(names[0].as_str()), "{line}");
     let line = ingested(capture, &store, &maps_in(&capture.join("nowhere"), DepthKind::Metric), 1).unwrap_err();
-    assert!(line.contains("nowhere is not a folder"), "{line}");
+    assert!(line.contains("nowhere: is not a folder"), "{line}");
 }
 
 /// Whether the first frame of a file is the photo of this map.

@@ -86,7 +86,7 @@ impl Alignment {
         }
         let (scale, shift) = line;
         if scale <= 0.0 {
-            return Err("its values fall where the depths of sparse points ask them to rise".into());
+            return Err("its scale would be negative: its values fall where those of the sparse points rise".into());
         }
         let error = median_error(&pairs, line);
         if !(error <= MAX_MEDIAN_ERROR && scale.is_finite() && shift.is_finite()) {
