@@ -35,11 +35,11 @@ fn depth_maps_change_the_model_and_damaged_ones_are_refused() {
 
     let refuses = |words: &[&str], wanted: &str| refused(at, &[&job[..], &["--out", "x"], words].concat(), wanted);
     let deep = ["--depth-weight", "0.5"];
-    refuses(&["--depths", "maps"], "--depths has no effect without --depth-weight");
-    refuses(&["--depth-kind", "inverse"], "--depth-kind has no effect without --depth-weight");
+    refuses(&["--depths", "maps"], "--depths: has no effect without --depth-weight");
+    refuses(&["--depth-kind", "inverse"], "--depth-kind: has no effect without --depth-weight");
     refuses(
         &[&deep[..], &["--depth-unit", "2"]].concat(),
-        "--depth-unit is given for depth maps, and the capture has none",
+        "--depth-unit: is given for depth maps, and the capture has none",
     );
     refuses(
         &[&deep[..], &["--depths", "maps", "--depth-kind", "inverse", "--depth-unit", "2"]].concat(),
