@@ -33,7 +33,8 @@ fn depth_maps_change_the_model_and_damaged_ones_are_refused() {
         assert!(sparse != maps && maps == again, "{blocks}");
     }
 
-    let refuses = |words: &[&str], wanted: &str| refused(at, &[&job[..], &["--out", "x"], words].concat(), wanted);
+    let refuses =
+        |words: &[&str], wanted: &str| refused(at, &[&job[..], &["--quiet", "--out", "x"], words].concat(), wanted);
     let deep = ["--depth-weight", "0.5"];
     refuses(&["--depths", "maps"], "--depths: has no effect without --depth-weight");
     refuses(&["--depth-kind", "inverse"], "--depth-kind: has no effect without --depth-weight");

@@ -134,7 +134,7 @@ fn least_squares(pairs: &[Pair], weights: &[f64]) -> Option<(f64, f64)> {
         size += weight * pair.v * pair.v;
     }
     let scale = covariance / variance;
-    (variance > 1e-13 * size && scale.is_finite()).then(|| (scale, y - scale * v))
+    (variance > 1e-13 * size && scale.is_finite()).then_some((scale, y - scale * v))
 }
 
 fn median_error(pairs: &[Pair], line: (f64, f64)) -> f64 {
