@@ -26,7 +26,7 @@ pub(crate) use cluster::{
     TelemetryArgs, WorkerArgs,
 };
 pub(crate) use model::{EvalArgs, ExportArgs, Format, PruneArgs, PruneCapture, RenderArgs};
-pub(crate) use plan::{Blocks, PlanOptions, RESIDUAL};
+pub(crate) use plan::{Blocks, DepthKind, PlanOptions, RESIDUAL};
 pub(crate) use sweep::Named;
 pub(crate) use synth::{Rig, SynthArgs};
 pub(crate) use values::{Auto, Backend, Size};

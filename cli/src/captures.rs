@@ -2,6 +2,7 @@
 
 use std::path::Path;
 
+use dataset::depth_maps::DepthMapOptions;
 use dataset::ingest::{IngestOptions, Ingested, downscaled, ingest};
 use dataset::mips::MIN_MIP_SIDE;
 use dataset::open::{OpenOptions, Source};
@@ -10,7 +11,7 @@ use model::Model;
 use scene::{BadInput, Camera, Capture, Pinhole};
 use store::BlockingStore;
 
-use crate::args::PlanOptions;
+use crate::args::{DepthKind, PlanOptions};
 use crate::failure::Failure;
 use crate::observer::OutputObserver;
 use crate::output::Output;
@@ -23,9 +24,50 @@ pub(crate) fn open(path: &Path, output: &Output) -> Result<Source, BadInput> {
     open_with(path, &OpenOptions::default(), output)
 }
 
-/// Opens a capture to plan it with these options: also its lidar, from which initial points and target depths come.
+/// Opens a capture to plan it with these options: also its lidar, from which initial points and target depths come, and its depth
+/// maps if their targets are used.
 pub(crate) fn open_to_plan(path: &Path, options: &PlanOptions, output: &Output) -> Result<Source, BadInput> {
-    open_with(path, &OpenOptions { lidar: !options.no_lidar, ..OpenOptions::default() }, output)
+    let is_used = options.depth_weight > 0.0;
+    let depths = depth_maps(options)?.filter(|_| is_used);
+    let given = [
+        ("--depths", options.depths.is_some()),
+        ("--depth-kind", options.depth_kind != DepthKind::Metric),
+        ("--depth-unit", options.depth_unit.is_some()),
+    ];
+    let given = given.into_iter().find(|(_, is_given)| *is_given).map(|(name, _)| name);
+    if let Some(name) = given.filter(|_| !is_used) {
+        let advice = "give the weight of the depths' loss, such as --depth-weight 0.1";
+        return Err(BadInput::new(name, "has no effect without --depth-weight", advice));
+    }
+    let source = open_with(path, &OpenOptions { lidar: !options.no_lidar, depths, ..OpenOptions::default() }, output)?;
+    match given.filter(|_| source.depth_maps() == 0) {
+        Some(name) => {
+            Err(BadInput::new(name, "is given for depth maps, and the capture has none", "give their --depths"))
+        }
+        None => Ok(source),
+    }
+}
+
+/// Opens a capture to show what is in it: as [`open_to_plan`], and depth maps whether they are used or not.
+pub(crate) fn open_to_inspect(path: &Path, options: &PlanOptions) -> Result<Source, BadInput> {
+    let depths = depth_maps(options)?;
+    let options = OpenOptions { lidar: !options.no_lidar, depths, ..OpenOptions::default() };
+    open_with(path, &options, &Output::silent())
+}
+
+/// How to find depth maps, unless they are left out.
+fn depth_maps(options: &PlanOptions) -> Result<Option<DepthMapOptions>, BadInput> {
+    let kind = match options.depth_kind {
+        DepthKind::Metric => dataset::depth_maps::DepthKind::Metric,
+        DepthKind::Relative => dataset::depth_maps::DepthKind::Relative,
+        DepthKind::Inverse => dataset::depth_maps::DepthKind::Inverse,
+    };
+    if options.depth_unit.is_some() && options.depth_kind != DepthKind::Metric {
+        let problem = "is of metric depth maps; others get their scale from the sparse points";
+        return Err(BadInput::new("--depth-unit", problem, "leave it, or --depth-kind"));
+    }
+    let maps = DepthMapOptions { folder: options.depths.clone(), kind, unit: options.depth_unit };
+    Ok((!options.no_depths).then_some(maps))
 }
 
 fn open_with(path: &Path, options: &OpenOptions, output: &Output) -> Result<Source, BadInput> {
@@ -55,7 +97,16 @@ pub(crate) fn ingest_photos(
     let _traced = tracing::info_span!("ingest").entered();
     let threads = std::thread::available_parallelism().map_or(1, usize::from);
     let progress = output.progress("photos", source.photos.len() as u64);
-    Ok(ingest(source, store, &IngestOptions { downscale, threads }, &|done, _| progress.at(done as u64, ""))?)
+    let ingested =
+        ingest(source, store, &IngestOptions { downscale, threads }, &|done, _| progress.at(done as u64, ""))?;
+    let left_out = &ingested.depth_maps.left_out;
+    for (name, reason) in left_out.iter().take(MAX_LEFT_OUT) {
+        output.note(format!("left out the depth map of {name}: {reason}"));
+    }
+    if left_out.len() > MAX_LEFT_OUT {
+        output.note(format!("left out {} more depth maps", left_out.len() - MAX_LEFT_OUT));
+    }
+    Ok(ingested)
 }
 
 /// Ingests the photos that a model is measured on, with progress.

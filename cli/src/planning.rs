@@ -17,8 +17,8 @@ pub(crate) fn plan_of(source: &Source, options: &PlanOptions) -> Result<(Capture
     let id = ArtefactId::of(&frame::encode(dataset::ingest::CAPTURE, &capture, &[]));
     let settings = options.settings(&capture);
     if settings.depth_weight > 0.0 && !source.is_measured() && capture.points.seen_by.is_empty() {
-        let problem = "the capture has no lidar, and does not say which photos observed its sparse points: there are no \
-                       target depths";
+        let problem = "the capture has neither lidar nor depth maps, and does not say which photos observed its sparse \
+                       points: there are no target depths";
         return Err(BadInput::new("--depth-weight", problem, "leave it").into());
     }
     let plan = blocks::plan(&capture, id, &settings, &train::Backend::Cpu.name())?;

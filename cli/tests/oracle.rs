@@ -59,7 +59,8 @@ fn write_case(case: &BTreeMap<String, Vec<f64>>, folder: &Path) {
     let camera_from_world = Rigid { rotation: DQuat::from_mat3(&rotation), translation: DVec3::new(v[3], v[7], v[11]) };
     let size = (case["W"][0] as u32, case["H"][0] as u32);
     let intrinsics = Intrinsics::from_model(&CameraModel::Pinhole([k[0], k[4], k[2], k[5]]), Some(size));
-    let frame = Frame { file_path: "view.png".into(), mask_path: None, intrinsics, camera_from_world };
+    let frame =
+        Frame { file_path: "view.png".into(), mask_path: None, depth_file_path: None, intrinsics, camera_from_world };
     let transforms = Transforms { frames: vec![frame], ply_file_path: None };
     std::fs::write(folder.join("transforms.json"), scene::transforms::write(&transforms)).unwrap();
 }

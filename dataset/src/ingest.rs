@@ -7,6 +7,7 @@
 
 mod depths;
 mod error;
+mod from_map;
 
 use std::fs::File;
 use std::io::Read;
@@ -19,8 +20,9 @@ use scene::{ArtefactId, BadInput, Camera, CameraModel, Capture, Pinhole, Pixels,
 use serde::{Deserialize, Serialize};
 use store::{BlockingStore, StoreError};
 
-use self::depths::Lidar;
+use self::depths::Depths;
 pub use self::error::IngestError;
+pub use self::from_map::Used;
 use crate::open::{Photo, Source};
 use crate::photo::DecodedPhoto;
 use crate::undistortion::Undistorter;
@@ -51,8 +53,10 @@ pub struct Ingested {
     pub id: ArtefactId,
     /// Number of photos decoded; the others had an ingest record.
     pub decoded: usize,
-    /// Number of depths that lidar measured, in all views.
+    /// Number of depths from lidar and depth maps, in all views.
     pub depth_samples: usize,
+    /// The depth maps behind them.
+    pub depth_maps: Used,
 }
 
 /// Ingests all photos of a capture. `progress` is called with (photos done, photos in total) from any thread, one call at a
@@ -85,15 +89,17 @@ pub fn ingest(
     let decoded = views.iter().filter(|(_, decoded)| *decoded).count();
     let views = views.into_iter().map(|(view, _)| view).collect();
     let mut capture = Capture { views, points: source.capture.points.clone(), geo_origin: source.capture.geo_origin };
-    let lidar = Lidar::new(source);
-    let concerned: Vec<usize> = (0..photos.len()).filter(|&view| lidar.concerns(view)).collect();
-    let measured = in_threads(options.threads, concerned.len(), |i, _: &mut ()| {
+    let depths = Depths::new(source, options.downscale);
+    let concerned: Vec<usize> = (0..photos.len()).filter(|&view| depths.concerns(view)).collect();
+    let measured = in_threads(options.threads, concerned.len(), |i, undistorter: &mut LastUndistorter| {
         let view = concerned[i];
-        Ok::<_, IngestError>((view, lidar.measure(&capture, view, store)?))
+        Ok::<_, IngestError>((view, depths.measure(&capture, view, store, undistorter)?))
     })?;
-    let depth_samples = depths::enter(&mut capture, measured);
+    let (depth_samples, maps) = depths::enter(&mut capture, measured);
+    let names: Vec<&str> = capture.views.iter().map(|view| view.name.as_str()).collect();
+    let depth_maps = from_map::check(maps, photos, &names)?;
     let id = store.put(frame::encode(CAPTURE, &capture, &[]))?;
-    Ok(Ingested { capture, id, decoded, depth_samples })
+    Ok(Ingested { capture, id, decoded, depth_samples, depth_maps })
 }
 
 /// The results of `work` for 0 to `count` in order, computed by this many threads, each of which keeps a state.

@@ -6,11 +6,13 @@
 
 mod box_masks;
 pub mod byte_lru;
+pub mod depth_maps;
 pub mod depth_samples;
 pub mod ingest;
 pub mod lidar;
 pub mod mip_tiles;
 pub mod mips;
+mod observations;
 pub mod open;
 mod photo;
 pub mod synth;

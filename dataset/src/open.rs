@@ -8,6 +8,7 @@
 //! Missing photos are skipped and reported, because captures are often shared without all of them.
 
 mod colmap;
+mod depths;
 mod dgp;
 mod files;
 mod frustum_points;
@@ -30,6 +31,7 @@ use scene::{BadInput, Camera, CameraModel, Capture, GeoOrigin, Pinhole, View};
 use self::files::{CaptureRoot, Found};
 pub use self::parsed::OpenOptions;
 use self::parsed::{ParsedCapture, PosedImage};
+use crate::depth_maps::DepthFile;
 use crate::lidar::Sweep;
 use crate::lidar::seeds::{Seeds, seeds};
 use crate::undistortion;
@@ -47,6 +49,8 @@ pub struct Photo {
     pub width: u32,
     /// Height of the file in pixels.
     pub height: u32,
+    /// Its depth map, if it has one that is used.
+    pub depth: Option<DepthFile>,
     /// Boxes of moving objects, which are left out like masked pixels: corners in the camera's axes.
     pub moving: Vec<[DVec3; 8]>,
 }
@@ -72,9 +76,14 @@ pub struct Source {
 }
 
 impl Source {
-    /// Whether lidar measured depths of its views.
+    /// Whether its views have target depths from lidar or from depth maps.
     pub fn is_measured(&self) -> bool {
-        self.sweeps.iter().any(|sweep| !sweep.views.is_empty())
+        self.depth_maps() > 0 || self.sweeps.iter().any(|sweep| !sweep.views.is_empty())
+    }
+
+    /// The number of photos with a depth map.
+    pub fn depth_maps(&self) -> usize {
+        self.photos.iter().filter(|photo| photo.depth.is_some()).count()
     }
 }
 
@@ -148,7 +157,7 @@ fn parse(root: &CaptureRoot, path: &Path, options: &OpenOptions) -> Result<Parse
     }
     if files::has_photos(root) {
         let problem = "has photos but no camera poses";
-        let advice = "make them with COLMAP or pycolmap, which write sparse/0";
+        let advice = "make them with COLMAP or pycolmap, which write sparse/0; the chapter Captures of plat's book has the commands";
         return Err(BadInput::new(files::show(path), problem, advice));
     }
     let problem = "has neither a COLMAP model in sparse/0 nor a transforms.json, a reconstruction.json, or the files of DGP, \
@@ -167,8 +176,9 @@ fn find_photos(root: &CaptureRoot, mut images: Vec<PosedImage>, options: &OpenOp
         return Err(BadInput::new(format!("image {}", pair[0].name), "is in the capture twice", advice));
     }
     let masks = masks::folders(root);
+    let maps = options.depths.as_ref().map(|options| depths::Maps::new(root, options)).transpose()?;
     // All results first, then the first error by name, whichever thread is faster.
-    let photos: Vec<_> = images.par_iter().map(|image| photo(root, image, &masks, options)).collect();
+    let photos: Vec<_> = images.par_iter().map(|image| photo(root, image, &masks, maps.as_ref(), options)).collect();
     let (mut kept, mut found, mut left_out) = (Vec::new(), Vec::new(), Vec::new());
     for (image, photo) in images.into_iter().zip(photos) {
         match photo? {
@@ -184,7 +194,11 @@ fn find_photos(root: &CaptureRoot, mut images: Vec<PosedImage>, options: &OpenOp
             let problem = format!("has none of its {} images: {reason}", left_out.len());
             Err(BadInput::new(root.to_string(), problem, "put the photos there"))
         }
-        _ => Ok((kept, found, left_out)),
+        _ => {
+            let count = found.iter().filter(|photo: &&Photo| photo.depth.is_some()).count();
+            maps.map_or(Ok(()), |maps| maps.check(count, &kept))?;
+            Ok((kept, found, left_out))
+        }
     }
 }
 
@@ -193,6 +207,7 @@ fn photo(
     root: &CaptureRoot,
     image: &PosedImage,
     masks: &[&str],
+    maps: Option<&depths::Maps>,
     options: &OpenOptions,
 ) -> Result<Option<Photo>, BadInput> {
     let path = match root.image(&image.file)? {
@@ -207,6 +222,7 @@ fn photo(
                 model,
                 width,
                 height,
+                depth: None,
                 moving: Vec::new(),
             }));
         }
@@ -227,7 +243,8 @@ fn photo(
         },
         None => masks::find(root, masks, &image.file, &path, options),
     };
-    Ok(Some(Photo { path, mask, model, width, height, moving: image.moving.clone() }))
+    let depth = maps.map(|maps| maps.find(root, image)).transpose()?.flatten();
+    Ok(Some(Photo { path, mask, model, width, height, depth, moving: image.moving.clone() }))
 }
 
 /// The lens in pixels of a photo of this size. The photo may be a uniformly scaled copy of the camera's image; `None` for another

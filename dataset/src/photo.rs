@@ -81,7 +81,11 @@ pub(crate) fn planes(rgb: &[u8]) -> Vec<u8> {
     planes
 }
 
-fn open(bytes: &[u8], width: u32, height: u32) -> Result<DynamicImage, CodecError> {
+/// Decodes an image of this size.
+///
+/// # Errors
+/// As [`decode`].
+pub(crate) fn open(bytes: &[u8], width: u32, height: u32) -> Result<DynamicImage, CodecError> {
     let mut limits = Limits::default();
     limits.max_alloc = Some(DECODER_BYTES + 8 * u64::from(width) * u64::from(height));
     let mut reader = ImageReader::new(Cursor::new(bytes)).with_guessed_format().map_err(|e| damaged(&e))?;

@@ -205,7 +205,7 @@ impl Undistorter {
     }
 
     /// The position in the photo of a position in the ideal image, both in pixels.
-    fn source(&self, ideal: DVec2) -> DVec2 {
+    pub(crate) fn source(&self, ideal: DVec2) -> DVec2 {
         let [fx, fy, cx, cy] = self.model.focal_and_centre();
         let k = &self.pinhole;
         let bent = self.model.distort(DVec2::new((ideal.x - k.cx) / k.fx, (ideal.y - k.cy) / k.fy));

@@ -29,7 +29,7 @@ pub struct View {
     pub mips: Vec<ArtefactId>,
     /// True if the view has a mask. Its mips then have a fourth channel: 255 = use, 0 = leave out.
     pub masked: bool,
-    /// Artefact of the depths that lidar measured in this view, if any. `None` before ingest.
+    /// Artefact of the view's target depths from lidar and depth maps, if any. `None` before ingest.
     pub depth: Option<ArtefactId>,
 }
 

@@ -35,6 +35,8 @@ pub struct Frame {
     pub file_path: String,
     /// Path of the mask as in the file.
     pub mask_path: Option<String>,
+    /// Path of the depth map as in the file.
+    pub depth_file_path: Option<String>,
     /// Intrinsics as far as the file has them.
     pub intrinsics: Intrinsics,
     /// Pose: OpenCV camera axes from world axes.
@@ -125,7 +127,8 @@ pub fn read(bytes: &[u8]) -> Result<Transforms, CodecError> {
         };
         let intrinsics = frame.lens().or(&shared).resolve().map_err(named)?;
         let camera_from_world = pose(&frame.transform_matrix).map_err(named)?;
-        frames.push(Frame { file_path: frame.file_path, mask_path: frame.mask_path, intrinsics, camera_from_world });
+        let FileFrame { file_path, mask_path, depth_file_path, .. } = frame;
+        frames.push(Frame { file_path, mask_path, depth_file_path, intrinsics, camera_from_world });
     }
     Ok(Transforms { frames, ply_file_path: file.ply_file_path })
 }
@@ -134,8 +137,8 @@ pub fn read(bytes: &[u8]) -> Result<Transforms, CodecError> {
 /// [`read`] refuses or treats as missing.
 pub fn write(transforms: &Transforms) -> Vec<u8> {
     let frames = transforms.frames.iter().map(|frame| {
-        let (file_path, mask_path) = (frame.file_path.clone(), frame.mask_path.clone());
-        FileFrame::new(file_path, mask_path, Lens::of(&frame.intrinsics), matrix(&frame.camera_from_world))
+        let paths = (frame.file_path.clone(), frame.mask_path.clone(), frame.depth_file_path.clone());
+        FileFrame::new(paths, Lens::of(&frame.intrinsics), matrix(&frame.camera_from_world))
     });
     let file = File::new(Lens::default(), transforms.ply_file_path.clone(), frames.collect());
     serde_json::to_vec_pretty(&file).expect("text and numbers always serialise")
@@ -195,6 +198,8 @@ macro_rules! lens {
             file_path: String,
             #[serde(skip_serializing_if = "Option::is_none")]
             mask_path: Option<String>,
+            #[serde(skip_serializing_if = "Option::is_none")]
+            depth_file_path: Option<String>,
             $(#[serde(skip_serializing_if = "Option::is_none")] $field: Option<$type>,)*
             transform_matrix: Vec<[f64; 4]>,
         }
@@ -216,8 +221,12 @@ macro_rules! lens {
         }
 
         impl FileFrame {
-            fn new(file_path: String, mask_path: Option<String>, lens: Lens, transform_matrix: Vec<[f64; 4]>) -> Self {
-                Self { file_path, mask_path, $($field: lens.$field,)* transform_matrix }
+            fn new(
+                (file_path, mask_path, depth_file_path): (String, Option<String>, Option<String>),
+                lens: Lens,
+                transform_matrix: Vec<[f64; 4]>,
+            ) -> Self {
+                Self { file_path, mask_path, depth_file_path, $($field: lens.$field,)* transform_matrix }
             }
 
             fn lens(&self) -> Lens {

@@ -1,11 +1,13 @@
 //! Options that decide the plan of a capture.
 
+use std::path::PathBuf;
+
 use blocks::{Mode, PlanSettings};
 use clap::{Args, ValueEnum};
 use scene::Capture;
 use serde::Serialize;
 
-use super::values::{Auto, decibels, metres_or_none, residual, views_per_step, weight};
+use super::values::{Auto, decibels, metres, metres_or_none, residual, views_per_step, weight};
 
 /// How the scene is divided.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum, Serialize)]
@@ -17,6 +19,19 @@ pub(crate) enum Blocks {
     Flat,
     /// One block
     Whole,
+}
+
+/// What the values of depth maps are.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, ValueEnum, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub(crate) enum DepthKind {
+    /// Depths along the optical axis in metres or --depth-unit
+    #[default]
+    Metric,
+    /// Depths of an unknown scale and shift: fitted to the sparse points of each photo
+    Relative,
+    /// Inverse depths (disparity) of an unknown scale and shift: fitted to the sparse points of each photo
+    Inverse,
 }
 
 /// Default of `--residual`.
@@ -71,13 +86,28 @@ pub(crate) struct PlanOptions {
     /// Label each splat with the block that trained it, as the integer property `block` of merged.ply
     #[arg(long)]
     pub(crate) label_blocks: bool,
-    /// Weight of a loss that compares rendered depths with those that lidar and the sparse points give for the photo. It keeps splats
-    /// from floating where few photos overlap; 0 leaves it out
+    /// Weight of a loss that compares rendered depths with those that lidar, depth maps and the sparse points give for the photo. It
+    /// keeps splats from floating where few photos overlap; 0 leaves it out
     #[arg(long, value_name = "W", value_parser = weight, default_value_t = 0.0)]
     pub(crate) depth_weight: f64,
     /// Leave out the capture's lidar: its sweeps give neither target depths nor initial points
     #[arg(long)]
     pub(crate) no_lidar: bool,
+    /// Folder of depth maps, named like the photos: NAME.npy (floats) or NAME.png (16-bit grey), 0 for no depth. By default those
+    /// that transforms.json names, or the capture's folder `depths`. Used with --depth-weight
+    #[arg(long, value_name = "DIR", conflicts_with = "no_depths")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(crate) depths: Option<PathBuf>,
+    /// What the values of depth maps are
+    #[arg(long, value_enum, default_value = "metric", conflicts_with = "no_depths")]
+    pub(crate) depth_kind: DepthKind,
+    /// Metres that a value of 1 in a metric depth map stands for; by default 1 in npy files and 0.001 in PNG files. KITTI's is 0.00390625
+    #[arg(long, value_name = "METRES", value_parser = metres, conflicts_with = "no_depths")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(crate) depth_unit: Option<f64>,
+    /// Leave out the capture's depth maps
+    #[arg(long)]
+    pub(crate) no_depths: bool,
     /// After training, measure the merged model on the held-out photos in tasks of the job, which any worker can take. The
     /// figures are those of `plat eval`, without the contact sheet; they go to OUT/eval/report.json
     #[arg(long)]

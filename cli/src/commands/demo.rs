@@ -13,7 +13,7 @@ use scene::Capture;
 use serde::Serialize;
 use store::Store;
 
-use crate::args::{Auto, Backend, Blocks, DemoArgs, PlanOptions, TrainArgs};
+use crate::args::{Auto, Backend, Blocks, DemoArgs, DepthKind, PlanOptions, TrainArgs};
 use crate::commands::eval::measure_trained;
 use crate::commands::train::{Report, train};
 use crate::failure::Failure;
@@ -140,6 +140,10 @@ pub(crate) fn settings(args: &DemoArgs) -> (Settings, TrainArgs) {
             label_blocks: false,
             depth_weight: 0.0,
             no_lidar: true,
+            depths: None,
+            depth_kind: DepthKind::Metric,
+            depth_unit: None,
+            no_depths: true,
             test_stretches: 0.0,
             evaluate: false,
             test_every: 8,

@@ -37,6 +37,8 @@ struct Inspected {
     views_with_lidar: usize,
     /// How many of the points come from lidar.
     lidar_points: usize,
+    /// Photos with a depth map.
+    depth_maps: usize,
     /// Number of annotated boxes by class.
     boxes: BTreeMap<String, usize>,
     left_out: Vec<(String, String)>,
@@ -67,7 +69,7 @@ struct Shown {
 }
 
 pub(crate) fn run(args: &InspectArgs, output: &Output) -> Result<(), Failure> {
-    let source = captures::open_to_plan(&args.capture, &args.plan, &Output::silent())?;
+    let source = captures::open_to_inspect(&args.capture, &args.plan)?;
     let planned = plan_of(&source, &args.plan);
     let planned = planned.and_then(|(capture, plan)| {
         check_plan(&plan, &capture, output)?;
@@ -98,6 +100,7 @@ pub(crate) fn run(args: &InspectArgs, output: &Output) -> Result<(), Failure> {
         sweeps: source.sweeps.len(),
         views_with_lidar: source.sweeps.iter().flat_map(|sweep| &sweep.views).collect::<BTreeSet<_>>().len(),
         lidar_points: source.seeds.len(),
+        depth_maps: source.depth_maps(),
         boxes: source.labels,
         left_out: source.left_out,
         extent_metres: extent_metres(capture),
@@ -129,6 +132,9 @@ fn text(found: &Inspected, plan: Option<&Plan>) -> String {
         text += &format!(
             "{sweeps} sweeps of a lidar, taken with {views} of the views; {points} of the points come from them\n"
         );
+    }
+    if found.depth_maps > 0 {
+        text += &format!("depth maps of {} of the views, for --depth-weight\n", found.depth_maps);
     }
     if !found.boxes.is_empty() {
         let boxes: Vec<String> = found.boxes.iter().map(|(class, count)| format!("{count} {class}")).collect();

@@ -1,17 +1,20 @@
-//! Measured depths of the views and the colours of points from lidar, from the photos in the store.
+//! Target depths of the views from lidar and depth maps, and the colours of points from lidar, with the photos in the store.
 
 use std::collections::BTreeMap;
 
+use glam::DVec2;
 use scene::{ArtefactId, BadInput, Capture, Pixels, View};
 use store::BlockingStore;
 
+use super::LastUndistorter;
 use super::error::IngestError;
+use super::from_map::{FromMap, Maps};
 use crate::depth_samples::DepthSamples;
 use crate::lidar::{Sweep, visible};
 use crate::mip_tiles::MipLayout;
 use crate::open::Source;
 
-/// What lidar adds to a view.
+/// What lidar and its depth map add to a view.
 #[derive(Default)]
 pub(super) struct Measured {
     depth: Option<ArtefactId>,
@@ -19,19 +22,22 @@ pub(super) struct Measured {
     samples: usize,
     /// Colours of the points that this view colours; `None` for those on excluded pixels.
     colours: Vec<(u32, Option<[u8; 3]>)>,
+    /// What became of its depth map.
+    map: Option<FromMap>,
 }
 
-/// The sweeps and the points from lidar, by view.
-pub(super) struct Lidar<'a> {
+/// The sweeps, the points from lidar and the depth maps, by view.
+pub(super) struct Depths<'a> {
     sweeps: &'a [Sweep],
     /// The sweeps taken during a view.
     of_view: Vec<Vec<u32>>,
     /// The points that a view colours, as indices of the capture's points.
     coloured_by: BTreeMap<u32, Vec<u32>>,
+    maps: Maps<'a>,
 }
 
-impl<'a> Lidar<'a> {
-    pub(super) fn new(source: &'a Source) -> Self {
+impl<'a> Depths<'a> {
+    pub(super) fn new(source: &'a Source, downscale: u32) -> Self {
         let mut of_view = vec![Vec::new(); source.capture.views.len()];
         for (sweep, Sweep { views, .. }) in (0..).zip(&source.sweeps) {
             views.iter().for_each(|&view| of_view[view as usize].push(sweep));
@@ -41,56 +47,93 @@ impl<'a> Lidar<'a> {
         for (point, &view) in (first..).zip(&source.seeds) {
             coloured_by.entry(view).or_default().push(point);
         }
-        Self { sweeps: &source.sweeps, of_view, coloured_by }
+        Self { sweeps: &source.sweeps, of_view, coloured_by, maps: Maps::new(source, downscale) }
     }
 
     /// Whether there is anything to do for a view.
     pub(super) fn concerns(&self, view: usize) -> bool {
+        self.has_lidar(view) || self.maps.has(view)
+    }
+
+    fn has_lidar(&self, view: usize) -> bool {
         !self.of_view[view].is_empty() || self.coloured_by.contains_key(&(view as u32))
     }
 
-    /// Projects sweeps and points into an ingested view.
+    /// Projects sweeps and points into an ingested view, and reads its depth map. Lidar comes before the map where both have a depth.
     ///
     /// # Errors
-    /// A sweep that cannot be read, or a failing store.
+    /// A sweep or a map that cannot be read, or a failing store.
     pub(super) fn measure(
         &self,
         capture: &Capture,
         number: usize,
         store: &BlockingStore,
+        last_undistorter: &mut LastUndistorter,
     ) -> Result<Measured, IngestError> {
         let view = &capture.views[number];
-        let pixels = finest(view, store)?;
-        let is_used =
-            |x: u32, y: u32| pixels.mask.as_ref().is_none_or(|mask| mask[(y * pixels.width + x) as usize] >= 128);
+        let (width, height) = (view.camera.pinhole.width, view.camera.pinhole.height);
+        let has_lidar = self.has_lidar(number);
+        let pixels = (has_lidar || view.masked).then(|| finest(view, store)).transpose()?;
+        let mask = pixels.as_ref().and_then(|pixels| pixels.mask.as_deref());
+        let is_used = |x: u32, y: u32| mask.is_none_or(|mask| mask[y as usize * width as usize + x as usize] >= 128);
         let mut returns = Vec::new();
         for &sweep in &self.of_view[number] {
             returns.extend(self.sweeps[sweep as usize].read()?.into_iter().map(|found| found.place));
         }
         let seen = visible(&view.camera, (0..).zip(returns));
-        let seen = seen.into_iter().filter(|s| is_used(s.x, s.y)).map(|s| (s.x, s.y, s.depth));
-        let depths = DepthSamples::new(pixels.width, pixels.height, seen);
+        let mut seen: Vec<(u32, u32, f32)> =
+            seen.into_iter().filter(|s| is_used(s.x, s.y)).map(|s| (s.x, s.y, s.depth)).collect();
+        let map = self.maps.measure(capture, number, &is_used, last_undistorter)?;
+        let mut held: Vec<(u32, u32)> = seen.iter().map(|&(x, y, _)| (y, x)).collect();
+        held.sort_unstable();
+        let map = map.map(|mut map| {
+            let samples = std::mem::take(&mut map.samples).into_iter();
+            seen.extend(samples.filter(|&(x, y, _)| held.binary_search(&(y, x)).is_err()));
+            map
+        });
+        let depths = DepthSamples::new(width, height, seen.into_iter());
         let depth = if depths.is_empty() { None } else { Some(store.put(depths.encode())?) };
+        let colours = match &pixels {
+            Some(pixels) if has_lidar => self.colours(capture, number, pixels, is_used),
+            _ => Vec::new(),
+        };
+        Ok(Measured { depth, samples: depths.len(), colours, map })
+    }
+
+    /// The colours of the points that a view colours.
+    fn colours(
+        &self,
+        capture: &Capture,
+        number: usize,
+        pixels: &Pixels,
+        is_used: impl Fn(u32, u32) -> bool,
+    ) -> Vec<(u32, Option<[u8; 3]>)> {
+        let camera = &capture.views[number].camera;
         let colour = |&point: &u32| {
-            let (at, _) = view.camera.project(capture.points.positions[point as usize]);
-            let side = |v: f64, side: u32| (v.max(0.0) as u32).min(side - 1);
-            let (x, y) = (side(at.x, pixels.width), side(at.y, pixels.height));
+            let (at, _) = camera.project(capture.points.positions[point as usize]);
+            let (x, y) = pixel_at(at, pixels.width, pixels.height);
             let channel = |c: usize| pixels.rgb[c * pixels.area() + (y * pixels.width + x) as usize];
             (point, is_used(x, y).then(|| [0, 1, 2].map(channel)))
         };
-        let colours = self.coloured_by.get(&(number as u32)).into_iter().flatten().map(colour).collect();
-        Ok(Measured { depth, samples: depths.len(), colours })
+        self.coloured_by.get(&(number as u32)).into_iter().flatten().map(colour).collect()
     }
 }
 
-/// Enters what lidar adds into the capture: depths, and colours of points. Points on excluded pixels are removed, as they lie on
-/// moving objects. Returns the number of depth samples.
-pub(super) fn enter(capture: &mut Capture, measured: Vec<(usize, Measured)>) -> usize {
+/// The pixel at a position, the nearest one outside of the image.
+fn pixel_at(at: DVec2, width: u32, height: u32) -> (u32, u32) {
+    let side = |v: f64, side: u32| (v.max(0.0) as u32).min(side - 1);
+    (side(at.x, width), side(at.y, height))
+}
+
+/// Enters what was measured into the capture: depths, and colours of points. Points on excluded pixels are removed, as they lie on
+/// moving objects. Returns the number of depth samples, and what became of the depth map of each view that has one.
+pub(super) fn enter(capture: &mut Capture, measured: Vec<(usize, Measured)>) -> (usize, Vec<(usize, FromMap)>) {
     let mut removed = vec![false; capture.points.len()];
-    let mut samples = 0;
+    let (mut samples, mut maps) = (0, Vec::new());
     for (view, measured) in measured {
         capture.views[view].depth = measured.depth;
         samples += measured.samples;
+        maps.extend(measured.map.map(|map| (view, map)));
         for (point, colour) in measured.colours {
             match colour {
                 Some(colour) => capture.points.colours[point as usize] = colour,
@@ -101,7 +144,7 @@ pub(super) fn enter(capture: &mut Capture, measured: Vec<(usize, Measured)>) -> 
     if removed.contains(&true) {
         capture.points = capture.points.filter(|i| !removed[i]);
     }
-    samples
+    (samples, maps)
 }
 
 /// Mip 0 of an ingested view.

@@ -27,6 +27,7 @@ fn source(folder: &Path, count: u32) -> Source {
         let photo = Photo {
             path: folder.join(&name),
             mask: None,
+            depth: None,
             model: model(),
             width: WIDTH,
             height: HEIGHT,

@@ -44,6 +44,7 @@ pub(super) fn read(root: &CaptureRoot, folder: &str, options: &OpenOptions) -> R
             file: format!("{photos}{}", image.name),
             name: image.name,
             mask: None,
+            depth: None,
             intrinsics: Intrinsics::from_model(&camera.model, size),
             camera_from_world: image.camera_from_world,
             moving: Vec::new(),

@@ -59,6 +59,7 @@ pub(super) fn read(root: &CaptureRoot, path: &Path, options: &OpenOptions) -> Re
                 name: photo.file.clone(),
                 file: photo.file.clone(),
                 mask: None,
+                depth: None,
                 intrinsics: Intrinsics::from_model(model, Some(photo.size).filter(|size| size.0 > 0)),
                 camera_from_world: photo.world_from_sensor.inverse(),
                 moving: Vec::new(),

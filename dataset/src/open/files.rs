@@ -131,3 +131,12 @@ pub(super) fn read(path: &Path) -> Result<Vec<u8>, BadInput> {
 pub(super) fn show(path: &Path) -> String {
     path.display().to_string()
 }
+
+/// The name of a photo without `images/` and extension.
+pub(super) fn stem(name: &str) -> &str {
+    let name = name.strip_prefix("images/").unwrap_or(name);
+    match name.rsplit_once('.') {
+        Some((stem, extension)) if !extension.contains('/') => stem,
+        _ => name,
+    }
+}

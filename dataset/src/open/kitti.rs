@@ -85,6 +85,7 @@ pub(super) fn read(root: &CaptureRoot, of: &Sequence, options: &OpenOptions) -> 
                 name,
                 file,
                 mask: None,
+                depth: None,
                 intrinsics: Intrinsics::from_model(model, None),
                 camera_from_world: from_first.compose(&world_from_first.inverse()),
                 moving: Vec::new(),

@@ -81,6 +81,7 @@ pub(super) fn read(root: &CaptureRoot, options: &OpenOptions) -> Result<ParsedCa
                     name: format!("{drive}/{camera}/{frame:010}.png"),
                     file,
                     mask: None,
+                    depth: None,
                     intrinsics: Intrinsics::from_model(&lens.model, Some((lens.width, lens.height))),
                     camera_from_world: world_from_camera.inverse(),
                     moving: Vec::new(),

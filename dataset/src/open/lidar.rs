@@ -11,7 +11,7 @@ use rayon::prelude::*;
 use scene::lidar::{self, SweepPose};
 use scene::{BadInput, View};
 
-use super::files::{self, CaptureRoot, Found};
+use super::files::{self, CaptureRoot, Found, stem};
 use super::parsed::{ParsedSweep, PosedImage};
 use crate::lidar::{PointFormat, Sweep};
 
@@ -74,13 +74,4 @@ pub(super) fn with_views(parsed: Vec<ParsedSweep>, images: &[PosedImage]) -> Vec
         Sweep { path, format, readings: None, world_from_sensor, turn: None, views }
     };
     parsed.into_iter().map(sweep).collect()
-}
-
-/// The name of a photo without `images/` and extension.
-fn stem(name: &str) -> &str {
-    let name = name.strip_prefix("images/").unwrap_or(name);
-    match name.rsplit_once('.') {
-        Some((stem, extension)) if !extension.contains('/') => stem,
-        _ => name,
-    }
 }

@@ -27,6 +27,7 @@ pub(super) fn read(root: &CaptureRoot, path: &Path) -> Result<ParsedCapture, Bad
         file: format!("{folder}{}", shot.name),
         name: shot.name,
         mask: None,
+        depth: None,
         intrinsics: Intrinsics::from_model(&shot.camera.model, Some((shot.camera.width, shot.camera.height))),
         camera_from_world: shot.camera_from_world,
         moving: Vec::new(),

@@ -7,6 +7,7 @@ use glam::DVec3;
 use scene::transforms::Intrinsics;
 use scene::{GeoOrigin, Rigid, SparsePoints};
 
+use crate::depth_maps::DepthMapOptions;
 use crate::lidar::PointFormat;
 
 /// How to open a capture.
@@ -18,6 +19,8 @@ pub struct OpenOptions {
     pub cameras_only: bool,
     /// Uses the capture's lidar: sweeps give target depths and initial points.
     pub lidar: bool,
+    /// Finds depth maps in files, which give target depths. `None` leaves them out.
+    pub depths: Option<DepthMapOptions>,
 }
 
 /// A capture as parsed from its files, before its photos are found.
@@ -58,6 +61,8 @@ pub(super) struct PosedImage {
     pub(super) file: String,
     /// Path of its mask, relative to the capture, if the capture names one.
     pub(super) mask: Option<String>,
+    /// Path of its depth map, relative to the capture, if the capture names one.
+    pub(super) depth: Option<String>,
     pub(super) intrinsics: Intrinsics,
     pub(super) camera_from_world: Rigid,
     /// Boxes of moving objects, which are left out of the photo: corners in the camera's axes.

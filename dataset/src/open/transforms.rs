@@ -44,6 +44,7 @@ pub(super) fn read(root: &CaptureRoot, paths: &[PathBuf]) -> Result<ParsedCaptur
                 file: name.clone(),
                 name,
                 mask: frame.mask_path,
+                depth: frame.depth_file_path,
                 intrinsics: frame.intrinsics,
                 camera_from_world: frame.camera_from_world,
                 moving: Vec::new(),

@@ -51,6 +51,7 @@ fn frames(shots: &[Shot], masks: bool, camera: impl Fn(&Shot) -> Camera) -> Tran
         Frame {
             file_path: format!("images/{}.png", shot.name),
             mask_path: masks.then(|| format!("masks/{}.png", shot.name)),
+            depth_file_path: None,
             intrinsics: Intrinsics::from_model(&model, Some((k.width, k.height))),
             camera_from_world,
         }

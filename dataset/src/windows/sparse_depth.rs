@@ -2,30 +2,15 @@
 
 use scene::{Capture, Rect};
 
-/// The sparse points that each view observed. Takes four bytes per observation, like the capture's tracks.
+use crate::observations::Observations;
+
+/// Depths of the sparse points that each view observed.
 #[derive(Debug)]
-pub(super) struct SparseDepth {
-    /// View `v` observed `points[start[v] .. start[v + 1]]`.
-    start: Vec<u32>,
-    points: Vec<u32>,
-}
+pub(super) struct SparseDepth(Observations);
 
 impl SparseDepth {
-    /// Inverts the tracks of a capture. A capture without tracks gives no observations.
     pub(super) fn new(capture: &Capture) -> Self {
-        let tracks = || (0..capture.points.len()).filter_map(|i| Some((i as u32, capture.points.track(i)?)));
-        let mut start = vec![0u32; capture.views.len() + 1];
-        tracks().flat_map(|(_, views)| views).for_each(|&view| start[view as usize + 1] += 1);
-        (1..start.len()).for_each(|view| start[view] += start[view - 1]);
-        let mut next = start.clone();
-        let mut points = vec![0; capture.points.seen_by.len()];
-        for (point, views) in tracks() {
-            for &view in views {
-                points[next[view as usize] as usize] = point;
-                next[view as usize] += 1;
-            }
-        }
-        Self { start, points }
+        Self(Observations::new(capture))
     }
 
     /// Depths in metres of the view's points in a window of a mip, 0 elsewhere. The nearest point of a pixel wins. Empty if
@@ -34,8 +19,7 @@ impl SparseDepth {
         let camera = capture.views[view as usize].camera.mip(mip).window(rect);
         let (width, height) = (f64::from(rect.width), f64::from(rect.height));
         let mut plane = Vec::new();
-        let range = self.start[view as usize] as usize..self.start[view as usize + 1] as usize;
-        for &point in &self.points[range] {
+        for &point in self.0.of(view as usize) {
             let (pixel, depth) = camera.project(capture.points.positions[point as usize]);
             if !(depth > 0.0 && (0.0..width).contains(&pixel.x) && (0.0..height).contains(&pixel.y)) {
                 continue;

@@ -10,7 +10,7 @@ use dataset::mip_tiles;
 use dataset::open::{self, OpenOptions};
 use dataset::synth::{self, Settings};
 use glam::Vec3;
-use image::{DynamicImage, ImageFormat, Rgb, RgbImage, Rgba, RgbaImage};
+use image::{DynamicImage, ImageFormat, Luma, Rgb, RgbImage, Rgba, RgbaImage};
 use scene::frame;
 use scene::transforms::{Frame, Intrinsics, Transforms};
 use scene::{CameraModel, Exposure, Exposures, Pixels, Splat, Splats};
@@ -163,6 +163,7 @@ impl Corpus {
         let frames = source.capture.views.iter().zip(&source.photos).map(|(view, photo)| Frame {
             file_path: format!("images/{}", view.name),
             mask_path: None,
+            depth_file_path: None,
             intrinsics: Intrinsics::from_model(&photo.model, Some((photo.width, photo.height))),
             camera_from_world: view.camera.camera_from_world,
         });
@@ -205,6 +206,7 @@ impl Corpus {
         let frames = (source.capture.views.iter().zip(&source.photos).enumerate()).map(|(i, (view, photo))| Frame {
             file_path: format!("images/{}", view.name),
             mask_path: (i == 1).then(|| "masks/a.png".to_string()),
+            depth_file_path: (i == 2).then(|| "depths/a.npy".to_string()),
             intrinsics: Intrinsics::from_model(&lens(i, &photo.model), (i % 2 == 0).then_some((48, 32))),
             camera_from_world: view.camera.camera_from_world,
         });
@@ -256,6 +258,13 @@ impl Corpus {
         }
         let alpha = RgbaImage::from_fn(PHOTO_SIZE.0, PHOTO_SIZE.1, |x, y| Rgba([x as u8, y as u8, 9, (x + y) as u8]));
         self.photo("photo with alpha", encoded(alpha, ImageFormat::Png), &photo);
+        let (width, height) = PHOTO_SIZE;
+        let depths: Vec<f32> = (0..width * height).map(|i| 3.0 + 0.01 * (i % 700) as f32).collect();
+        let map = npy::write_f32(&[height as usize, width as usize], &depths);
+        self.put("depth map, npy", map, &depth_map_codec("npy", "map.npy"), Seal::None, PHOTO);
+        let map = image::ImageBuffer::from_fn(width, height, |x, y| Luma([(900 + 31 * x * y) as u16]));
+        let map = encoded(DynamicImage::ImageLuma16(map), ImageFormat::Png);
+        self.photo("depth map, PNG", map, &depth_map_codec("image", "map.png"));
         self.photo("mask", encoded(DynamicImage::from(image).to_luma8(), ImageFormat::Png), &mask);
     }
 }

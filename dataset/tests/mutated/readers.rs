@@ -3,6 +3,8 @@
 use std::fs;
 use std::rc::Rc;
 
+use dataset::depth_maps::DepthMapOptions;
+use dataset::depth_samples::DepthSamples;
 use dataset::ingest::{self, IngestOptions};
 use dataset::mip_tiles;
 use dataset::open::{self, OpenOptions};
@@ -196,6 +198,7 @@ pub(crate) fn photo_codec(as_mask: bool) -> Read {
     let frame = |x: f64, mask: bool| Frame {
         file_path: if mask { "good.png" } else { "photo" }.into(),
         mask_path: mask.then(|| "photo".to_string()),
+        depth_file_path: None,
         intrinsics: Intrinsics::from_model(&CameraModel::Pinhole([90.0, 90.0, 50.0, 50.0]), None),
         camera_from_world: Rigid { rotation: DQuat::IDENTITY, translation: DVec3::new(x, 0.0, 0.0) },
     };
@@ -212,6 +215,39 @@ pub(crate) fn photo_codec(as_mask: bool) -> Read {
         let ingested = ingest::ingest(&source, &store, &options, &|_, _| ()).map_err(|error| error.to_string())?;
         let loaded = ingest::load_capture(&store, ingested.id).map_err(|error| error.to_string())?;
         assert_eq!(loaded, ingested.capture);
+        Ok(())
+    })
+}
+
+/// Opens and ingests a capture whose photo has the file as its depth map, under this name.
+pub(crate) fn depth_map_codec(target: &'static str, name: &'static str) -> Read {
+    let folder = tempfile::tempdir().expect("a folder");
+    let frame = Frame {
+        file_path: "photo.png".into(),
+        mask_path: None,
+        depth_file_path: Some(name.into()),
+        intrinsics: Intrinsics::from_model(&CameraModel::Pinhole([90.0, 90.0, 40.0, 30.0]), None),
+        camera_from_world: Rigid::IDENTITY,
+    };
+    let file = Transforms { frames: vec![frame], ply_file_path: Some("cloud.ply".into()) };
+    fs::write(folder.path().join("transforms.json"), transforms::write(&file)).expect("written");
+    fs::write(folder.path().join("cloud.ply"), CLOUD).expect("written");
+    let photo = encoded(RgbImage::new(PHOTO_SIZE.0, PHOTO_SIZE.1), ImageFormat::Png);
+    fs::write(folder.path().join("photo.png"), photo).expect("written");
+    Reader::new(target, move |bytes| {
+        fs::write(folder.path().join(name), bytes).expect("written");
+        let depths = Some(DepthMapOptions::default());
+        let source = open::open(folder.path(), &OpenOptions { depths, ..OpenOptions::default() })
+            .map_err(|error| error.to_string())?;
+        assert_eq!(source.depth_maps(), 1);
+        let store = Store::open("memory://").expect("memory").blocking();
+        let options = IngestOptions { downscale: 1, threads: 1 };
+        let ingested = ingest::ingest(&source, &store, &options, &|_, _| ()).map_err(|error| error.to_string())?;
+        if let Some(id) = ingested.capture.views[0].depth {
+            let bytes = store.get(id).expect("it was stored");
+            let depths = DepthSamples::decode(&bytes, PHOTO_SIZE.0, PHOTO_SIZE.1).map_err(|error| error.to_string())?;
+            assert!(depths.iter().all(|(_, _, depth)| depth > 0.0 && depth.is_finite()));
+        }
         Ok(())
     })
 }

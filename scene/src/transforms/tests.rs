@@ -28,8 +28,10 @@ fn opengl_axes_become_opencv_axes() {
 fn frame_intrinsics_override_those_of_the_file() {
     let shared =
         r#""w": 100, "h": 50.0, "fl_x": 80, "fl_y": 81, "cx": 49, "k1": 0.1, "p2": 0.2, "k4": 0, "other": {},"#;
-    let taken = frame(shared, r#""mask_path": "m.png", "fl_x": 90, "cy": 20, "k1": null,"#).unwrap();
+    let taken = frame(shared, r#""mask_path": "m.png", "depth_file_path": "d.npy", "fl_x": 90, "cy": 20, "k1": null,"#)
+        .unwrap();
     assert_eq!((taken.file_path.as_str(), taken.mask_path.as_deref()), ("a.png", Some("m.png")));
+    assert_eq!(taken.depth_file_path.as_deref(), Some("d.npy"));
     assert_eq!(taken.intrinsics.size, Some((100, 50)));
     let expected = CameraModel::OpenCv([90.0, 81.0, 49.0, 20.0, 0.1, 0.0, 0.0, 0.2]);
     assert_eq!(taken.intrinsics.model(100, 50), expected);
@@ -140,7 +142,7 @@ proptest! {
             fisheye: false,
         };
         let frame =
-            Frame { file_path: "images/\"ä\".png".into(), mask_path: None, intrinsics, camera_from_world };
+            Frame { file_path: "images/\"ä\".png".into(), mask_path: None, depth_file_path: Some("d".into()), intrinsics, camera_from_world };
         let transforms = Transforms { frames: vec![frame.clone(); 2], ply_file_path: Some("points.ply".into()) };
         let bytes = write(&transforms);
         let again = read(&bytes).unwrap();
@@ -148,6 +150,7 @@ proptest! {
         prop_assert_eq!(again.frames.len(), 2);
         for read in &again.frames {
             prop_assert_eq!(&read.file_path, &frame.file_path);
+            prop_assert_eq!(&read.depth_file_path, &frame.depth_file_path);
             prop_assert_eq!(read.intrinsics.size, intrinsics.size);
             let (a, b) = (read.intrinsics.model(640, 480), intrinsics.model(640, 480));
             prop_assert!(a.focal_and_centre().iter().zip(b.focal_and_centre()).all(|(a, b)| near(*a, b)));

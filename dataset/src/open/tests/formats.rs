@@ -219,6 +219,7 @@ fn masks_are_found_by_every_convention() {
         let frame = |name: &str, x: f64| Frame {
             file_path: name.into(),
             mask_path: None,
+            depth_file_path: None,
             intrinsics: Intrinsics::from_model(&model, None),
             camera_from_world: looking(DVec3::new(x, -5.0, 0.0), DVec3::ZERO),
         };
