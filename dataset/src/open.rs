@@ -16,6 +16,8 @@ mod kitti;
 mod kitti360;
 mod lidar;
 mod masks;
+mod moving_boxes;
+mod nuscenes;
 mod opensfm;
 mod parsed;
 mod transforms;
@@ -64,7 +66,7 @@ pub struct Source {
     pub photos: Vec<Photo>,
     /// Names of the capture's images that are not used, with the reason.
     pub left_out: Vec<(String, String)>,
-    /// `colmap`, `transforms`, `opensfm`, `dgp`, `kitti` or `kitti360`, followed by ` without points` if its points were sampled from the
+    /// `colmap`, `transforms`, `opensfm`, `dgp`, `nuscenes`, `kitti` or `kitti360`, followed by ` without points` if its points were sampled from the
     /// overlap of its views.
     pub format: &'static str,
     /// Lidar sweeps. The last [`seeds`](Self::seeds) points of the capture come from them.
@@ -87,14 +89,18 @@ impl Source {
     }
 }
 
-/// Opens a capture: a folder, or the path of a `transforms.json` or `reconstruction.json`.
+/// Opens a capture: a folder, the path of a `transforms.json` or `reconstruction.json`, or `FOLDER/SCENE` for a scene of
+/// nuScenes.
 ///
 /// # Errors
 /// The invalid file, its defect, and advice.
 pub fn open(path: &Path, options: &OpenOptions) -> Result<Source, BadInput> {
-    let root = CaptureRoot::new(path)?;
-    let ParsedCapture { mut format, images, points, origin, left_out: unused, sweeps, labels } =
-        parse(&root, path, options)?;
+    let named = nuscenes::named_scene(path);
+    let root = CaptureRoot::new(named.map_or(path, |(folder, _)| folder))?;
+    let ParsedCapture { mut format, images, points, origin, left_out: unused, sweeps, labels } = match named {
+        Some((_, scene)) => nuscenes::read(&root, Some(scene), options)?,
+        None => parse(&root, path, options)?,
+    };
     let (images, photos, mut left_out) = find_photos(&root, images, options)?;
     left_out.extend(unused);
     let views = views(&images, &photos)?;
@@ -117,6 +123,7 @@ pub fn open(path: &Path, options: &OpenOptions) -> Result<Source, BadInput> {
             "transforms" => "transforms without points",
             "opensfm" => "opensfm without points",
             "dgp" => "dgp without points",
+            "nuscenes" => "nuscenes without points",
             "kitti" => "kitti without points",
             _ => "kitti360 without points",
         };
@@ -146,6 +153,9 @@ fn parse(root: &CaptureRoot, path: &Path, options: &OpenOptions) -> Result<Parse
     if let Some(scene) = dgp::find(root) {
         return dgp::read(root, &scene, options);
     }
+    if nuscenes::is_present(root) {
+        return nuscenes::read(root, None, options);
+    }
     if let Some(sequence) = kitti::find(root)? {
         return kitti::read(root, &sequence, options);
     }
@@ -161,7 +171,7 @@ fn parse(root: &CaptureRoot, path: &Path, options: &OpenOptions) -> Result<Parse
         return Err(BadInput::new(files::show(path), problem, advice));
     }
     let problem = "has neither a COLMAP model in sparse/0 nor a transforms.json, a reconstruction.json, or the files of DGP, \
-                   KITTI or KITTI-360";
+                   nuScenes, KITTI or KITTI-360";
     Err(BadInput::new(files::show(path), problem, "give a folder that has one of them"))
 }
 

@@ -13,6 +13,7 @@
 //! | `sparse` | nothing: computes sparse points with their tracks |
 //! | `sweeps` | `lidar/`, `radar/` |
 //! | `tracks_and_boxes` | `tracks.json`, `boxes3d.json` |
+//! | `nuscenes` | `nuscenes/` |
 //! | `gltf` | `city.glb` |
 //! | `occupancy` | `occupancy/` |
 //! | `gallery` | nothing: draws an overview of layouts, labels and faults |
@@ -26,6 +27,7 @@ mod gallery;
 mod gltf;
 mod ground_truth;
 mod manifest;
+mod nuscenes;
 mod occupancy;
 mod output;
 mod photos;
@@ -62,12 +64,15 @@ pub fn write(out: &Path, settings: &Settings, progress: Progress) -> Result<Summ
         return Err(BadInput::new(SUBJECT, "has no view left", "ask for more views or milder faults").into());
     }
     shots.sort_by(|a, b| a.name.cmp(&b.name));
-    sweeps::write(out, &world, &legs, &stations, settings, progress)?;
+    let turns = sweeps::write(out, &world, &legs, &stations, settings, progress)?;
     let rendered = photos::render_all(out, &world, &shots, settings, progress)?;
     let points = sparse::points(&world, &shots, rendered.features, settings.city.seed, progress);
     cameras::write(out, &shots, &points, photos::has_moving_actors(&city))?;
     tracks_and_boxes::write_tracks(out, &city, &shots)?;
     tracks_and_boxes::write_boxes(out, &rendered.boxes)?;
+    if settings.nuscenes {
+        nuscenes::write(out, &world, &shots, &stations, &turns, settings, progress)?;
+    }
     if settings.mesh {
         gltf::write(out, &city)?;
     }

@@ -19,6 +19,7 @@ pub mod kitti;
 pub mod kitti360;
 pub mod lidar;
 pub mod npy;
+pub mod nuscenes;
 pub mod opensfm;
 pub mod ply;
 pub mod poses;

@@ -75,6 +75,9 @@ pub(crate) struct SynthArgs {
     /// Add a forward radar to cars, read at the same places
     #[arg(long)]
     pub(crate) radar: bool,
+    /// Write the drives of the cars in the layout of nuScenes too: photos, boxes and, with --lidar, sweeps
+    #[arg(long)]
+    pub(crate) nuscenes: bool,
     /// Write the city as glTF
     #[arg(long)]
     pub(crate) mesh: bool,
@@ -133,6 +136,9 @@ with --lidar, for every place NAME (street-LEG-NUMBER) where a photo of the car 
                          middle of the turn, 1 if it was seen through glass
   lidar/poses.jsonl      each turn: time, pose, motion, and the photos taken during it; plat train reads it
 with --radar: radar/NAME.csv (readings, then their ground truth), radar/poses.jsonl
+with --nuscenes, in nuscenes/, which plat and the nuScenes devkit read (a scene is a drive of a car, scene-LEG):
+  v1.0-mini/*.json       thirteen tables; the boxes are of vehicles and people within 70 m, seen or hit by the lidar
+  samples/CAM_*/NAME.png, samples/LIDAR_TOP/NAME.pcd.bin (float32 x 5, corrected for the car's motion), maps/none.png
 with --mesh:  city.glb   glTF 2: a node for each actor (class, instance), a mesh for each asset, materials without patterns
 with --occupancy: occupancy/X_Y.npz for each block: semantic (uint8, 255 free) and instance (uint32) by z, y, x;
               origin (the lowest corner) and voxel (its side) in metres, world_from_grid (4 x 4; the identity)

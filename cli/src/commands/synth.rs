@@ -86,6 +86,7 @@ fn settings(args: &SynthArgs) -> Settings {
         lidar: args.lidar,
         radar: args.radar,
         mesh: args.mesh,
+        nuscenes: args.nuscenes,
         occupancy: args.occupancy,
         around: args.occupancy_around.clone(),
         spacing: args.spacing,

@@ -11,20 +11,17 @@
 //!
 //! A sweep gives depths to the photos of its sample. Objects that move between samples are left out of the photos.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use glam::DVec3;
 use scene::dgp::{self, BoxAnnotation, Datum, Scene};
 use scene::transforms::Intrinsics;
 use scene::{BadInput, CameraModel, CodecError, Rigid};
 
 use super::files::{self, CaptureRoot, Found};
+use super::moving_boxes::{corners, moving};
 use super::parsed::{OpenOptions, ParsedCapture, ParsedSweep, PosedImage, RawPoints};
 use crate::lidar::PointFormat;
-
-/// An object moves if its place in the world differs by more between two samples, metres.
-const MOVED_METRES: f64 = 0.5;
 
 /// The scene's file.
 pub(super) fn find(root: &CaptureRoot) -> Option<PathBuf> {
@@ -74,9 +71,10 @@ pub(super) fn read(root: &CaptureRoot, path: &Path, options: &OpenOptions) -> Re
             });
         }
     }
-    let moving = moving(&boxes);
+    let places = boxes.iter().map(|(_, pose, found)| (found.instance, pose.apply(found.sensor_from_box.translation)));
+    let moving = moving(places);
     for (image, _, found) in boxes.iter().filter(|(.., found)| moving.contains(&found.instance)) {
-        images[*image as usize].moving.push(corners(found));
+        images[*image as usize].moving.push(corners(&found.sensor_from_box, found.size));
     }
     Ok(ParsedCapture {
         labels: labels(root, &boxes)?,
@@ -87,25 +85,6 @@ pub(super) fn read(root: &CaptureRoot, path: &Path, options: &OpenOptions) -> Re
 
 /// A box with its photo and that photo's pose.
 type Labelled = (u32, Rigid, BoxAnnotation);
-
-/// The instances that move.
-fn moving(boxes: &[Labelled]) -> BTreeSet<i64> {
-    let mut places: BTreeMap<i64, (DVec3, DVec3)> = BTreeMap::new();
-    for (_, world_from_sensor, found) in boxes {
-        let place = world_from_sensor.apply(found.sensor_from_box.translation);
-        let (low, high) = places.entry(found.instance).or_insert((place, place));
-        (*low, *high) = (low.min(place), high.max(place));
-    }
-    let moved = places.into_iter().filter(|(_, (low, high))| low.distance(*high) > MOVED_METRES);
-    moved.map(|(instance, _)| instance).collect()
-}
-
-/// The corners of a box, in its sensor's axes.
-fn corners(found: &BoxAnnotation) -> [DVec3; 8] {
-    let sign = |i: usize, bit: usize| if i & bit == 0 { -0.5 } else { 0.5 };
-    let corner = |i: usize| found.size * DVec3::new(sign(i, 1), sign(i, 2), sign(i, 4));
-    std::array::from_fn(|i| found.sensor_from_box.apply(corner(i)))
-}
 
 /// Number of boxes by class.
 fn labels(root: &CaptureRoot, boxes: &[Labelled]) -> Result<BTreeMap<String, usize>, BadInput> {

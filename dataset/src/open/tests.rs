@@ -6,7 +6,9 @@ use image::{GrayImage, RgbImage};
 
 use super::*;
 
+mod drives;
 mod formats;
+mod nuscenes;
 mod reprojection;
 
 use crate::synth::{self, Settings};

@@ -37,6 +37,9 @@ pub struct Settings {
     pub radar: bool,
     /// Whether to write the city's mesh.
     pub mesh: bool,
+    /// Whether to write the drives of the cars in the layout of nuScenes too.
+    #[serde(skip_serializing_if = "is_unset")]
+    pub nuscenes: bool,
     /// Voxel size of the occupancy grids, metres, 0.05 to 10. `None` writes no grids.
     pub occupancy: Option<f64>,
     /// Regions of the occupancy grids, 1,000 at most. Empty covers the whole city.
@@ -48,6 +51,10 @@ pub struct Settings {
     /// Cameras of a car.
     #[serde(skip_serializing_if = "CarRig::is_default")]
     pub rig: CarRig,
+}
+
+fn is_unset(flag: &bool) -> bool {
+    !flag
 }
 
 /// Cameras of a car.
@@ -88,6 +95,7 @@ impl Default for Settings {
             lidar: false,
             radar: false,
             mesh: false,
+            nuscenes: false,
             occupancy: None,
             around: Vec::new(),
             spacing: None,
@@ -116,6 +124,9 @@ impl Settings {
             }
             s if s.occupancy.is_some_and(|voxel| !(0.05..=10.0).contains(&voxel)) => {
                 refuse("the side of a voxel", "choose 0.05 to 10 metres")
+            }
+            s if s.nuscenes && s.aerial + s.fixed >= 1.0 => {
+                refuse("the number of photos from cars, for nuScenes,", "choose shares that sum to less than 1")
             }
             s if s.around.len() > 1000 => refuse("the number of places to fill with voxels", "choose 1,000 at most"),
             s if s.faults.iter().any(|f| !f.is_valid()) => refuse("the strength of a fault", "choose 0 to 1"),

@@ -1,5 +1,6 @@
 //! Writes lidar and radar sweeps of the cars at each station: readings in the formats of KITTI, with ground truth beside them.
 
+use std::collections::BTreeMap;
 use std::fmt::Write;
 use std::path::Path;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -16,11 +17,20 @@ use scene::{Rigid, npy};
 use serde_json::json;
 use store::file::{SaveError, save};
 
+use super::nuscenes;
 use super::output::create_folder;
 use super::settings::{Progress, Settings, SynthError, unsupported};
 use super::shots::Station;
 
-/// Writes `lidar/` and `radar/`, as far as the settings enable them.
+/// A turn of a car's lidar.
+pub(super) struct LidarTurn {
+    /// World from the sensor at the middle of the turn: x ahead, y left, z up.
+    pub(super) pose: Rigid,
+    /// Number of returns by instance.
+    pub(super) hits: BTreeMap<u32, u32>,
+}
+
+/// Writes `lidar/` and `radar/`, as far as the settings enable them, and returns the turns of the lidar by station.
 pub(super) fn write(
     out: &Path,
     world: &World,
@@ -28,19 +38,38 @@ pub(super) fn write(
     stations: &[Station],
     settings: &Settings,
     progress: Progress,
-) -> Result<(), SynthError> {
+) -> Result<Vec<Option<LidarTurn>>, SynthError> {
     let seed = settings.city.seed;
+    let mut turns = Vec::new();
     if settings.lidar {
+        if settings.nuscenes {
+            create_folder(&out.join(nuscenes::FOLDER).join("samples").join(nuscenes::LIDAR))?;
+        }
         let lidar = Lidar { seed, ..Lidar::default() };
         let lidar_sweep = |station: &Station, pose: &Rigid, motion: &Motion, folder: &Path| {
             let sweep = lidar.sweep(world, pose, motion, station.seconds, &settings.faults);
             let sweep = sweep.map_err(|e: SenseError| unsupported(&e))?;
             let returns: Vec<&Return> = sweep.returns.iter().filter(|point| !point.lost).collect();
             save_points(folder, station, &returns)?;
-            Ok::<_, SynthError>(returns.len())
+            if settings.nuscenes {
+                nuscenes::save_sweep(&out.join(nuscenes::FOLDER), station, pose, motion, &returns)?;
+            }
+            let mut hits = BTreeMap::new();
+            returns.iter().for_each(|found| *hits.entry(found.instance).or_default() += 1);
+            Ok::<_, SynthError>((returns.len(), LidarTurn { pose: *pose, hits }))
         };
         let turn_seconds = 1.0 / lidar.turns_per_second;
-        run_sensor("lidar", &lidar.mount, Some(turn_seconds), out, legs, stations, settings, progress, &lidar_sweep)?;
+        turns = run_sensor(
+            "lidar",
+            &lidar.mount,
+            Some(turn_seconds),
+            out,
+            legs,
+            stations,
+            settings,
+            progress,
+            &lidar_sweep,
+        )?;
     }
     if settings.radar {
         let radar = Radar { seed, ..Radar::default() };
@@ -48,18 +77,19 @@ pub(super) fn write(
             let found = radar.sweep(&world.at(station.seconds), pose, motion, &settings.faults);
             let found = found.map_err(|e: SenseError| unsupported(&e))?;
             save(&folder.join(format!("{}.csv", station.name)), radar_csv(&found).as_bytes())?;
-            Ok(found.len())
+            Ok((found.len(), ()))
         };
         run_sensor("radar", &radar.mount, None, out, legs, stations, settings, progress, &radar_sweep)?;
     }
-    Ok(())
+    Ok(turns)
 }
 
-/// Measures at a station, writes the readings into a folder, and returns their number.
-type Measure<'a> = &'a (dyn Fn(&Station, &Rigid, &Motion, &Path) -> Result<usize, SynthError> + Sync);
+/// Measures at a station, writes the readings into a folder, and returns their number and what is kept of them.
+type Measure<'a, T> = &'a (dyn Fn(&Station, &Rigid, &Motion, &Path) -> Result<(usize, T), SynthError> + Sync);
 
-/// Measures at all stations where the sensor has not dropped out, and writes its poses to `poses.jsonl`.
-fn run_sensor(
+/// Measures at all stations where the sensor has not dropped out, writes its poses to `poses.jsonl`, and returns what is kept by
+/// station.
+fn run_sensor<T: Send>(
     sensor: &'static str,
     mount: &Mount,
     turn_seconds: Option<f64>,
@@ -68,19 +98,19 @@ fn run_sensor(
     stations: &[Station],
     settings: &Settings,
     progress: Progress,
-    measure: Measure,
-) -> Result<(), SynthError> {
+    measure: Measure<T>,
+) -> Result<Vec<Option<T>>, SynthError> {
     let folder = out.join(sensor);
     create_folder(&folder)?;
     let done = AtomicUsize::new(0);
-    let one = |station: &Station| -> Result<Option<String>, SynthError> {
+    let one = |station: &Station| -> Result<Option<(String, T)>, SynthError> {
         progress(sensor, done.fetch_add(1, Ordering::Relaxed) + 1, stations.len());
         let pose = legs.get(station.leg).and_then(|leg| sensor_pose_at(leg, mount, station.seconds));
         let Some((pose, motion)) = pose.filter(|_| !faults::is_dropped_out(&settings.faults, sensor, station.seconds))
         else {
             return Ok(None);
         };
-        let readings = measure(station, &pose, &motion, &folder)?;
+        let (readings, kept) = measure(station, &pose, &motion, &folder)?;
         let line = json!({
             "name": station.name,
             "seconds": station.seconds,
@@ -91,16 +121,19 @@ fn run_sensor(
             "photos": station.photos,
             "turn_seconds": turn_seconds.unwrap_or(0.0),
         });
-        Ok(Some(format!("{line}\n")))
+        Ok(Some((format!("{line}\n"), kept)))
     };
     // All results first, then the first error in station order, whichever thread is faster.
     let lines: Vec<_> = stations.par_iter().map(one).collect();
-    let mut poses = String::new();
+    let (mut poses, mut all) = (String::new(), Vec::new());
     for line in lines {
-        poses.extend(line?);
+        all.push(line?.map(|(line, kept)| {
+            poses += &line;
+            kept
+        }));
     }
     save(&folder.join("poses.jsonl"), poses.as_bytes())?;
-    Ok(())
+    Ok(all)
 }
 
 fn save_points(folder: &Path, station: &Station, returns: &[&Return]) -> Result<(), SaveError> {

@@ -10,6 +10,8 @@ use super::*;
 use crate::depth_samples::DepthSamples;
 use crate::open::{OpenOptions, open};
 
+mod nuscenes;
+
 fn small() -> Settings {
     let city = CitySettings { layout: Layout::Grid, traffic: Traffic::Heavy, ..CitySettings::default() };
     Settings { city, views: 24, width: 96, height: 54, ..Settings::default() }
@@ -175,6 +177,7 @@ fn settings_out_of_range_are_refused_before_anything_is_written() {
         Settings { aerial: f64::NAN, ..small() },
         Settings { aerial: 0.6, fixed: 0.5, ..small() },
         Settings { fixed: -0.1, ..small() },
+        Settings { aerial: 0.5, fixed: 0.5, nuscenes: true, ..small() },
         Settings { faults: vec![Fault { kind: FaultKind::Fog, strength: 2.0, seed: 0 }], ..small() },
         Settings { city: CitySettings { area_km2: 26.0, ..small().city }, ..small() },
     ] {
@@ -194,6 +197,7 @@ fn everything() -> Settings {
         lidar: true,
         radar: true,
         mesh: true,
+        nuscenes: true,
         occupancy: Some(2.0),
         ..small()
     }

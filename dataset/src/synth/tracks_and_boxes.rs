@@ -124,7 +124,7 @@ impl<'a> Instances<'a> {
 }
 
 /// Bounding box of an asset in its own axes.
-fn bounds(city: &City, asset: u32) -> Option<(Vec3, Vec3)> {
+pub(super) fn bounds(city: &City, asset: u32) -> Option<(Vec3, Vec3)> {
     let positions = &city.assets.get(asset as usize)?.mesh.positions;
     let first = *positions.first()?;
     Some(positions.iter().fold((first, first), |(low, high), p| (low.min(*p), high.max(*p))))

@@ -76,6 +76,11 @@ pub(crate) fn swelling() -> Vec<Seed> {
     corpus.plain("empty frames in transforms.json", json, &transforms_codec());
     let json = format!(r#"[{{"x": [{}], "shots": {{}}, "cameras": {{}}}}]"#, ones(2_000_000));
     corpus.plain("unknown numbers in reconstruction.json", json, &opensfm_codec());
+    for (codec, row) in nuscenes_codecs().iter().zip(["[[]]", "{}", "1", "\"\"", "null", "[0,0,0]", "true"]) {
+        corpus.plain("a table of wrong rows", format!("[{row}{}]", format!(",{row}").repeat(200_000)), codec);
+    }
+    let matrix = format!(r#"[{{"token": "", "sensor_token": "", "camera_intrinsic": [{}]"#, "[0,0,0],".repeat(200_000));
+    corpus.plain("a matrix of many rows", matrix, &nuscenes_codecs()[5]);
     let text = format!("P_rect_00: {}", "1 ".repeat(1_000_000));
     corpus.plain("a long line in perspective.txt", text, &kitti_codecs()[0]);
     for line in ["comment\n", "property char a\n", "obj_info\n"] {
@@ -221,6 +226,10 @@ impl Corpus {
         let floats = |n: usize| (0..n).flat_map(|i| (i as f32 * 0.7 - 9.0).to_le_bytes()).collect::<Vec<u8>>();
         self.plain("scan.bin", floats(400), &scan);
 
+        for ((name, table), codec) in NUSCENES.into_iter().zip(&nuscenes_codecs()) {
+            self.plain(name, table, codec);
+        }
+
         for degree in [0, 3] {
             let mut splats = Splats::new(degree);
             (0..200).for_each(|i| splats.push(&splat(i)));
@@ -334,3 +343,36 @@ const PERSPECTIVE: &str = "calib_time: x\nS_rect_00: 80 40\nR_rect_00: 1 0 0 0 1
     P_rect_00: 50 0 40 0 0 50 20 0 0 0 1 0\nS_rect_01: 80 40\nP_rect_01: 50 0 40 -30 0 50 20 0 0 0 1 0\n";
 const CAM_TO_POSE: &str = "image_00: 0 0 1 1 1 0 0 0 0 1 0 0\nimage_01: 0 0 1 1 1 0 0 0.6 0 1 0 0\n";
 const POSES: &str = "1 1 0 0 10 0 -1 0 7 0 0 -1 2\n2 1 0 0 20 0 -1 0 7 0 0 -1 2 0 0 0 1\n";
+/// Tables of nuScenes: names, samples, data, poses of the vehicle, sensors, their mounting, and boxes.
+const NUSCENES: [(&str, &str); 7] = [
+    ("scene.json", r#"[{"token": "one", "name": "scene-0001", "description": "Caf\u00e9", "nbr_samples": 2}]"#),
+    (
+        "sample.json",
+        r#"[{"token": "s", "scene_token": "one", "timestamp": 7, "prev": "", "next": ""},
+        {"token": "t", "scene_token": "two", "timestamp": 1532402927647951}]"#,
+    ),
+    (
+        "sample_data.json",
+        r#"[{"token": "d", "sample_token": "s", "ego_pose_token": "e", "calibrated_sensor_token": "c", "width": 16, "height": 9,
+        "filename": "samples/CAM_FRONT/a.jpg", "fileformat": "jpg", "timestamp": 7, "is_key_frame": true},
+        {"token": "f", "sample_token": "s", "ego_pose_token": "e", "calibrated_sensor_token": "c", "width": null,
+        "filename": "sweeps\/LIDAR_TOP\/a.pcd.bin", "timestamp": 3, "is_key_frame": false}]"#,
+    ),
+    (
+        "ego_pose.json",
+        r#"[{"token": "e", "timestamp": 7, "rotation": [0.5720, -0.0016, 0.0118, -0.8201], "translation": [411.3, 1180.8, 0]}]"#,
+    ),
+    ("sensor.json", r#"[{"token": "x", "channel": "CAM_FRONT", "modality": "camera"}]"#),
+    (
+        "calibrated_sensor.json",
+        r#"[{"token": "c", "sensor_token": "x", "translation": [1.7, 0.01, 1.5], "rotation": [0.5, -0.5, 0.5, -0.5],
+        "camera_intrinsic": [[1266.4, 0.0, 816.2], [0.0, 1266.4, 491.5], [0.0, 0.0, 1.0]]},
+        {"token": "r", "sensor_token": "y", "translation": [3.4, 0, 0.5], "rotation": [1, 0, 0, 0], "camera_intrinsic": []}]"#,
+    ),
+    (
+        "sample_annotation.json",
+        r#"[{"token": "a", "sample_token": "s", "instance_token": "i", "visibility_token": "1", "attribute_tokens": ["m", "p"],
+        "translation": [373.2, 1130.4, 0.8], "size": [0.621, 0.669, 1.642], "rotation": [0.98, 0.0, 0.0, -0.199],
+        "num_lidar_pts": 5, "num_radar_pts": 0}]"#,
+    ),
+];

@@ -1,5 +1,6 @@
 //! The readers under test, each with a check of the values that it accepts.
 
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::rc::Rc;
 
@@ -13,7 +14,7 @@ use image::{ImageFormat, RgbImage};
 use scene::frame::{self, Kind};
 use scene::transforms::{Frame, Intrinsics, Transforms};
 use scene::{CameraModel, Capture, CodecError, Exposures, Rect, Rigid};
-use scene::{colmap, kitti360, npy, opensfm, ply, spz, transforms};
+use scene::{colmap, kitti360, npy, nuscenes, opensfm, ply, spz, transforms};
 use store::Store;
 
 use crate::corpus::{CLOUD, PHOTO_SIZE, encoded};
@@ -114,6 +115,37 @@ pub(crate) fn kitti_codecs() -> [Read; 5] {
         codec("kitti360", kitti360::read_cam_to_velo, |pose| pose.is_sane()),
         codec("kitti360", kitti360::read_poses, |poses| poses.values().all(Rigid::is_sane)),
         codec("kitti360", |bytes| kitti360::read_scan(bytes, 1), |points| points.iter().all(|p| p.is_finite())),
+    ]
+}
+
+/// Tables of nuScenes in the order of `corpus::NUSCENES`, whose tokens these select.
+pub(crate) fn nuscenes_codecs() -> [Read; 7] {
+    fn samples() -> BTreeMap<String, i64> {
+        BTreeMap::from([("s".to_string(), 7)])
+    }
+    [
+        codec("nuscenes", nuscenes::read_names, |_| true),
+        codec("nuscenes", |bytes| nuscenes::read_samples(bytes, "one"), |_| true),
+        codec(
+            "nuscenes",
+            |bytes| nuscenes::read_data(bytes, &samples()),
+            |data| data.is_sorted_by_key(|datum| datum.microseconds),
+        ),
+        codec(
+            "nuscenes",
+            |bytes| nuscenes::read_ego_poses(bytes, &BTreeSet::from(["e"])),
+            |poses| poses.values().all(Rigid::is_sane),
+        ),
+        codec("nuscenes", nuscenes::read_modalities, |_| true),
+        codec("nuscenes", nuscenes::read_calibrated_sensors, |sensors| {
+            let lens = |lens: &CameraModel| camera_is_sane(lens, 16, 9);
+            sensors.values().all(|s| s.vehicle_from_sensor.is_sane() && s.lens.iter().all(lens))
+        }),
+        codec(
+            "nuscenes",
+            |bytes| nuscenes::read_annotations(bytes, &samples()),
+            |boxes| boxes.iter().all(|found| found.world_from_box.is_sane() && found.size.min_element() > 0.0),
+        ),
     ]
 }
 

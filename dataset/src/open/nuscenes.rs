@@ -1,0 +1,196 @@
+//! Parses a scene of nuScenes: photos of all cameras, sweeps of the lidar, and boxes of objects.
+//!
+//! ```text
+//! v1.0-VERSION/*.json                   tables (see `scene::nuscenes`)
+//! samples/CHANNEL/*.jpg, *.pcd.bin      as sample_data says: key frames
+//! sweeps/CHANNEL/*.jpg, *.pcd.bin       as sample_data says: data between them; optional
+//! ```
+//!
+//! Each scene is a capture. Of a data set with several, one is named after its folder: `FOLDER/scene-0061`.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::Path;
+
+use scene::nuscenes::{self, CalibratedSensor, Datum};
+use scene::transforms::Intrinsics;
+use scene::{BadInput, CodecError, Rigid};
+
+use self::boxes::Boxes;
+use super::files::{self, CaptureRoot, Found};
+use super::parsed::{OpenOptions, ParsedCapture, ParsedSweep, PosedImage, RawPoints};
+use crate::lidar::PointFormat;
+
+mod boxes;
+
+/// A photo belongs to the sweep nearest in time, within this.
+const SAME_MICROSECONDS: u64 = 100_000;
+/// Names of scenes that an error lists.
+const LISTED: usize = 5;
+
+/// The folder of a data set and the name of a scene, if the path is `FOLDER/SCENE`, which is no folder itself.
+pub(super) fn named_scene(path: &Path) -> Option<(&Path, &str)> {
+    let (folder, scene) = (path.parent()?, path.file_name()?.to_str()?);
+    let root = CaptureRoot::new(folder).ok().filter(|_| !path.exists())?;
+    (!versions(&root).is_empty()).then_some((folder, scene))
+}
+
+/// Whether there is a data set.
+pub(super) fn is_present(root: &CaptureRoot) -> bool {
+    !versions(root).is_empty()
+}
+
+/// Folders of tables, sorted.
+fn versions(root: &CaptureRoot) -> Vec<String> {
+    let entries = root.path("").read_dir().into_iter().flatten();
+    let mut names: Vec<String> = entries.filter_map(|entry| entry.ok()?.file_name().into_string().ok()).collect();
+    names.retain(|name| name.starts_with("v1.0-") && root.file(&format!("{name}/scene.json")).is_some());
+    names.sort();
+    names
+}
+
+/// Parses the scene of this name, or the only one.
+pub(super) fn read(root: &CaptureRoot, scene: Option<&str>, options: &OpenOptions) -> Result<ParsedCapture, BadInput> {
+    let (tables, scene) = choose(root, scene)?;
+    let samples = tables.read("sample", |bytes| nuscenes::read_samples(bytes, &scene))?;
+    let data = tables.read("sample_data", |bytes| nuscenes::read_data(bytes, &samples))?;
+    let wanted: BTreeSet<&str> = data.iter().map(|datum| datum.ego_pose.as_str()).collect();
+    let vehicles = tables.read("ego_pose", |bytes| nuscenes::read_ego_poses(bytes, &wanted))?;
+    let mounted = tables.read("calibrated_sensor", nuscenes::read_calibrated_sensors)?;
+    let modalities = tables.read("sensor", nuscenes::read_modalities)?;
+    let boxes = Boxes::read(&tables, &samples)?;
+
+    let (mut images, mut times, mut sweeps) = (Vec::new(), Vec::new(), Vec::new());
+    for datum in &data {
+        let sensor = tables.row(&mounted, "sample_data", "calibrated_sensor", &datum.calibrated_sensor)?;
+        let modality = tables.row(&modalities, "calibrated_sensor", "sensor", &sensor.sensor)?;
+        let vehicle = tables.row(&vehicles, "sample_data", "ego_pose", &datum.ego_pose)?;
+        let world_from_sensor = vehicle.after(&sensor.vehicle_from_sensor);
+        match modality.as_str() {
+            "camera" => {
+                // Data sets are often shared without the photos between key frames.
+                if !datum.is_key_frame && root.file(&datum.file).is_none() && !options.cameras_only {
+                    continue;
+                }
+                times.push(datum.microseconds);
+                images.push(image(&tables, images.len() as u32, datum, sensor, &world_from_sensor, &boxes)?);
+            }
+            "lidar" if options.lidar => {
+                if let Found::File(path) = root.image(&datum.file)? {
+                    let (format, images) = (PointFormat::Floats(5), Vec::new());
+                    sweeps.push((datum.microseconds, ParsedSweep { path, format, world_from_sensor, images }));
+                }
+            }
+            _ => {}
+        }
+    }
+    if images.is_empty() {
+        return Err(tables.bad("sample_data", format!("has no photo of the scene {scene:.40}")));
+    }
+    assign(&times, &mut sweeps);
+    if !sweeps.is_empty() && sweeps.iter().all(|(_, sweep)| sweep.images.is_empty()) {
+        let problem = "has no sweep within 0.1 s of a photo, so that its timestamps cannot be right";
+        return Err(tables.bad("sample_data", problem.into()));
+    }
+    Ok(ParsedCapture {
+        labels: boxes.labels,
+        sweeps: sweeps.into_iter().map(|(_, sweep)| sweep).collect(),
+        ..ParsedCapture::new("nuscenes", images, RawPoints::default())
+    })
+}
+
+/// The tables that hold a scene, and its token.
+fn choose<'a>(root: &'a CaptureRoot, wanted: Option<&str>) -> Result<(Tables<'a>, String), BadInput> {
+    let mut scenes: BTreeMap<String, (String, String)> = BTreeMap::new();
+    for version in versions(root) {
+        let tables = Tables { root, version };
+        for (token, name) in tables.read("scene", nuscenes::read_names)? {
+            scenes.entry(name).or_insert((tables.version.clone(), token));
+        }
+    }
+    let names: Vec<&str> = scenes.keys().map(String::as_str).collect();
+    let listed = names.iter().take(LISTED).map(|name| name.chars().take(40).collect::<String>()).collect::<Vec<_>>();
+    let more = names.len().saturating_sub(LISTED);
+    let listed = listed.join(", ") + &if more > 0 { format!(" and {more} more") } else { String::new() };
+    let chosen = match (wanted, names.as_slice()) {
+        (_, []) => return Err(BadInput::new(root.to_string(), "has no scene", "download the data set again")),
+        (Some(name), _) => name,
+        (None, [only]) => only,
+        (None, [first, ..]) => {
+            let problem = format!("has {} scenes, each a capture of its own: {listed}", names.len());
+            return Err(BadInput::new(root.to_string(), problem, format!("name one, as in {root}/{first:.40}")));
+        }
+    };
+    let Some((version, token)) = scenes.get(chosen) else {
+        let problem = format!("has no scene {chosen:.100}");
+        return Err(BadInput::new(root.to_string(), problem, format!("name one that it has: {listed}")));
+    };
+    Ok((Tables { root, version: version.clone() }, token.clone()))
+}
+
+fn image(
+    tables: &Tables,
+    id: u32,
+    datum: &Datum,
+    sensor: &CalibratedSensor,
+    world_from_sensor: &Rigid,
+    boxes: &Boxes,
+) -> Result<PosedImage, BadInput> {
+    let Some(model) = &sensor.lens else {
+        return Err(tables.bad("calibrated_sensor", format!("has a camera without intrinsics, of {:.100}", datum.file)));
+    };
+    let camera_from_world = world_from_sensor.inverse();
+    let size = Some(datum.size).filter(|(width, height)| *width > 0 && *height > 0);
+    Ok(PosedImage {
+        id,
+        name: datum.file.clone(),
+        file: datum.file.clone(),
+        mask: None,
+        intrinsics: Intrinsics::from_model(model, size),
+        camera_from_world,
+        moving: boxes.seen(datum.microseconds, &camera_from_world, model, size),
+    })
+}
+
+/// Gives each photo to the sweep nearest in time. Both are sorted by time.
+fn assign(times: &[i64], sweeps: &mut [(i64, ParsedSweep)]) {
+    for (id, &time) in (0..).zip(times) {
+        let after = sweeps.partition_point(|(other, _)| *other < time);
+        let near = sweeps[after.saturating_sub(1)..].iter_mut().take(2);
+        let nearest = near.min_by_key(|(other, _)| other.abs_diff(time));
+        if let Some((_, sweep)) = nearest.filter(|(other, _)| other.abs_diff(time) <= SAME_MICROSECONDS) {
+            sweep.images.push(id);
+        }
+    }
+}
+
+/// The tables of a version.
+struct Tables<'a> {
+    root: &'a CaptureRoot,
+    version: String,
+}
+
+impl Tables<'_> {
+    fn read<T>(&self, table: &str, read: impl FnOnce(&[u8]) -> Result<T, CodecError>) -> Result<T, BadInput> {
+        let name = format!("{}/{table}.json", self.version);
+        let missing = || BadInput::new(format!("{}: {name}", self.root), "is not there", "download the tables again");
+        let path = self.root.file(&name).ok_or_else(missing)?;
+        read(&files::read(&path)?).map_err(|e| self.bad(table, e.to_string()))
+    }
+
+    /// The row that a table names.
+    fn row<'a, T>(
+        &self,
+        rows: &'a BTreeMap<String, T>,
+        table: &str,
+        named: &str,
+        token: &str,
+    ) -> Result<&'a T, BadInput> {
+        let nowhere = || self.bad(table, format!("names a row '{token:.40}' that {named}.json lacks"));
+        rows.get(token).ok_or_else(nowhere)
+    }
+
+    fn bad(&self, table: &str, problem: String) -> BadInput {
+        let file = self.root.path(&format!("{}/{table}.json", self.version));
+        BadInput::new(files::show(&file), problem, "correct the file or download the tables again")
+    }
+}
