@@ -128,7 +128,13 @@ fn cameras(capture: &Capture, poses: &Poses) -> Vec<u8> {
         let k = view.camera.pinhole;
         let lens = CameraModel::Pinhole([k.fx, k.fy, k.cx, k.cy]);
         let intrinsics = Intrinsics::from_model(&lens, Some((k.width, k.height)));
-        Some(Frame { file_path: view.name.clone(), mask_path: None, depth_file_path: None, intrinsics, camera_from_world })
+        Some(Frame {
+            file_path: view.name.clone(),
+            mask_path: None,
+            depth_file_path: None,
+            intrinsics,
+            camera_from_world,
+        })
     };
     transforms::write(&Transforms { frames: poses.iter().filter_map(frame).collect(), ply_file_path: None })
 }
