@@ -144,6 +144,7 @@ fn image(
         id,
         name: datum.file.clone(),
         file: datum.file.clone(),
+        depth: None,
         mask: None,
         intrinsics: Intrinsics::from_model(model, size),
         camera_from_world,
