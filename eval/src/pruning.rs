@@ -111,6 +111,7 @@ impl<'a> Pruner<'a> {
             views: &self.held_in,
             counts: all,
             keeps: all,
+            free_space: None,
             budget: model.splats.len(),
             steps: settings.as_ref().map_or(DEFAULT_STEPS, |settings| settings.steps),
             antialiased: model.antialiased,

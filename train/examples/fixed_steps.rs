@@ -48,6 +48,7 @@ fn steps() -> Splats {
         views: &views,
         counts: &|_| true,
         keeps: &|_| true,
+        free_space: None,
         budget: 2 * SPLATS as usize,
         steps: STEPS,
         antialiased: false,

@@ -4,6 +4,7 @@ use glam::Vec3;
 use scene::{Exposures, Splats};
 
 use crate::device::Backend;
+use crate::free_space::FreeSpace;
 use crate::recipe::Recipe;
 use crate::source::WindowSource;
 use crate::view::TrainView;
@@ -20,6 +21,8 @@ pub struct Job<'a> {
     pub counts: &'a (dyn Fn(Vec3) -> bool + Sync),
     /// True where a splat may be. Densification removes splats that drift elsewhere, as the context covers that place.
     pub keeps: &'a (dyn Fn(Vec3) -> bool + Sync),
+    /// Space that splats keep out of, if it is known. As `keeps`, it takes effect at refinements only.
+    pub free_space: Option<&'a FreeSpace>,
     /// Number of counted splats to reach at the end.
     pub budget: usize,
     /// Number of training steps, counted in views.

@@ -295,7 +295,7 @@ impl<'a> Trainer<'a> {
     /// Adds and removes splats where that is due after a step of `count` views. Skips the steps up to the end of growth
     /// where it no longer improves the error.
     fn densify(&mut self, count: u32, progress: f32, error: Option<f64>) -> Result<(), TrainError> {
-        let Job { counts, keeps, budget, steps, recipe, .. } = self.job;
+        let Job { counts, keeps, free_space, budget, steps, recipe, .. } = self.job;
         let (growth, state) = (&recipe.growth, &mut self.state);
         let until = (growth.until * steps as f32) as u32;
         let worth_db = f64::from(growth.worth_db);
@@ -314,8 +314,12 @@ impl<'a> Trainer<'a> {
         {
             let target = growth.target(state.step, steps, state.start_count, budget);
             self.device.download(state, StatePart::All)?;
-            let (grown, rows, _) =
-                growth::refine(&state.splats, &mut state.densification, growth, target, counts, keeps);
+            let keeps = |place| keeps(place) && free_space.is_none_or(|free| !free.contains(place));
+            let (mut grown, rows, _) =
+                growth::refine(&state.splats, &mut state.densification, growth, target, counts, &keeps);
+            if let Some(free) = free_space {
+                free.clip(&mut grown);
+            }
             state.splats = grown;
             state.adam.rearrange(&rows);
             self.device.upload(state, StatePart::All)?;

@@ -107,6 +107,7 @@ fn with_job<R>(
         views: &views,
         counts,
         keeps: &|_| true,
+        free_space: None,
         budget: initial.len(),
         // Enough for all rounds: shorter jobs have fewer.
         steps: 1400,

@@ -7,8 +7,8 @@ use blocks::{Cut, Plan, Task, ViewUse};
 use dataset::windows::WindowReader;
 use glam::DVec3;
 use scene::{BLOCK_ATTRIBUTE, BlockId, Capture, Exposures, Poses, Splats};
-use train::TrainView;
 use train::prune::Pruning;
+use train::{FreeSpace, TrainView};
 
 use crate::result_cache::ResultCache;
 use crate::task::{ExecuteError, TaskOrder};
@@ -122,6 +122,12 @@ impl Block<'_> {
         distances.sort_by(f64::total_cmp);
         let far = distances.get(distances.len() * 98 / 100).copied().unwrap_or(1.0);
         (centre, 5.0 * far.max(self.plan.ground.edge_metres * 0.5))
+    }
+
+    /// The space in the block's halo that its views see through. Only views that are trained on count.
+    pub(crate) fn free_space(&self, views: &[TrainView]) -> Option<FreeSpace> {
+        let views: Vec<u32> = views.iter().map(|view| view.view).collect();
+        FreeSpace::new(self.capture, &views, |place| self.plan.ground.in_halo(self.task.block, place))
     }
 
     /// The splats with this block in their attribute [`BLOCK_ATTRIBUTE`].

@@ -120,6 +120,7 @@ impl OneBlockTraining<'_> {
             found.is_some()
         };
         let mut is_evaluable = evaluate(0, &initial);
+        let free_space = block.free_space(&views);
         let due = |step: u32| is_due(step, task.steps, self.evaluations);
         let job = train::Job {
             initial,
@@ -127,6 +128,7 @@ impl OneBlockTraining<'_> {
             views: &views,
             counts: &|p: Vec3| block.owns(task, p.as_dvec3()),
             keeps: &|_| true,
+            free_space: free_space.as_ref(),
             budget: task.budget as usize,
             steps: task.steps,
             antialiased: plan.settings.antialiased,

@@ -46,6 +46,7 @@ fn step_seconds() -> f64 {
         views: &views,
         counts: &everywhere,
         keeps: &everywhere,
+        free_space: None,
         budget: SPLATS,
         steps: WARM_UP_STEPS + STEPS,
         antialiased: false,

@@ -62,6 +62,7 @@ impl Block<'_> {
             self.start(results, &recipe, &counts)?;
         let cut = task.context_cut();
         let keeps = |p: Vec3| self.trains(&cut, p.as_dvec3());
+        let free_space = self.free_space(&views);
         let size_bounds_metres = self.size_bounds_metres(&views);
         let job_of = |initial, steps, views| Job {
             initial,
@@ -69,6 +70,7 @@ impl Block<'_> {
             views,
             counts: &counts,
             keeps: &keeps,
+            free_space: free_space.as_ref(),
             budget,
             steps,
             antialiased: plan.settings.antialiased,

@@ -13,7 +13,7 @@ use eval::{ByKind, Group};
 use model::save_json;
 use proto::Access;
 use proto::watch_event::Event as Update;
-use scene::{ArtefactId, BadInput, Capture};
+use scene::{ArtefactId, Capture};
 use serde::Serialize;
 use store::Store;
 use store::file::save;

@@ -187,6 +187,7 @@ impl<'a> Setup<'a> {
             views: &self.views,
             counts,
             keeps: &|_| true,
+            free_space: None,
             budget: self.budget,
             steps: self.steps,
             antialiased: false,
