@@ -108,8 +108,8 @@ fn relative_maps_are_aligned_to_the_sparse_points_of_each_view() {
     let scale = |number: usize| 0.3 + 0.1 * number as f32;
     let relative = |number: usize, d: f32| scale(number) * d + 2.0 - 0.1 * number as f32;
     let inverse = |number: usize, d: f32| scale(number) / d + 0.05 - 0.004 * number as f32;
-    let kinds: [(DepthKind, &dyn Fn(usize, f32) -> f32); 2] =
-        [(DepthKind::Relative, &relative), (DepthKind::Inverse, &inverse)];
+    type Distort<'a> = &'a dyn Fn(usize, f32) -> f32;
+    let kinds: [(DepthKind, Distort); 2] = [(DepthKind::Relative, &relative), (DepthKind::Inverse, &inverse)];
     for (kind, value) in kinds {
         let (maps, store) = (capture.join(format!("{kind:?}")), memory());
         write_maps(&maps, &truth, value);
