@@ -38,9 +38,10 @@ fn a_plain_stays_coarse_while_houses_are_refined() {
     let (mut settled, mut refined) = (Vec::new(), Vec::new());
     for task in plan.tasks.iter().filter(|task| task.block.level == 2) {
         let of_parent = owned(&result("adaptive", task.parent.unwrap()), task);
-        let grown = owned(&result("adaptive", task.block), task) > of_parent;
+        // A refined block may end with fewer: its own views show more free space than its parent's.
+        let changed = owned(&result("adaptive", task.block), task) != of_parent;
         let west = plan.ground.core(task.block).centre().x < -10.0;
-        if grown { refined.push(west) } else { settled.push(west) }
+        if changed { refined.push(west) } else { settled.push(west) }
     }
     assert!(settled.len() >= 2 && settled.iter().all(|west| *west), "settled {settled:?}, refined {refined:?}");
     assert!(refined.iter().filter(|west| !*west).count() >= 6, "settled {settled:?}, refined {refined:?}");
