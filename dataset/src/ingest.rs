@@ -8,6 +8,7 @@
 mod depths;
 mod error;
 mod from_map;
+mod undistorter;
 
 use std::fs::File;
 use std::io::Read;
@@ -16,13 +17,14 @@ use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Mutex, PoisonError};
 
 use scene::frame::{self, Kind};
-use scene::{ArtefactId, BadInput, Camera, CameraModel, Capture, Pinhole, Pixels, View};
+use scene::{ArtefactId, BadInput, Camera, Capture, Pinhole, Pixels, View};
 use serde::{Deserialize, Serialize};
 use store::{BlockingStore, StoreError};
 
 use self::depths::Depths;
 pub use self::error::IngestError;
 pub use self::from_map::Used;
+use self::undistorter::{LastUndistorter, undistorter};
 use crate::open::{Photo, Source};
 use crate::photo::DecodedPhoto;
 use crate::undistortion::Undistorter;
@@ -152,9 +154,6 @@ struct Job<'a> {
     downscale: u32,
 }
 
-/// The undistorter of the last photo, by lens and size. Consecutive photos mostly share a lens.
-type LastUndistorter = Option<((CameraModel, u32, u32), Undistorter)>;
-
 /// The cached ingest of a photo.
 #[derive(Serialize, Deserialize)]
 struct IngestRecord {
@@ -274,24 +273,6 @@ impl Job<'_> {
             }
         }
         Ok(Some(record))
-    }
-}
-
-/// The undistorter of a photo, whose pinhole has to be the camera of its view.
-fn undistorter<'a>(
-    photo: &Photo,
-    pinhole: Pinhole,
-    last: &'a mut LastUndistorter,
-) -> Result<&'a Undistorter, BadInput> {
-    let key = (photo.model, photo.width, photo.height);
-    let cached = last.take().filter(|(of, _)| *of == key).map(|(_, undistorter)| undistorter);
-    let undistorter = cached.or_else(|| Undistorter::new(&photo.model, photo.width, photo.height));
-    match undistorter.filter(|undistorter| undistorter.pinhole() == pinhole) {
-        Some(undistorter) => Ok(&last.insert((key, undistorter)).1),
-        None => {
-            let advice = "check the parameters of its camera";
-            Err(BadInput::new(show(&photo.path), "was taken with a lens whose distortion cannot be inverted", advice))
-        }
     }
 }
 

@@ -6,9 +6,9 @@ use glam::DVec2;
 use scene::{ArtefactId, BadInput, Capture, Pixels, View};
 use store::BlockingStore;
 
-use super::LastUndistorter;
 use super::error::IngestError;
 use super::from_map::{FromMap, Maps};
+use super::undistorter::LastUndistorter;
 use crate::depth_samples::DepthSamples;
 use crate::lidar::{Sweep, visible};
 use crate::mip_tiles::MipLayout;

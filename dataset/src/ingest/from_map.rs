@@ -3,7 +3,7 @@
 use glam::DVec2;
 use scene::{BadInput, Capture};
 
-use super::{LastUndistorter, undistorter};
+use super::undistorter::{LastUndistorter, undistorter};
 use crate::depth_maps::alignment::{Alignment, MIN_POINTS};
 use crate::depth_maps::{DepthKind, Sampler};
 use crate::observations::Observations;
