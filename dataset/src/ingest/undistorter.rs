@@ -21,7 +21,11 @@ pub(super) fn undistorter<'a>(
         Some(undistorter) => Ok(&last.insert((key, undistorter)).1),
         None => {
             let advice = "check the parameters of its camera";
-            Err(BadInput::new(show(&photo.path), "was taken with a lens whose distortion cannot be inverted", advice))
+            Err(BadInput::new(
+                photo.path.display().to_string(),
+                "was taken with a lens whose distortion cannot be inverted",
+                advice,
+            ))
         }
     }
 }
