@@ -26,6 +26,7 @@ mod cameras;
 mod gallery;
 mod gltf;
 mod ground_truth;
+mod lidar_turn;
 mod manifest;
 mod nuscenes;
 mod occupancy;

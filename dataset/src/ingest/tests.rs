@@ -1,7 +1,7 @@
 use std::sync::Arc;
 
 use image::{DynamicImage, GrayImage, ImageFormat, Luma};
-use scene::{Rect, Rigid};
+use scene::{CameraModel, Rect, Rigid};
 use store::Store;
 
 use super::*;

@@ -13,14 +13,16 @@ use std::path::Path;
 
 use scene::nuscenes::{self, CalibratedSensor, Datum};
 use scene::transforms::Intrinsics;
-use scene::{BadInput, CodecError, Rigid};
+use scene::{BadInput, Rigid};
 
 use self::boxes::Boxes;
-use super::files::{self, CaptureRoot, Found};
+use self::tables::Tables;
+use super::files::{CaptureRoot, Found};
 use super::parsed::{OpenOptions, ParsedCapture, ParsedSweep, PosedImage, RawPoints};
 use crate::lidar::PointFormat;
 
 mod boxes;
+mod tables;
 
 /// A photo belongs to the sweep nearest in time, within this.
 const SAME_MICROSECONDS: u64 = 100_000;
@@ -161,37 +163,5 @@ fn assign(times: &[i64], sweeps: &mut [(i64, ParsedSweep)]) {
         if let Some((_, sweep)) = nearest.filter(|(other, _)| other.abs_diff(time) <= SAME_MICROSECONDS) {
             sweep.images.push(id);
         }
-    }
-}
-
-/// The tables of a version.
-struct Tables<'a> {
-    root: &'a CaptureRoot,
-    version: String,
-}
-
-impl Tables<'_> {
-    fn read<T>(&self, table: &str, read: impl FnOnce(&[u8]) -> Result<T, CodecError>) -> Result<T, BadInput> {
-        let name = format!("{}/{table}.json", self.version);
-        let missing = || BadInput::new(format!("{}: {name}", self.root), "is not there", "download the tables again");
-        let path = self.root.file(&name).ok_or_else(missing)?;
-        read(&files::read(&path)?).map_err(|e| self.bad(table, e.to_string()))
-    }
-
-    /// The row that a table names.
-    fn row<'a, T>(
-        &self,
-        rows: &'a BTreeMap<String, T>,
-        table: &str,
-        named: &str,
-        token: &str,
-    ) -> Result<&'a T, BadInput> {
-        let nowhere = || self.bad(table, format!("names a row '{token:.40}' that {named}.json lacks"));
-        rows.get(token).ok_or_else(nowhere)
-    }
-
-    fn bad(&self, table: &str, problem: String) -> BadInput {
-        let file = self.root.path(&format!("{}/{table}.json", self.version));
-        BadInput::new(files::show(&file), problem, "correct the file or download the tables again")
     }
 }

@@ -12,6 +12,7 @@
 //! the errors of the reported cameras.
 
 mod objects;
+mod sample;
 mod sweep;
 mod tables;
 
@@ -29,34 +30,18 @@ use serde_json::json;
 use store::file::{SaveError, save};
 
 use self::objects::{Object, Scene};
+use self::sample::Sample;
 pub(super) use self::sweep::{LIDAR, save_sweep};
 use self::tables::{Tables, chained, quaternion, token};
+use super::lidar_turn::LidarTurn;
 use super::output::create_folder;
 use super::settings::{Progress, Settings, SynthError};
 use super::shots::Station;
-use super::sweeps::LidarTurn;
 
 /// The folder below the capture.
 pub(super) const FOLDER: &str = "nuscenes";
 const VERSION: &str = "v1.0-mini";
 const MAP: &str = "maps/none.png";
-
-/// A place of a drive with its readings.
-pub(super) struct Sample<'a> {
-    station: &'a Station,
-    photos: Vec<&'a Shot>,
-    turn: Option<&'a LidarTurn>,
-}
-
-impl Sample<'_> {
-    fn token(&self) -> String {
-        token(&["sample", &self.station.name])
-    }
-
-    fn microseconds(&self) -> i64 {
-        (self.station.seconds * 1e6).round() as i64
-    }
-}
 
 /// Writes tables and photos; the sweeps are there ([`save_sweep`]). `shots` are sorted by name, `turns` those of the stations.
 pub(super) fn write(
@@ -94,7 +79,7 @@ pub(super) fn write(
         tables.push("sensor", json!({ "token": token(&["sensor", LIDAR]), "channel": LIDAR, "modality": "lidar" }));
         tables.push("calibrated_sensor", calibrated(LIDAR, &sweep::vehicle_from_sensor(), &json!([])));
     }
-    tables.push_classes();
+    objects::push_classes(&mut tables);
     let mut logs = Vec::new();
     for (done, (leg, samples)) in drives.iter().enumerate() {
         progress("nuscenes", done + 1, drives.len());

@@ -17,18 +17,11 @@ use scene::{Rigid, npy};
 use serde_json::json;
 use store::file::{SaveError, save};
 
+use super::lidar_turn::LidarTurn;
 use super::nuscenes;
 use super::output::create_folder;
 use super::settings::{Progress, Settings, SynthError, unsupported};
 use super::shots::Station;
-
-/// A turn of a car's lidar.
-pub(super) struct LidarTurn {
-    /// World from the sensor at the middle of the turn: x ahead, y left, z up.
-    pub(super) pose: Rigid,
-    /// Number of returns by instance.
-    pub(super) hits: BTreeMap<u32, u32>,
-}
 
 /// Writes `lidar/` and `radar/`, as far as the settings enable them, and returns the turns of the lidar by station.
 pub(super) fn write(

@@ -7,7 +7,7 @@ use scene::nuscenes::{self, Annotation};
 use scene::{BadInput, CameraModel, Rigid};
 
 use super::super::moving_boxes::{corners, moving};
-use super::Tables;
+use super::tables::Tables;
 
 /// An object whose boxes have an attribute with this ending moves.
 const MOVING: &str = ".moving";

@@ -10,10 +10,10 @@ use scene::Rigid;
 use serde_json::{Value, json};
 
 use super::super::tracks_and_boxes::bounds;
-use super::Sample;
+use super::sample::Sample;
 use super::tables::{Tables, chained, quaternion, token};
 
-pub(super) const CATEGORIES: [&str; 6] = [
+const CATEGORIES: [&str; 6] = [
     "human.pedestrian.adult",
     "vehicle.bicycle",
     "vehicle.bus.rigid",
@@ -21,7 +21,7 @@ pub(super) const CATEGORIES: [&str; 6] = [
     "vehicle.motorcycle",
     "vehicle.truck",
 ];
-pub(super) const ATTRIBUTES: [&str; 7] = [
+const ATTRIBUTES: [&str; 7] = [
     "cycle.with_rider",
     "cycle.without_rider",
     "pedestrian.moving",
@@ -31,8 +31,7 @@ pub(super) const ATTRIBUTES: [&str; 7] = [
     "vehicle.stopped",
 ];
 /// Levels of visibility and their upper ends.
-pub(super) const VISIBILITIES: [(&str, f64); 4] =
-    [("0-40", 0.4), ("40-60", 0.6), ("60-80", 0.8), ("80-100", f64::INFINITY)];
+const VISIBILITIES: [(&str, f64); 4] = [("0-40", 0.4), ("40-60", 0.6), ("60-80", 0.8), ("80-100", f64::INFINITY)];
 
 /// Objects this near to the car are annotated, metres.
 const RANGE_METRES: f64 = 70.0;
@@ -59,6 +58,20 @@ pub(super) struct Scene<'a> {
     pub(super) city: &'a City,
     pub(super) samples: &'a [Sample<'a>],
     pub(super) objects: &'a [Vec<Object>],
+}
+
+/// Categories, attributes and levels of visibility.
+pub(super) fn push_classes(tables: &mut Tables) {
+    for (table, names) in [("category", &CATEGORIES[..]), ("attribute", &ATTRIBUTES)] {
+        let row =
+            |name: &&str| json!({ "token": token(&[table, name]), "name": name, "description": "as in nuScenes" });
+        tables.extend(table, names.iter().map(row).collect());
+    }
+    for (i, (level, _)) in VISIBILITIES.iter().enumerate() {
+        let description = format!("{level} % of the object are visible to the camera that sees most of it");
+        let row = json!({ "token": (i + 1).to_string(), "level": format!("v{level}"), "description": description });
+        tables.push("visibility", row);
+    }
 }
 
 /// The objects of a sample.

@@ -12,7 +12,7 @@ use store::file::{SaveError, save};
 use super::super::shots::Station;
 
 /// The lidar's name.
-pub(in super::super) const LIDAR: &str = "LIDAR_TOP";
+pub(crate) const LIDAR: &str = "LIDAR_TOP";
 
 /// Path of a station's sweep, relative to the data set.
 pub(super) fn file(station: &Station) -> String {
@@ -30,7 +30,7 @@ pub(super) fn world_from_vehicle(world_from_turn: &Rigid) -> Rigid {
 }
 
 /// Writes the sweep of a station into a data set. The folder exists.
-pub(in super::super) fn save_sweep(
+pub(crate) fn save_sweep(
     root: &Path,
     station: &Station,
     pose: &Rigid,

@@ -4,11 +4,10 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use glam::DQuat;
-use serde_json::{Value, json};
+use serde_json::Value;
 use store::file::{SaveError, save};
 
 use super::super::output::create_folder;
-use super::objects::{ATTRIBUTES, CATEGORIES, VISIBILITIES};
 
 /// All tables. The devkit needs each, also without rows.
 const NAMES: [&str; 13] = [
@@ -38,20 +37,6 @@ impl Tables {
 
     pub(super) fn extend(&mut self, table: &'static str, rows: Vec<Value>) {
         self.0.entry(table).or_default().extend(rows);
-    }
-
-    /// Categories, attributes and levels of visibility.
-    pub(super) fn push_classes(&mut self) {
-        for (table, names) in [("category", &CATEGORIES[..]), ("attribute", &ATTRIBUTES)] {
-            let row =
-                |name: &&str| json!({ "token": token(&[table, name]), "name": name, "description": "as in nuScenes" });
-            self.extend(table, names.iter().map(row).collect());
-        }
-        for (i, (level, _)) in VISIBILITIES.iter().enumerate() {
-            let description = format!("{level} % of the object are visible to the camera that sees most of it");
-            let row = json!({ "token": (i + 1).to_string(), "level": format!("v{level}"), "description": description });
-            self.push("visibility", row);
-        }
     }
 
     /// Writes a file for each table, a row a line.
