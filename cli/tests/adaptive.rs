@@ -35,13 +35,20 @@ fn a_plain_stays_coarse_while_houses_are_refined() {
             |i: &usize| plan.ground.owns(task.block, place(*i)) && task.donor(&plan.ground, place(*i)).is_none();
         (0..splats.len()).filter(of_block).count()
     };
+    let in_core = |splats: &Splats, task: &Task| {
+        (0..splats.len()).filter(|&i| plan.ground.owns(task.block, splats.mean(i).as_dvec3())).count()
+    };
     let (mut settled, mut refined) = (Vec::new(), Vec::new());
     for task in plan.tasks.iter().filter(|task| task.block.level == 2) {
-        let of_parent = owned(&result("adaptive", task.parent.unwrap()), task);
-        // A refined block may end with fewer: its own views show more free space than its parent's.
-        let changed = owned(&result("adaptive", task.block), task) != of_parent;
+        let [parent, own] = [task.parent.unwrap(), task.block].map(|block| result("adaptive", block));
         let west = plan.ground.core(task.block).centre().x < -10.0;
-        if changed { refined.push(west) } else { settled.push(west) }
+        if owned(&own, task) == owned(&parent, task) {
+            settled.push(west);
+        } else {
+            refined.push(west);
+            let [before, after] = [&parent, &own].map(|splats| in_core(splats, task));
+            assert!(after > before, "{}: {after} splats of the parent's {before}", task.block);
+        }
     }
     assert!(settled.len() >= 2 && settled.iter().all(|west| *west), "settled {settled:?}, refined {refined:?}");
     assert!(refined.iter().filter(|west| !*west).count() >= 6, "settled {settled:?}, refined {refined:?}");
