@@ -1,8 +1,6 @@
 use super::*;
+use crate::lidar::Return;
 use crate::open::Source;
-
-/// A firing's azimuth gives its time only up to the half column that the reader does not know of.
-const SAME_METRES: f64 = 0.02;
 
 /// A city with several drives, as a plain capture and as nuScenes.
 fn drives() -> (tempfile::TempDir, Source, Vec<Source>) {
@@ -45,26 +43,29 @@ fn drives_as_nuscenes_have_the_cameras_and_sweeps_of_the_capture() {
 
     // The same points, once corrected for the car's motion by the reader and once by the writer.
     let stem = |path: &Path| path.file_name().unwrap().to_string_lossy().split('.').next().unwrap().to_owned();
-    let mut sweeps = 0;
+    let (mut sweeps, mut compared, mut largest) = (0, 0, 0.0_f64);
     for sweep in scenes.iter().flat_map(|scene| &scene.sweeps) {
         let expected = plain.sweeps.iter().find(|other| stem(&other.path) == stem(&sweep.path)).unwrap();
         assert!(expected.turn.is_some() && sweep.turn.is_none() && sweep.views.len() == expected.views.len());
         let (ours, theirs) = (sweep.read().unwrap(), expected.read().unwrap());
-        // Both are the same firings in the same order. The nearest returns are left out by their range, which one takes
-        // from where the sensor was when it fired and the other from where it was in the middle of the turn.
-        let (mut next, mut found) = (0, 0);
-        for one in &ours {
-            let ahead = theirs[next..].iter().take(400);
-            let same = ahead.map(|other| one.place.distance(other.place)).position(|distance| distance < SAME_METRES);
-            if let Some(same) = same {
-                (next, found) = (next + same + 1, found + 1);
-            }
+        // The returns at the ends of the range are left out by one and not by the other: it counts from where the sensor was
+        // when it fired, or in the middle of the turn.
+        let sensor = sweep.world_from_sensor.translation;
+        let places = |returns: Vec<Return>| -> Vec<DVec3> {
+            let places = returns.into_iter().map(|found| found.place);
+            places.filter(|place| (4.0..70.0).contains(&place.distance(sensor))).collect()
+        };
+        let [ours, theirs] = [ours, theirs].map(places);
+        assert!(ours.len() > 1000 && ours.len().abs_diff(theirs.len()) < 5, "{} and {}", ours.len(), theirs.len());
+        if ours.len() == theirs.len() {
+            compared += 1;
+            largest = ours.iter().zip(&theirs).map(|(a, b)| a.distance(*b)).fold(largest, f64::max);
         }
-        let all = ours.len().max(theirs.len());
-        assert!(found > 1000 && found as f64 > 0.98 * all as f64, "{found} of {} and {}", ours.len(), theirs.len());
         sweeps += 1;
     }
     assert_eq!(sweeps, plain.sweeps.len());
+    // A firing's azimuth gives its time only up to the half column that the reader does not know of.
+    assert!(2 * compared > sweeps && largest < 0.02, "{largest} m in {compared} of {sweeps} sweeps");
     let labels: usize = scenes.iter().flat_map(|scene| scene.labels.values()).sum();
     assert!(labels > 20 && scenes.iter().any(|scene| scene.labels.contains_key("vehicle.car")), "{labels}");
 }
