@@ -1,16 +1,18 @@
 #!/usr/bin/env bash
-# Whether others read what `plat synth` writes: a small capture of it, opened by pycolmap and by Khronos' glTF validator.
-# Fetches both into a folder of its own. PLAT names the program; without it, it is built.
+# Whether others read what `plat synth` writes: small captures of it, opened by pycolmap, the devkit of nuScenes and
+# Khronos' glTF validator. Fetches them into a folder of its own. PLAT names the program; without it, it is built.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
 scratch=$(mktemp -d)
 trap 'rm -rf "$scratch"' EXIT
-synth=(synth --out "$scratch/city" --area-km2 0.05 --views 24 --size 96x54 --mesh --quiet)
-if [[ -n "${PLAT:-}" ]]; then "$PLAT" "${synth[@]}"; else cargo run --release --locked -- "${synth[@]}"; fi
+synth() { if [[ -n "${PLAT:-}" ]]; then "$PLAT" synth "$@"; else cargo run --release --locked -- synth "$@"; fi; }
+synth --out "$scratch/city" --area-km2 0.05 --views 24 --size 96x54 --mesh --quiet
+synth --out "$scratch/drives" --area-km2 0.02 --views 96 --aerial 0 --size 192x108 --spacing 8 --traffic heavy \
+    --lidar --nuscenes --truth --quiet
 
 python3 -m venv "$scratch/venv"
-"$scratch/venv/bin/pip" install --quiet --disable-pip-version-check pycolmap==4.2.1
+"$scratch/venv/bin/pip" install --quiet --disable-pip-version-check pycolmap==4.2.1 nuscenes-devkit==1.2.0
 "$scratch/venv/bin/python" - "$scratch/city" <<'PYTHON'
 import json, pathlib, sys
 import pycolmap
@@ -28,6 +30,53 @@ for point in model.points3D.values():
         at = model.images[element.image_id].project_point(point.xyz)
         assert at is not None, "a point behind a camera that saw it"
 print("pycolmap:", model.summary().replace("\n", " "))
+PYTHON
+
+# The devkit's cameras are COLMAP's, and its returns lie where the photos' true depths are.
+"$scratch/venv/bin/python" - "$scratch/drives" <<'PYTHON'
+import pathlib, sys
+import numpy, pycolmap
+from nuscenes.nuscenes import NuScenes, NuScenesExplorer
+from pyquaternion import Quaternion
+
+city = pathlib.Path(sys.argv[1])
+data = NuScenes(version="v1.0-mini", dataroot=str(city / "nuscenes"), verbose=False)
+model = pycolmap.Reconstruction(str(city / "sparse/0"))
+cameras = {pathlib.Path(image.name).stem: image for image in model.images.values()}
+photos, sweeps, off, errors = 0, 0, 0.0, []
+for row in data.sample_data:
+    mounted = data.get("calibrated_sensor", row["calibrated_sensor_token"])
+    vehicle = data.get("ego_pose", row["ego_pose_token"])
+    assert (city / "nuscenes" / row["filename"]).is_file(), row["filename"]
+    if row["sensor_modality"] == "lidar":
+        sweeps += 1
+        continue
+    photos += 1
+    image = cameras[pathlib.Path(row["filename"]).stem]
+    turn, place = Quaternion(vehicle["rotation"]), numpy.array(vehicle["translation"])
+    centre = place + turn.rotate(numpy.array(mounted["translation"]))
+    world_from_camera = (turn * Quaternion(mounted["rotation"])).rotation_matrix
+    ours = image.cam_from_world().matrix()
+    off = max(off, abs(centre + ours[:, :3].T @ ours[:, 3]).max(), abs(world_from_camera.T - ours[:, :3]).max())
+    matrix = image.camera.calibration_matrix()
+    off = max(off, abs(matrix - numpy.array(mounted["camera_intrinsic"])).max())
+explorer = NuScenesExplorer(data)
+for sample in data.sample:
+    if "LIDAR_TOP" not in sample["data"]:
+        continue
+    for channel, camera in sample["data"].items():
+        if not channel.startswith("CAM_"):
+            continue
+        points, depths, _ = explorer.map_pointcloud_to_image(sample["data"]["LIDAR_TOP"], camera)
+        truth = numpy.load(city / f"depth/{pathlib.Path(data.get('sample_data', camera)['filename']).stem}.npy")
+        x, y = points[0].astype(int), points[1].astype(int)
+        true = truth[y, x]
+        errors.extend(abs(depths[true > 0] / true[true > 0] - 1))
+median = float(numpy.median(errors))
+print(f"nuScenes devkit: {len(data.scene)} scenes, {photos} photos, {sweeps} sweeps,",
+      f"{len(data.sample_annotation)} boxes; cameras within {off:.1e} of COLMAP's, {len(errors)} returns, depths off by {100 * median:.2f} % (median)")
+assert photos == model.num_images() and sweeps > 0 and len(data.sample_annotation) > 0
+assert off < 1e-4 and len(errors) > 1000 and median < 0.02
 PYTHON
 
 npm install --silent --no-audit --no-fund --prefix "$scratch/npm" gltf-validator@2.0.0-dev.3.10
