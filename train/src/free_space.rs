@@ -22,7 +22,7 @@ const OCCUPIED: u8 = u8::MAX;
 const LINES_PER_POINT: usize = 8;
 /// Most lines of sight in all; of more points, every n-th is used.
 const MAX_LINES: usize = 1 << 21;
-/// Longest line of sight, in voxels. Longer ones are left out.
+/// Longest part of a line of sight in the grid, in voxels. Lines with longer ones are left out.
 const MAX_LENGTH: f64 = 4096.0;
 /// Positions on a line, for each voxel of its length.
 const SAMPLES_PER_VOXEL: f64 = 1.5;
@@ -95,19 +95,36 @@ impl FreeSpace {
 
     /// Counts a line of sight in the voxels that it crosses, each once. It may miss a voxel of which it cuts a corner.
     fn add_line(&mut self, from: DVec3, to: DVec3) {
+        let Some([enter, leave]) = self.crossing(from, to) else { return };
         let length = (to - from).length() / self.edge_metres;
-        if length.is_nan() || length > MAX_LENGTH {
+        let crosses = length * (leave - enter) <= MAX_LENGTH;
+        if !crosses {
             return;
         }
-        let samples = (length * SAMPLES_PER_VOXEL) as usize;
+        let samples = (length * SAMPLES_PER_VOXEL).floor();
+        let (first, end) = ((enter * samples) as u64, (leave * samples).ceil() as u64);
         let mut last = None;
-        for sample in 0..samples {
-            let at = self.index(self.voxel(from.lerp(to, sample as f64 / samples as f64)));
+        for sample in first..end {
+            let at = self.index(self.voxel(from.lerp(to, sample as f64 / samples)));
             if let Some(index) = at.filter(|_| at != last) {
                 self.lines[index] = (self.lines[index] + 1).min(OCCUPIED - 1);
             }
             last = at;
         }
+    }
+
+    /// Where a line enters the grid and leaves it, as shares of its length; `None` if it passes by.
+    fn crossing(&self, from: DVec3, to: DVec3) -> Option<[f64; 2]> {
+        let high = self.origin + self.size.as_dvec3() * self.edge_metres;
+        let (mut enter, mut leave) = (0.0f64, 1.0f64);
+        for axis in 0..3 {
+            let along = to[axis] - from[axis];
+            let [low, high] = [self.origin[axis], high[axis]].map(|side| (side - from[axis]) / along);
+            // A line along a side has no number here, which max and min leave out.
+            enter = enter.max(low.min(high));
+            leave = leave.min(low.max(high));
+        }
+        (enter < leave).then_some([enter, leave])
     }
 
     /// Marks the voxel of a point and its neighbours.
@@ -224,6 +241,20 @@ mod tests {
         assert!(FreeSpace::new(&capture, &[0, 1], |place| place.x < 0.0).is_none(), "too few points");
         let without_tracks = SparsePoints { track_start: Vec::new(), seen_by: Vec::new(), ..capture.points.clone() };
         assert!(FreeSpace::new(&Capture { points: without_tracks, ..capture }, &[0, 1], |_| true).is_none());
+    }
+
+    #[test]
+    fn cameras_far_outside_of_the_grid_see_through_it() {
+        let mut capture = wall();
+        for view in &mut capture.views {
+            view.camera.camera_from_world.translation.x += 30_000.0;
+        }
+        let free = FreeSpace::new(&capture, &[0, 1], |_| true).unwrap();
+        // Both lines to a point run side by side, half a metre before the wall and on to the grid's other end.
+        for x in [0.0, 5.0, 9.0] {
+            assert!(free.contains(Vec3::new(x, 0.5, 5.0)), "{x}");
+        }
+        assert!(!free.contains(Vec3::new(10.0, 0.5, 5.0)));
     }
 
     #[test]
