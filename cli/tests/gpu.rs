@@ -77,6 +77,27 @@ fn a_job_on_a_gpu_is_as_good_and_survives_kills() {
 }
 
 #[test]
+fn exposures_and_poses_train_on_a_gpu_as_on_the_cpu() {
+    if gpu().is_none() {
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    common::city(at, 20, 64, 48);
+    let words = |out| ["--out", out, "--exposure", "--refine-poses"];
+    let psnr = |report: Value| report["psnr"].as_f64().expect("held-out views are measured");
+    let [cpu, one, _] =
+        [("cpu", "cpu"), ("gpu", "one"), ("gpu", "two")].map(|(on, out)| psnr(done(at, on, &words(out))));
+    println!("{cpu:.2} dB on the CPU, {one:.2} dB on the GPU");
+    assert!((cpu - one).abs() < 0.2, "{cpu} {one}");
+    let bytes = |path: String| std::fs::read(at.join(path)).unwrap();
+    for file in ["merged.ply", "cameras.json", "model/exposures.plat", "model/poses.plat"] {
+        assert!(bytes(format!("one/{file}")) == bytes(format!("two/{file}")), "{file} differs from run to run");
+        assert!(file == "merged.ply" || bytes(format!("cpu/{file}")) != bytes(format!("one/{file}")), "{file}");
+    }
+}
+
+#[test]
 fn too_little_memory_ends_the_job_and_names_the_block() {
     if gpu().is_none() {
         return;
