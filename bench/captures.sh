@@ -24,5 +24,5 @@ fox fox/pinhole_270 1 400 14000 25
 aerial_caliterra aerial_caliterra 4 2400 16000 100
 street_lund street_lund 4 1500 6000 100
 building_sceaux building_sceaux 4 500 5000 50
-drive_kitti_odom_1 drive_kitti_odom_1 2 1500 15000 0
+drive_kitti_odom_1 drive_kitti_odom_1 2 1200 30000 0
 CAPTURES
