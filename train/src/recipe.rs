@@ -84,7 +84,7 @@ impl Default for Recipe {
             coarse: vec![0.2, 0.5],
             detail_factor: 2.0,
             views_per_step: 1,
-            initial_opacity: 0.1,
+            initial_opacity: 0.5,
             growth: Growth::default(),
             pose: [0.1, 0.004],
             pose_from: 0.05,
