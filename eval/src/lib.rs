@@ -7,13 +7,16 @@
 //! Architecture invariant: no command line, no terminal, no clock. Progress and time come from the caller's [`Observer`].
 
 mod birdseye;
+mod depth;
 mod details;
 mod error;
 mod evaluate;
 mod figures;
 mod fits;
+mod groups;
 mod held_out;
 mod images;
+mod judges;
 mod label_colours;
 mod lpips;
 mod metric_maps;
@@ -29,13 +32,16 @@ pub mod cuts;
 pub mod seams;
 
 pub use birdseye::{birdseye_camera, oblique_camera};
+pub use depth::{DepthFigures, DepthSummary};
 pub use details::{DetailOptions, Details, Levels};
 pub use error::EvalError;
 pub use evaluate::{Evaluation, Request, evaluate};
 pub use figures::{FIGURES, Means, ViewFigures, figures_from_frame, figures_to_frame, mean};
 pub use fits::Fits;
+pub use groups::{Groups, Kinds};
 pub use held_out::figures_of_views;
 pub use images::{frame_image, write_png};
+pub use judges::DepthReport;
 pub use label_colours::coloured_by;
 pub use lpips::Lpips;
 pub use observer::{Observer, Seconds};

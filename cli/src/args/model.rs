@@ -46,6 +46,10 @@ pub(crate) struct EvalArgs {
     /// Also measure LPIPS with this network (ONNX)
     #[arg(long, value_name = "FILE", long_help = LPIPS_HELP)]
     pub(crate) lpips: Option<PathBuf>,
+    /// Also measure the error of the rendered depth, against the true depth of a capture of `plat synth --truth`, else against the
+    /// capture's lidar and metric depth maps
+    #[arg(long)]
+    pub(crate) depth: bool,
     /// Also measure the tree cut at level L, or at every level, against the finest model
     #[arg(long, value_name = "L|all", value_parser = levels)]
     pub(crate) level: Option<Levels>,

@@ -4,6 +4,7 @@
 
 use std::path::Path;
 
+use dataset::ingest::TrueDepth;
 use eval::{DetailOptions, Details, Evaluation, Fits, Lpips, PhotoOptions, Photos, Request};
 use model::{Model, save_json};
 
@@ -40,6 +41,7 @@ pub(crate) fn measure(args: &EvalArgs, output: &Output) -> Result<Evaluated, Fai
         test_every: args.test_every,
         test_stretches: args.test_stretches,
     };
+    let depth = args.depth.then(|| TrueDepth::open(&args.capture)).transpose()?;
     let photos = captures::photos_of(&model, &source, &photos, output)?;
     let out = args.out.clone().unwrap_or_else(|| model.report_folder(&args.model, "eval"));
     let request = Request {
@@ -52,6 +54,7 @@ pub(crate) fn measure(args: &EvalArgs, output: &Output) -> Result<Evaluated, Fai
             pose: args.refine_poses || model.poses.is_some(),
             exposure: args.fit_exposure || model.exposures.is_some(),
         },
+        depth: depth.as_ref(),
         out: &out,
         trained: args.trained as usize,
     };
@@ -72,7 +75,7 @@ pub(crate) fn measure_trained(
 ) -> Result<Evaluated, Failure> {
     let (details, backend) = (Details::default(), train::Backend::Cpu);
     let fits = Fits { pose: model.poses.is_some(), exposure: model.exposures.is_some() };
-    let request = Request { model, details: &details, photos, backend: &backend, lpips, fits, out, trained: 0 };
+    let request = Request { model, details: &details, photos, backend: &backend, lpips, fits, depth: None, out, trained: 0 };
     let evaluated = evaluated(&request, output)?;
     save_json(&out.join("report.json"), &evaluated)?;
     Ok(evaluated)
@@ -94,7 +97,7 @@ fn evaluated(request: &Request, output: &Output) -> Result<Evaluated, Failure> {
         ..Record::new("eval")
     };
     record.set_figures(&evaluation.views);
-    let Evaluation { views, by_kind, stretches, trained_on, sheet, cuts, seams, .. } = evaluation;
+    let Evaluation { views, by_kind, stretches, trained_on, depth, sheet, cuts, seams, .. } = evaluation;
     let evaluated = Evaluated::new(record, views);
-    Ok(Evaluated { by_kind, stretches, trained_on, sheet: Some(sheet), cuts, seams, ..evaluated })
+    Ok(Evaluated { by_kind, stretches, trained_on, depth, sheet: Some(sheet), cuts, seams, ..evaluated })
 }
