@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use blocks::{Part, view_kinds};
 use dataset::ingest::TrueDepth;
 use model::{Model, Tree};
+use perceive::Detector;
 use render::{Frame, Options};
 use scene::{BadInput, Camera, Splats};
 use train::Backend;
@@ -15,7 +16,7 @@ use crate::details::Details;
 use crate::figures::{Comparison, ViewFigures, clamped};
 use crate::fits::{Fits, Fitter};
 use crate::images::{colour_image, photo_image, write_png};
-use crate::judges::{DepthReport, Judged, Judges};
+use crate::judges::{DepthReport, DetectionReport, Judged, Judges};
 use crate::seams::{SeamFrames, SeamMeter, SeamReport};
 use crate::sheet::{SheetRow, contact_sheet};
 use crate::summary::{ByKind, Group};
@@ -43,6 +44,8 @@ pub struct Request<'a> {
     pub fits: Fits,
     /// True depths to compare with.
     pub depth: Option<&'a TrueDepth>,
+    /// What finds objects on photos and renders.
+    pub detector: Option<&'a Detector>,
     /// Folder for contact sheets and pictures; created if need be.
     pub out: &'a Path,
     /// How many views that were trained on to measure as well, evenly chosen.
@@ -66,6 +69,8 @@ pub struct Evaluation {
     pub trained_on: Option<Group>,
     /// Depth errors.
     pub depth: Option<DepthReport>,
+    /// Detections on photos and renders.
+    pub detections: Option<DetectionReport>,
     /// The contact sheet.
     pub sheet: PathBuf,
     /// In the order of the request.
@@ -88,8 +93,9 @@ pub fn evaluate(request: &Request, observer: &dyn Observer) -> Result<Evaluation
         return Err(BadInput::new("--test-every", "holds out no view", advice).into());
     }
     let of_photos = |&index: &u32| &photos.capture.views[index as usize];
-    let mut judges = Judges::new(request.depth, photos.downscale, held_out.iter().map(of_photos))?;
-    let options = Options { extras: judges.need_depth(), ..model.options() };
+    let mut judges = Judges::new(request.depth, request.detector, photos.downscale, held_out.iter().map(of_photos))?;
+    let extras = judges.need_depth();
+    let options = Options { extras, inverse_depth: extras, ..model.options() };
     std::fs::create_dir_all(out).map_err(|error| EvalError::Folder { path: out.to_path_buf(), error })?;
     let reader = photos.reader(CACHE_BYTES);
     let mut renderer = Renderer::new(backend)?;
@@ -162,7 +168,7 @@ pub fn evaluate(request: &Request, observer: &dyn Observer) -> Result<Evaluation
     }
 
     let kinds = view_kinds(&photos.capture);
-    let Judged { depth } = judges.finish(&kinds);
+    let Judged { depth, detections } = judges.finish(&kinds);
     let in_stretches = views.split_off(test.len());
     let sheet = out.join("sheet.png");
     write_png(&sheet, &contact_sheet(&rows))?;
@@ -174,6 +180,7 @@ pub fn evaluate(request: &Request, observer: &dyn Observer) -> Result<Evaluation
         stretches: Group::of(in_stretches, &stretches, &kinds),
         trained_on: Group::of(trained_figures, &trained, &kinds),
         depth,
+        detections,
         sheet,
         cuts: cuts.map_or(Vec::new(), CutMeter::figures),
         seams: seams.map(|seams| seams.finish(&photos.capture, out, &mut renderer)).transpose()?,

@@ -46,17 +46,16 @@ impl<S> Groups<S> {
             Kinds { all: summary(&of(part, None)), aerial, street }
         };
         let if_any = |part: Part| figures.iter().any(|(of, ..)| *of == part).then(|| by_kind(part));
-        Self {
-            held_out: by_kind(Part::Test),
-            stretches: if_any(Part::Stretch),
-            trained_on: if_any(Part::Trained),
-        }
+        Self { held_out: by_kind(Part::Test), stretches: if_any(Part::Stretch), trained_on: if_any(Part::Trained) }
     }
 
     /// The summaries that are there, with their names.
     pub fn named(&self) -> Vec<(String, &S)> {
-        let groups =
-            [("held out", Some(&self.held_out)), ("stretches", self.stretches.as_ref()), ("trained on", self.trained_on.as_ref())];
+        let groups = [
+            ("held out", Some(&self.held_out)),
+            ("stretches", self.stretches.as_ref()),
+            ("trained on", self.trained_on.as_ref()),
+        ];
         let mut all = Vec::new();
         for (name, group) in groups {
             let Some(Kinds { all: of_all, aerial, street }) = group else { continue };

@@ -111,7 +111,10 @@ mod tests {
     use super::*;
     use crate::card::Written;
 
-    const [PERSON, CAR, TRUCK, BENCH]: [usize; 4] = [0, 2, 7, 13];
+    const PERSON: usize = 0;
+    const CAR: usize = 2;
+    const TRUCK: usize = 7;
+    const BENCH: usize = 13;
 
     fn at(class: usize, score: f32, left: f32) -> Detection {
         Detection { class, score, corners: [left, 0.0, left + 10.0, 10.0] }

@@ -112,7 +112,12 @@ impl Card {
         }
         let expected: usize = card.strides.iter().map(|stride| (height / stride) * (width / stride)).sum();
         let is_even = card.strides.iter().all(|stride| height.is_multiple_of(*stride) && width.is_multiple_of(*stride));
-        if !is_even || anchors != expected || anchors == 0 || numbers != BOX_NUMBERS + card.classes.len() || numbers == BOX_NUMBERS {
+        if !is_even
+            || anchors != expected
+            || anchors == 0
+            || numbers != BOX_NUMBERS + card.classes.len()
+            || numbers == BOX_NUMBERS
+        {
             return Err(wanted());
         }
         Ok(Self { input: [width, height], written: card })
@@ -158,7 +163,16 @@ mod tests {
         let text = "strides = [8, 16]\nclasses = ['car', 'person']\nchannels = 'rgb'\nwhite = 1.0\npad = 0";
         let card = Card::of(&two, Some(text)).unwrap();
         assert_eq!((card.written.channels, card.written.white, card.written.head), (Channels::Rgb, 1.0, Head::Yolox));
-        for bad in ["strides = []", "strides = [0]", "white = 0.0", "white = inf", "head = 'ssd'", "colour = 'rgb'", "=", "classes = []"] {
+        for bad in [
+            "strides = []",
+            "strides = [0]",
+            "white = 0.0",
+            "white = inf",
+            "head = 'ssd'",
+            "colour = 'rgb'",
+            "=",
+            "classes = []",
+        ] {
             let error = Card::of(&two, Some(bad)).unwrap_err();
             assert!(!error.contains('\n'), "{error}");
         }

@@ -99,11 +99,12 @@ mod tests {
     #[test]
     fn numbers_and_boxes_are_those_of_onnxruntime() {
         let Some(detector) = yolox() else { return };
-        for Expected { photo, sum, raw, boxes } in PHOTOS {
+        for Expected { photo, columns, sum, raw, boxes } in PHOTOS {
             let Some(path) = shared(&format!("images_street/kitti_object/image_2/{photo}")) else { return };
             let image = image::open(path).unwrap().to_rgb8();
-            let (width, height) = (image.width() as usize, image.height() as usize);
-            let picture = Picture { rgb: image.as_raw(), width, height };
+            let of_row = |row: &[u8]| row[3 * columns.start..3 * columns.end].to_vec();
+            let rgb: Vec<u8> = image.chunks_exact(3 * image.width() as usize).flat_map(of_row).collect();
+            let picture = Picture { rgb: &rgb, width: columns.len(), height: image.height() as usize };
             let output = detector.raw(letterbox(&picture, &detector.card).0).unwrap();
             let mut worst = 0.0f32;
             for (anchor, numbers) in raw {
@@ -111,11 +112,11 @@ mod tests {
                 worst = found.iter().zip(numbers).map(|(a, b)| (a - b).abs()).fold(worst, f32::max);
             }
             let total: f64 = output.iter().map(|v| f64::from(v.abs())).sum();
-            let found = detector.detect(&picture, 0.04).unwrap();
+            let found = detector.detect(&picture, 0.12).unwrap();
             println!("{photo}: raw within {worst:.2e}, sum {total:.4} of {sum:.4}, {} boxes", found.len());
             assert!(worst < 1e-3 && (total - sum).abs() < 1e-4 * sum);
             assert_eq!(found.len(), boxes.len(), "{photo}: {found:?}");
-            for (found, (class, score, corners)) in found.iter().zip(*boxes) {
+            for (found, (class, score, corners)) in found.iter().zip(boxes) {
                 assert!(found.class == *class && (found.score - score).abs() < 1e-3, "{photo}: {found:?}");
                 let off = found.corners.iter().zip(corners).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
                 assert!(off < 0.5, "{photo}: {found:?} is off by {off} pixels");

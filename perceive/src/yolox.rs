@@ -10,7 +10,8 @@ pub(crate) fn decode(output: &[f32], card: &Card, placed: &Placed, threshold: f3
     let [width, height] = card.input;
     let cells = card.written.strides.iter().flat_map(|&stride| {
         let columns = width / stride;
-        (0..columns * (height / stride)).map(move |cell| (stride as f32, (cell % columns) as f32, (cell / columns) as f32))
+        (0..columns * (height / stride))
+            .map(move |cell| (stride as f32, (cell % columns) as f32, (cell / columns) as f32))
     });
     let numbers = BOX_NUMBERS + card.written.classes.len();
     let detection = |((stride, column, row), anchor): ((f32, f32, f32), &[f32])| {
@@ -35,8 +36,23 @@ pub(crate) fn decode(output: &[f32], card: &Card, placed: &Placed, threshold: f3
 
 #[cfg(test)]
 mod tests {
+    use proptest::prelude::*;
+
     use super::*;
+    use crate::boxes::suppressed;
     use crate::card::Written;
+
+    proptest! {
+        #[test]
+        fn any_numbers_give_boxes_inside_the_picture(output in prop::collection::vec(any::<f32>(), 10 * 7)) {
+            let written = Written { strides: vec![8, 16], classes: vec!["a".into(), "b".into()], ..Written::default() };
+            let card = Card { input: [32, 16], written };
+            let placed = Placed { scale: [2.0, 2.0], size: [64.0, 30.0] };
+            for Detection { corners: [left, top, right, bottom], .. } in suppressed(decode(&output, &card, &placed, 0.3), 0.45) {
+                prop_assert!(0.0 <= left && left < right && right <= 64.0 && 0.0 <= top && top < bottom && bottom <= 30.0);
+            }
+        }
+    }
 
     #[test]
     fn anchors_become_boxes_of_the_picture() {

@@ -76,8 +76,9 @@ impl ViewDepths<'_> {
         self.numbers.get(name).is_some_and(|&number| self.depths.concerns(number))
     }
 
-    /// Depths along the optical axis at the pixels of an ingested view that its mask (of the view's size, usable from 128) leaves. Reads the files of this view only. Of views
-    /// with a map of over 262,144 pixels, every second, fourth … pixel in both directions.
+    /// Depths along the optical axis at the pixels of an ingested view that its mask (of the view's size, usable from 128)
+    /// leaves. Reads the files of this view only. Of views of over 262,144 pixels a map gives every second, fourth … pixel in
+    /// both directions.
     ///
     /// # Errors
     /// Files that cannot be read, or a view that is not of this capture.
