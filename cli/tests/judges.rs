@@ -87,7 +87,7 @@ fn a_detector_is_run_on_photos_and_renders() {
     done(at, &["train", "city", "--out", "out", "--steps", "60", "--budget", "600", "--tolerance-db", "0"]);
     let words = |file: &'static str| ["eval", "out", "city", "--quiet", "--detector", file];
     fs::write(at.join("text.onnx"), "no network").unwrap();
-    refused(at, &words("text.onnx"), "text.onnx is not an ONNX graph");
+    refused(at, &words("text.onnx"), "text.onnx: is not an ONNX graph");
     refused(at, &words("missing.onnx"), "missing.onnx");
     let [Some(other), Some(yolox)] =
         ["fastestdet_352.onnx", "yolox_nano_416.onnx"].map(|n| shared(&format!("detectors/{n}")))

@@ -1,10 +1,12 @@
 //! Errors of rendered depth against true depth: AbsRel, RMSE and δ < 1.25 as Eigen et al. (2014) define them.
 //!
-//! The rendered depth of a pixel is the harmonic mean over its splats, Σ αT / Σ (αT / z), along the optical axis, which the loss of
-//! target depths fits too. The mean of z itself would measure the sky: one percent of a dome at 1 km adds 10 m to a wall.
+//! The rendered depth of a pixel is the harmonic mean over its splats, Σ αT / Σ (αT / z), along the optical axis, which
+//! the loss of target depths fits too. The mean of z itself would measure the sky: one percent of a dome at 1 km adds
+//! 10 m to a wall.
 //!
-//! All unmasked pixels with a true depth count. A pixel whose alpha is not above [`MIN_ALPHA`] has no depth; it is taken as 0, an
-//! error of all of the true depth: leaving such pixels out would reward holes. The sky has no true depth and does not count.
+//! All unmasked pixels with a true depth count. A pixel whose alpha is not above [`MIN_ALPHA`] has no depth; it is
+//! taken as 0, an error of all of the true depth: leaving such pixels out would reward holes. The sky has no true depth
+//! and does not count.
 
 use dataset::depth_samples::DepthSamples;
 use render::Frame;

@@ -1,7 +1,7 @@
 //! How many of the objects that a detector finds on a photo it still finds on the render of the same view.
 //!
-//! Both are pictures of the same size with 8 bits a channel. Masked pixels (moving objects, which no model shows) are the photo's in
-//! both, and detections of which more than half is masked are left out of both.
+//! Both are pictures of the same size with 8 bits a channel. Masked pixels (moving objects, which no model shows) are
+//! the photo's in both, and detections of which more than half is masked are left out of both.
 
 use perceive::{Agreement, Counts, Detection, Detector, Picture, SCORE, agreement};
 use scene::{BadInput, Pixels};

@@ -1,7 +1,8 @@
 //! Measures a model against the held-out photos of a capture.
 //!
 //! [`evaluate`] renders every held-out view once and compares it with its photo: PSNR, SSIM, SSIMULACRA2, LPIPS. On request it also
-//! measures the cuts of a level-of-detail tree ([`cuts`]) and the seams between blocks ([`seams`]) on the same views.
+//! measures the depth, what a detector finds, the cuts of a level-of-detail tree ([`cuts`]) and the seams between blocks
+//! ([`seams`]) on the same views.
 //! [`Pruner`] prunes a model by a capture's photos. Contact sheets, error maps and bird's-eye cameras are here too.
 //!
 //! Architecture invariant: no command line, no terminal, no clock. Progress and time come from the caller's [`Observer`].

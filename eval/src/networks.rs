@@ -20,7 +20,8 @@ pub(crate) fn read_network(path: &Path, advice: &'static str) -> Result<Vec<u8>,
     read(path, FILE_LIMIT, advice)
 }
 
-/// Loads a detector from an ONNX file, with the model card of its name and the extension `toml` if there is one beside it.
+/// Loads a detector from an ONNX file, with the model card of its name and the extension `toml` if there is one beside
+/// it.
 ///
 /// # Errors
 /// A file that cannot be read, or a network that is not a detector whose output is understood.

@@ -1,7 +1,8 @@
 //! How far the detections on a photo and on a render of the same view agree.
 //!
-//! A detection on the photo is *kept* if the render has one of the same group of classes that overlaps it by at least 0.5. Cars, buses
-//! and trucks are one group: which of them a van is may change with a few pixels. Every other class is a group of its own.
+//! A detection on the photo is *kept* if the render has one of the same group of classes that overlaps it by at least
+//! 0.5. Cars, buses and trucks are one group: which of them a van is may change with a few pixels. Every other class is
+//! a group of its own.
 
 use std::ops::AddAssign;
 
@@ -69,8 +70,8 @@ enum Group {
     Class(usize),
 }
 
-/// Compares detections on a photo and on its render; `classes` are the names of the detector's classes. In order of their scores,
-/// detections on the render take that on the photo which they overlap most and no other has taken.
+/// Compares detections on a photo and on its render; `classes` are the names of the detector's classes. In order of
+/// their scores, detections on the render take that on the photo which they overlap most and no other has taken.
 pub fn agreement(photo: &[Detection], render: &[Detection], classes: &[String]) -> Agreement {
     let group = |of: &Detection| {
         let name = classes.get(of.class).map_or("", String::as_str);

@@ -22,8 +22,8 @@ pub fn iou(a: [f32; 4], b: [f32; 4]) -> f32 {
 /// Most boxes that are compared with each other; of more, those with the highest scores.
 const MAX_BOXES: usize = 3000;
 
-/// Non-maximum suppression by class: in order of their scores, boxes that overlap an earlier one of their class by more than `limit`
-/// are dropped. Equal scores keep their order.
+/// Non-maximum suppression by class: in order of their scores, boxes that overlap an earlier one of their class by more
+/// than `limit` are dropped. Equal scores keep their order.
 pub(crate) fn suppressed(mut found: Vec<Detection>, limit: f32) -> Vec<Detection> {
     found.sort_by(|a, b| b.score.total_cmp(&a.score));
     found.truncate(MAX_BOXES);

@@ -1,6 +1,7 @@
 //! Model cards: how pictures go into a detector and what its numbers mean. ONNX does not say it.
 //!
-//! A network with the shapes of YOLOX has a card built in. A TOML file of the network's name beside it changes the card:
+//! A network with the shapes of YOLOX has a card built in. A TOML file of the network's name beside it changes the
+//! card:
 //!
 //! ```toml
 //! head = "yolox"            # the only one so far
@@ -66,7 +67,8 @@ impl Default for Written {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Head {
-    /// A row an anchor: centre as an offset in strides, log of the size in strides, objectness, and classes, both in 0..1.
+    /// A row an anchor: centre as an offset in strides, log of the size in strides, objectness, and classes, both in
+    /// 0..1.
     Yolox,
 }
 

@@ -26,7 +26,8 @@ pub struct Detector {
 }
 
 impl Detector {
-    /// Loads a detector from the bytes of its ONNX file; `card` is the text of the TOML file beside it, if there is one.
+    /// Loads a detector from the bytes of its ONNX file; `card` is the text of the TOML file beside it, if there is
+    /// one.
     ///
     /// # Errors
     /// Bytes that are no ONNX graph, or one that does not fit its card.
@@ -42,7 +43,8 @@ impl Detector {
         &self.card
     }
 
-    /// The objects in a picture with at least this score, best first. Of boxes of a class that overlap by more than 0.45 the best stays.
+    /// The objects in a picture with at least this score, best first. Of boxes of a class that overlap by more than
+    /// 0.45 the best stays.
     ///
     /// # Errors
     /// A picture without pixels, or a network that cannot be run.

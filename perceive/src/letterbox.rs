@@ -1,4 +1,5 @@
-//! Fits a picture into a network's input without changing its shape: YOLOX's way, in the upper left corner with grey beside it.
+//! Fits a picture into a network's input without changing its shape: YOLOX's way, in the upper left corner with grey
+//! beside it.
 
 use crate::Picture;
 use crate::card::{Card, Channels};

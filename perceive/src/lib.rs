@@ -1,8 +1,8 @@
 //! What a detector sees in photos and in renders, and how far both agree.
 //!
-//! A [`Detector`] is an ONNX network with a [`Card`] that says how pictures go in and boxes come out. [`agreement`] compares the
-//! detections on a photo with those on a render of the same view. [`network`] runs graphs of others so that they cannot crash the
-//! program.
+//! A [`Detector`] is an ONNX network with a [`Card`] that says how pictures go in and boxes come out. [`agreement`]
+//! compares the detections on a photo with those on a render of the same view. [`network`] runs graphs of others so
+//! that they cannot crash the program.
 //!
 //! Architecture invariant: functions of bytes and pixels; no files, no network, no clock. The caller reads the files.
 

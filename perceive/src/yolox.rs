@@ -4,8 +4,8 @@ use crate::boxes::Detection;
 use crate::card::{BOX_NUMBERS, Card};
 use crate::letterbox::Placed;
 
-/// The detections in a network's output (anchors × (5 + classes)) whose score, objectness times that of the likeliest class, is at
-/// least `threshold`, in the order of the anchors. Boxes that are not finite or empty are left out.
+/// The detections in a network's output (anchors × (5 + classes)) whose score, objectness times that of the likeliest
+/// class, is at least `threshold`, in the order of the anchors. Boxes that are not finite or empty are left out.
 pub(crate) fn decode(output: &[f32], card: &Card, placed: &Placed, threshold: f32) -> Vec<Detection> {
     let [width, height] = card.input;
     let cells = card.written.strides.iter().flat_map(|&stride| {
@@ -48,8 +48,10 @@ mod tests {
             let written = Written { strides: vec![8, 16], classes: vec!["a".into(), "b".into()], ..Written::default() };
             let card = Card { input: [32, 16], written };
             let placed = Placed { scale: [2.0, 2.0], size: [64.0, 30.0] };
-            for Detection { corners: [left, top, right, bottom], .. } in suppressed(decode(&output, &card, &placed, 0.3), 0.45) {
-                prop_assert!(0.0 <= left && left < right && right <= 64.0 && 0.0 <= top && top < bottom && bottom <= 30.0);
+            for found in suppressed(decode(&output, &card, &placed, 0.3), 0.45) {
+                let [left, top, right, bottom] = found.corners;
+                prop_assert!(0.0 <= left && left < right && right <= 64.0, "{:?}", found);
+                prop_assert!(0.0 <= top && top < bottom && bottom <= 30.0, "{:?}", found);
             }
         }
     }

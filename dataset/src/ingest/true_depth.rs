@@ -1,5 +1,5 @@
-//! What is known of the true depth of a capture's views, to compare renders with: of captures of `plat synth --truth` the depth of
-//! every pixel, of others what their lidar and metric depth maps measured.
+//! What is known of the true depth of a capture's views, to compare renders with: of captures of `plat synth --truth`
+//! the depth of every pixel, of others what their lidar and metric depth maps measured.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -76,9 +76,9 @@ impl ViewDepths<'_> {
         self.numbers.get(name).is_some_and(|&number| self.depths.concerns(number))
     }
 
-    /// Depths along the optical axis at the pixels of an ingested view that its mask (of the view's size, usable from 128)
-    /// leaves. Reads the files of this view only. Of views of over 262,144 pixels a map gives every second, fourth … pixel in
-    /// both directions.
+    /// Depths along the optical axis at the pixels of an ingested view that its mask (of the view's size, usable from
+    /// 128) leaves. Reads the files of this view only. Of views of over 262,144 pixels a map gives every second, fourth
+    /// … pixel in both directions.
     ///
     /// # Errors
     /// Files that cannot be read, or a view that is not of this capture.

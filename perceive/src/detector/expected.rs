@@ -1,6 +1,8 @@
-//! Numbers that onnxruntime 1.32 gave for YOLOX-Nano on photos of KITTI's object benchmark, for the test of the detector.
+//! Numbers that onnxruntime 1.32 gave for YOLOX-Nano on photos of KITTI's object benchmark, for the test of the
+//! detector.
 
-/// Of some columns of a photo, resized in double precision as `letterbox` does, run and decoded with onnxruntime and numpy.
+/// Of some columns of a photo, resized in double precision as `letterbox` does, run and decoded with onnxruntime and
+/// numpy.
 pub(super) struct Expected {
     pub(super) photo: &'static str,
     /// The part of the photo.
