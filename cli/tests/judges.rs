@@ -51,6 +51,11 @@ fn depth_is_compared_with_the_truth_and_with_lidar() {
     let text = String::from_utf8(plat(at, &["eval", "plain", "city", "--depth"]).stdout).unwrap();
     assert!(text.contains("depth against truth") && text.contains("held out, street"), "{text}");
 
+    // A benchmark's line has them too.
+    let run = ["bench", "pareto", "city", "--label", "l", "--results", "r", "--out", "p", "--depth", "--no-lidar"];
+    let line = done(at, &[&run[..], &["--steps", "20", "--budget", "300", "--blocks", "whole"]].concat());
+    assert!(figure(&line, "depth_absrel") > 0.0 && figure(&line, "depth_delta1") <= 1.0, "{line}");
+
     // Files of views that are not evaluated are not read.
     let photos: Vec<String> = plain["depth"]["by_view"].as_array().unwrap()[..8]
         .iter()
