@@ -38,7 +38,8 @@ pub struct DetectionReport {
 /// The judges of an evaluation, and their figures so far.
 pub(crate) struct Judges<'a> {
     depth: Option<DepthJudge<'a>>,
-    detector: Option<(&'a Detector, Vec<(Part, u32, DetectionFigures)>)>,
+    detector: Option<&'a Detector>,
+    detections: Vec<(Part, u32, DetectionFigures)>,
 }
 
 struct DepthJudge<'a> {
@@ -68,7 +69,7 @@ impl<'a> Judges<'a> {
             let advice = "hold out other views with --test-every, or leave --depth";
             return Err(BadInput::new("--depth", "finds no depths of any held-out view", advice));
         }
-        Ok(Self { depth, detector: detector.map(|detector| (detector, Vec::new())) })
+        Ok(Self { depth, detector, detections: Vec::new() })
     }
 
     /// Whether frames need a depth.
@@ -91,8 +92,9 @@ impl<'a> Judges<'a> {
             let truth = depth.views.of_view(view, photo.mask.as_deref())?;
             depth.figures.push((part, index, DepthFigures::new(&view.name, frame, &truth)));
         }
-        if let Some((detector, figures)) = &mut self.detector {
-            figures.push((part, index, DetectionFigures::new(&view.name, detector, photo, &frame.colour)?));
+        if let Some(detector) = self.detector {
+            let figures = DetectionFigures::new(&view.name, detector, photo, &frame.colour)?;
+            self.detections.push((part, index, figures));
         }
         Ok(())
     }
@@ -104,10 +106,10 @@ impl<'a> Judges<'a> {
             groups: Groups::of(&figures, kinds, DepthSummary::of),
             by_view: figures.into_iter().map(|(_, _, figures)| figures).collect(),
         });
-        let detections = self.detector.map(|(_, figures)| DetectionReport {
+        let detections = self.detector.map(|_| DetectionReport {
             score: SCORE,
-            groups: Groups::of(&figures, kinds, DetectionSummary::of),
-            by_view: figures.into_iter().map(|(_, _, figures)| figures).collect(),
+            groups: Groups::of(&self.detections, kinds, DetectionSummary::of),
+            by_view: self.detections.into_iter().map(|(_, _, figures)| figures).collect(),
         });
         Judged { depth, detections }
     }

@@ -103,7 +103,7 @@ impl Card {
             let all = BOX_NUMBERS + classes;
             format!("has the shapes {shapes}, and YOLOX of {classes} classes has 1×3×H×W in, 1×anchors×{all} out")
         };
-        let (&[ref input], &[ref output]) = (&shapes.inputs[..], &shapes.outputs[..]) else { return Err(wanted()) };
+        let ([input], [output]) = (&shapes.inputs[..], &shapes.outputs[..]) else { return Err(wanted()) };
         let (&[Some(1), Some(3), Some(height), Some(width)], &[Some(1), Some(anchors), Some(numbers)]) =
             (&input[..], &output[..])
         else {
