@@ -72,6 +72,12 @@ pub struct ResultLine {
     pub zone_psnr: Option<f64>,
     /// Share of the detections on photos that are also detected on renders.
     pub detections_kept: Option<f64>,
+    /// Mean relative error of the rendered depth over held-out views.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub depth_absrel: Option<f64>,
+    /// Share of their pixels whose depth is within a factor of 1.25.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub depth_delta1: Option<f64>,
     /// Final number of splats.
     pub splats: Option<u64>,
     /// Size of the model, bytes.
@@ -131,7 +137,8 @@ impl ResultLine {
     fn is_finite(&self) -> bool {
         let numbers = [Some(self.cpu_seconds), Some(self.psnr), self.wall_seconds, self.ssim, self.lpips];
         let more = [self.tolerance_db, self.cc_psnr, self.perceptual, self.zone_psnr, self.detections_kept, self.fps];
-        numbers.iter().chain(&more).flatten().all(|v| v.is_finite())
+        let depth = [self.depth_absrel, self.depth_delta1];
+        numbers.iter().chain(&more).chain(&depth).flatten().all(|v| v.is_finite())
             && self.curve.iter().all(|p| p.cpu_seconds.is_finite() && p.psnr.is_finite())
     }
 }

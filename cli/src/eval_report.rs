@@ -4,7 +4,8 @@ use std::path::PathBuf;
 
 use eval::cuts::CutFigures;
 use eval::seams::SeamReport;
-use eval::{ByKind, Group, Summary, ViewFigures, mean};
+use eval::{ByKind, DepthReport, DetectionReport, Group, Summary, ViewFigures, mean};
+use perceive::Counts;
 use serde::Serialize;
 
 use crate::run_record::Record;
@@ -34,6 +35,12 @@ pub(crate) struct Evaluated {
     /// With `--trained`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) trained_on: Option<Group>,
+    /// With `--depth`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(crate) depth: Option<DepthReport>,
+    /// With `--detector`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(crate) detections: Option<DetectionReport>,
     /// With `--level` or `--budget`.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub(crate) cuts: Vec<CutFigures>,
@@ -56,6 +63,8 @@ impl Evaluated {
             by_kind: ByKind::default(),
             stretches: None,
             trained_on: None,
+            depth: None,
+            detections: None,
             cuts: Vec::new(),
             seams: None,
         }
@@ -104,6 +113,12 @@ pub(crate) fn text(evaluated: &Evaluated) -> String {
         text += &line(&name, [psnr, cc_psnr, ssim, ssimulacra2, lpips, None, None]);
     }
     text += &format!("rendered on {}\n", record.backend);
+    if let Some(report) = &evaluated.depth {
+        text += &format!("\n{}", depth(report));
+    }
+    if let Some(report) = &evaluated.detections {
+        text += &format!("\n{}", detections(report));
+    }
     if !evaluated.cuts.is_empty() {
         text += &format!("\n{}\n", cuts(&evaluated.cuts));
     }
@@ -126,6 +141,31 @@ fn summaries(evaluated: &Evaluated) -> Vec<(String, Summary)> {
         all.extend(by_kind(&format!("{name}, "), group.by_kind));
     }
     all
+}
+
+fn depth(report: &DepthReport) -> String {
+    let [absrel, rmse, delta, empty, pixels] = ["AbsRel", "RMSE m", "δ<1.25", "empty", "pixels"];
+    let mut text =
+        format!("{absrel:>8} {rmse:>8} {delta:>8} {empty:>8} {pixels:>11}  depth against {}\n", report.source);
+    for (name, of) in report.groups.named() {
+        let [absrel, delta1, empty] = [of.absrel, of.delta1, of.empty].map(|value| figure(value, 4));
+        let rmse = figure(of.rmse, 2);
+        text +=
+            &format!("{absrel:>8} {rmse:>8} {delta1:>8} {empty:>8} {:>11}  {name}: {} views\n", of.pixels, of.views);
+    }
+    text
+}
+
+fn detections(report: &DetectionReport) -> String {
+    let mut text = String::from(" photos  renders     kept    extra  detections with a score of ");
+    text += &format!("{} or more\n", report.score);
+    for (name, of) in report.groups.named() {
+        for (classes, Counts { photos, renders, kept, extra }) in of.counts.named() {
+            let views = of.views;
+            text += &format!("{photos:>7} {renders:>8} {kept:>8} {extra:>8}  {classes}, {name}: {views} views\n");
+        }
+    }
+    text
 }
 
 fn figure(value: Option<f64>, digits: usize) -> String {

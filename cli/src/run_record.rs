@@ -65,6 +65,7 @@ impl Record {
     pub(crate) fn set_quality(&mut self, by: &Self) {
         (self.psnr, self.ssim, self.perceptual) = (by.psnr, by.ssim, by.perceptual);
         (self.lpips, self.fps, self.cc_psnr) = (by.lpips, by.fps, by.cc_psnr);
+        self.detections_kept = by.detections_kept;
     }
 
     /// A line of bench/results; `invoked` is the command line.
@@ -91,6 +92,8 @@ impl Record {
             perceptual: self.perceptual,
             zone_psnr: self.zone_psnr,
             detections_kept: self.detections_kept,
+            depth_absrel: None,
+            depth_delta1: None,
             splats: Some(self.splats),
             bytes: self.bytes,
             peak_memory_bytes: self.peak_memory_bytes,

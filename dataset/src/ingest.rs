@@ -8,6 +8,7 @@
 mod depths;
 mod error;
 mod from_map;
+mod true_depth;
 mod undistorter;
 
 use std::fs::File;
@@ -24,6 +25,7 @@ use store::{BlockingStore, StoreError};
 use self::depths::Depths;
 pub use self::error::IngestError;
 pub use self::from_map::Used;
+pub use self::true_depth::{TrueDepth, ViewDepths};
 use self::undistorter::{LastUndistorter, undistorter};
 use crate::open::{Photo, Source};
 use crate::photo::DecodedPhoto;

@@ -21,6 +21,7 @@ mod nuscenes;
 mod opensfm;
 mod parsed;
 mod transforms;
+mod truth;
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -33,6 +34,7 @@ use scene::{BadInput, Camera, CameraModel, Capture, GeoOrigin, Pinhole, View};
 use self::files::{CaptureRoot, Found};
 pub use self::parsed::OpenOptions;
 use self::parsed::{ParsedCapture, PosedImage};
+pub(crate) use self::truth::truth_folder;
 use crate::depth_maps::DepthFile;
 use crate::lidar::Sweep;
 use crate::lidar::seeds::{Seeds, seeds};

@@ -4,7 +4,9 @@ use std::borrow::Cow;
 use std::path::{Path, PathBuf};
 
 use blocks::{Part, view_kinds};
+use dataset::ingest::TrueDepth;
 use model::{Model, Tree};
+use perceive::Detector;
 use render::{Frame, Options};
 use scene::{BadInput, Camera, Splats};
 use train::Backend;
@@ -14,6 +16,7 @@ use crate::details::Details;
 use crate::figures::{Comparison, ViewFigures, clamped};
 use crate::fits::{Fits, Fitter};
 use crate::images::{colour_image, photo_image, write_png};
+use crate::judges::{DepthReport, DetectionReport, Judged, Judges};
 use crate::seams::{SeamFrames, SeamMeter, SeamReport};
 use crate::sheet::{SheetRow, contact_sheet};
 use crate::summary::{ByKind, Group};
@@ -39,6 +42,10 @@ pub struct Request<'a> {
     pub lpips: Option<&'a Lpips>,
     /// What is fitted to each photo for further figures.
     pub fits: Fits,
+    /// True depths to compare with.
+    pub depth: Option<&'a TrueDepth>,
+    /// What finds objects on photos and renders.
+    pub detector: Option<&'a Detector>,
     /// Folder for contact sheets and pictures; created if need be.
     pub out: &'a Path,
     /// How many views that were trained on to measure as well, evenly chosen.
@@ -60,6 +67,10 @@ pub struct Evaluation {
     pub stretches: Option<Group>,
     /// Of views that were trained on.
     pub trained_on: Option<Group>,
+    /// Depth errors.
+    pub depth: Option<DepthReport>,
+    /// Detections on photos and renders.
+    pub detections: Option<DetectionReport>,
     /// The contact sheet.
     pub sheet: PathBuf,
     /// In the order of the request.
@@ -81,6 +92,10 @@ pub fn evaluate(request: &Request, observer: &dyn Observer) -> Result<Evaluation
         let advice = "give a number from 1 to that of the views";
         return Err(BadInput::new("--test-every", "holds out no view", advice).into());
     }
+    let of_photos = |&index: &u32| &photos.capture.views[index as usize];
+    let mut judges = Judges::new(request.depth, request.detector, photos.downscale, held_out.iter().map(of_photos))?;
+    let extras = judges.need_depth();
+    let options = Options { extras, inverse_depth: extras, ..model.options() };
     std::fs::create_dir_all(out).map_err(|error| EvalError::Folder { path: out.to_path_buf(), error })?;
     let reader = photos.reader(CACHE_BYTES);
     let mut renderer = Renderer::new(backend)?;
@@ -105,8 +120,10 @@ pub fn evaluate(request: &Request, observer: &dyn Observer) -> Result<Evaluation
         let view = &photos.capture.views[index as usize];
         let photo = reader.window(index, 0, view.camera.full())?;
         let began = observer.now();
-        let frame = renderer.render(&splats, &view.camera, &model.options())?;
+        let frame = renderer.render(&splats, &view.camera, &options)?;
         render_seconds.add(began, observer.now());
+        let part = if i < test.len() { Part::Test } else { Part::Stretch };
+        judges.add((part, index), view, &photo, frame)?;
         let compared = Comparison::new(&view.name, &frame.colour, &photo);
         let mut figures = compared.figures(lpips)?;
         let rendering = (&mut renderer, &splats, &model.options());
@@ -144,12 +161,14 @@ pub fn evaluate(request: &Request, observer: &dyn Observer) -> Result<Evaluation
     for (i, &index) in trained.iter().enumerate() {
         let view = &photos.capture.views[index as usize];
         let photo = reader.window(index, 0, view.camera.full())?;
-        let frame = renderer.render(&splats, &view.camera, &model.options())?;
+        let frame = renderer.render(&splats, &view.camera, &options)?;
+        judges.add((Part::Trained, index), view, &photo, frame)?;
         trained_figures.push(Comparison::new(&view.name, &frame.colour, &photo).figures(lpips)?);
         observer.progress("evaluating", (held_out.len() + i) as u64 + 1, total, "");
     }
 
     let kinds = view_kinds(&photos.capture);
+    let Judged { depth, detections } = judges.finish(&kinds);
     let in_stretches = views.split_off(test.len());
     let sheet = out.join("sheet.png");
     write_png(&sheet, &contact_sheet(&rows))?;
@@ -160,6 +179,8 @@ pub fn evaluate(request: &Request, observer: &dyn Observer) -> Result<Evaluation
         views,
         stretches: Group::of(in_stretches, &stretches, &kinds),
         trained_on: Group::of(trained_figures, &trained, &kinds),
+        depth,
+        detections,
         sheet,
         cuts: cuts.map_or(Vec::new(), CutMeter::figures),
         seams: seams.map(|seams| seams.finish(&photos.capture, out, &mut renderer)).transpose()?,

@@ -1,22 +1,28 @@
 //! Measures a model against the held-out photos of a capture.
 //!
 //! [`evaluate`] renders every held-out view once and compares it with its photo: PSNR, SSIM, SSIMULACRA2, LPIPS. On request it also
-//! measures the cuts of a level-of-detail tree ([`cuts`]) and the seams between blocks ([`seams`]) on the same views.
+//! measures the depth, what a detector finds, the cuts of a level-of-detail tree ([`cuts`]) and the seams between blocks
+//! ([`seams`]) on the same views.
 //! [`Pruner`] prunes a model by a capture's photos. Contact sheets, error maps and bird's-eye cameras are here too.
 //!
 //! Architecture invariant: no command line, no terminal, no clock. Progress and time come from the caller's [`Observer`].
 
 mod birdseye;
+mod depth;
 mod details;
+mod detections;
 mod error;
 mod evaluate;
 mod figures;
 mod fits;
+mod groups;
 mod held_out;
 mod images;
+mod judges;
 mod label_colours;
 mod lpips;
 mod metric_maps;
+mod networks;
 mod observer;
 mod photos;
 mod pruning;
@@ -29,15 +35,20 @@ pub mod cuts;
 pub mod seams;
 
 pub use birdseye::{birdseye_camera, oblique_camera};
+pub use depth::{DepthFigures, DepthSummary};
 pub use details::{DetailOptions, Details, Levels};
+pub use detections::{DetectionFigures, DetectionSummary};
 pub use error::EvalError;
 pub use evaluate::{Evaluation, Request, evaluate};
 pub use figures::{FIGURES, Means, ViewFigures, figures_from_frame, figures_to_frame, mean};
 pub use fits::Fits;
+pub use groups::{Groups, Kinds};
 pub use held_out::figures_of_views;
 pub use images::{frame_image, write_png};
+pub use judges::{DepthReport, DetectionReport};
 pub use label_colours::coloured_by;
 pub use lpips::Lpips;
+pub use networks::load_detector;
 pub use observer::{Observer, Seconds};
 pub use photos::{PhotoOptions, Photos};
 pub use pruning::Pruner;

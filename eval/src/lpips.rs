@@ -3,16 +3,14 @@
 //! plat does not ship the weights. `plat eval --help` says how to export the network. The file is any ONNX
 //! graph with two float inputs (1, 3, height, width) of sRGB values in -1..1 and one scalar output.
 
-use std::fs::File;
-use std::io::Read;
-use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::Path;
 
+use perceive::network::{self, without_panic};
 use rten::{Model, NodeId, Value};
 use scene::BadInput;
 
-/// LPIPS networks have 10 MB (AlexNet) to 60 MB (VGG).
-const FILE_LIMIT: u64 = 1 << 30;
+use crate::networks::read_network;
+
 const ADVICE: &str = "export the network as plat eval --help says";
 
 /// A network that computes the distance of two pictures.
@@ -31,16 +29,7 @@ impl Lpips {
     pub fn load(path: &Path) -> Result<Self, BadInput> {
         let file = path.display().to_string();
         let bad = |problem: String| BadInput::new(file.clone(), problem, ADVICE);
-        let mut bytes = Vec::new();
-        let opened = File::open(path).map(|opened| opened.take(FILE_LIMIT + 1));
-        opened
-            .and_then(|mut opened| opened.read_to_end(&mut bytes))
-            .map_err(|e| bad(format!("cannot be read ({e})")))?;
-        if bytes.len() as u64 > FILE_LIMIT {
-            return Err(bad(format!("is larger than {} MB", FILE_LIMIT >> 20)));
-        }
-        let model = without_panic(|| Model::load(bytes).map_err(|error| error.to_string()));
-        let model = model.map_err(|error| bad(format!("is not an ONNX graph that can be run ({error})")))?;
+        let model = network::load(read_network(path, ADVICE)?).map_err(bad)?;
         let (&[a, b], &[output]) = (model.input_ids(), model.output_ids()) else {
             let (inputs, outputs) = (model.input_ids().len(), model.output_ids().len());
             return Err(bad(format!("has {inputs} inputs and {outputs} outputs, LPIPS has 2 and 1")));
@@ -71,13 +60,4 @@ impl Lpips {
         let bad = |error| format!("does not compare two pictures of {width}×{height} ({error})");
         without_panic(run).map_err(|error| BadInput::new(self.file.clone(), bad(error), ADVICE))
     }
-}
-
-/// Runs the inference runtime; its panics on unusual graphs become errors.
-fn without_panic<T>(work: impl FnOnce() -> Result<T, String>) -> Result<T, String> {
-    let hook = std::panic::take_hook();
-    std::panic::set_hook(Box::new(|_| {}));
-    let done = catch_unwind(AssertUnwindSafe(work));
-    std::panic::set_hook(hook);
-    done.unwrap_or_else(|_| Err("the runtime panicked".to_owned()))
 }

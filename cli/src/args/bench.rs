@@ -50,6 +50,12 @@ pub(crate) struct ParetoArgs {
     /// Also measure LPIPS with this network (ONNX), see plat eval --help
     #[arg(long, value_name = "FILE")]
     pub(crate) lpips: Option<PathBuf>,
+    /// Also measure the error of the rendered depth, see plat eval --help
+    #[arg(long)]
+    pub(crate) depth: bool,
+    /// Also count what this detector (ONNX) finds on photos and on renders, see plat eval --help
+    #[arg(long, value_name = "FILE")]
+    pub(crate) detector: Option<PathBuf>,
     #[command(flatten)]
     pub(crate) sweep: Sweep,
 }

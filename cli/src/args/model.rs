@@ -46,6 +46,13 @@ pub(crate) struct EvalArgs {
     /// Also measure LPIPS with this network (ONNX)
     #[arg(long, value_name = "FILE", long_help = LPIPS_HELP)]
     pub(crate) lpips: Option<PathBuf>,
+    /// Also measure the error of the rendered depth: against the true depth of a capture of plat synth --truth, else against the
+    /// capture's lidar and metric depth maps
+    #[arg(long)]
+    pub(crate) depth: bool,
+    /// Also count what this detector (ONNX) finds on photos, on renders, and on both
+    #[arg(long, value_name = "FILE", long_help = DETECTOR_HELP)]
+    pub(crate) detector: Option<PathBuf>,
     /// Also measure the tree cut at level L, or at every level, against the finest model
     #[arg(long, value_name = "L|all", value_parser = levels)]
     pub(crate) level: Option<Levels>,
@@ -63,6 +70,19 @@ pub(crate) struct EvalArgs {
     #[arg(long, value_name = "M", value_parser = metres)]
     pub(crate) seam_metres: Option<f64>,
 }
+
+pub(super) const DETECTOR_HELP: &str = "\
+Also count what this detector finds on photos, on renders, and on both: a YOLOX network as an ONNX file of fixed sizes
+with undecoded boxes, such as YOLOX's tools/export_onnx.py writes. A file of the same name that ends in .toml, beside
+it, can change how pictures go in and what comes out; these are the defaults:
+
+    head = 'yolox'
+    strides = [8, 16, 32]
+    channels = 'bgr'         # or 'rgb'
+    white = 255.0            # value of a white pixel
+    pad = 114                # grey level beside the picture, of 255
+    classes = ['person', 'bicycle', ...]  # those of COCO
+";
 
 const LPIPS_HELP: &str = "\
 Also measure LPIPS with this network, an ONNX file with the weights inside: two inputs (1, 3, height, width) of sRGB

@@ -22,7 +22,7 @@ use crate::args::{
 use crate::captures::{self, ingest_photos};
 use crate::clock::{self, Stopwatch};
 use crate::commands::demo;
-use crate::commands::eval::{measure, measure_trained};
+use crate::commands::eval::{Further, measure, measure_trained};
 use crate::commands::train::{store_url, train};
 use crate::eval_report::text;
 use crate::failure::{Failure, make_folder, temporary_folder};
@@ -62,7 +62,7 @@ pub(crate) fn adaptive(args: &AdaptiveArgs, output: &Output) -> Result<(), Failu
         let model = model::read(&train.out)?;
         let split = model.split(&trained.capture, None, None);
         let photos = Photos::ingested(trained.capture, store, split, train.plan.downscale);
-        let evaluated = measure_trained(&model, &photos, None, &out, output)?;
+        let evaluated = measure_trained(&model, &photos, &Further::default(), &out, output)?;
         record.scene = "half a bare plain".into();
         record.set_quality(&evaluated.record);
         let settled = format!(

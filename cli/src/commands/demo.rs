@@ -14,7 +14,7 @@ use serde::Serialize;
 use store::Store;
 
 use crate::args::{Auto, Backend, Blocks, DemoArgs, DepthKind, PlanOptions, TrainArgs};
-use crate::commands::eval::measure_trained;
+use crate::commands::eval::{Further, measure_trained};
 use crate::commands::train::{Report, train};
 use crate::failure::Failure;
 use crate::output::Output;
@@ -64,7 +64,7 @@ pub(crate) fn build(args: &DemoArgs, output: &Output) -> Result<Built, Failure> 
     render_overviews(&model, &trained.capture, &birdseye, &oblique)?;
     let split = model.split(&trained.capture, None, None);
     let photos = Photos::ingested(trained.capture, store, split, train_args.plan.downscale);
-    let evaluated = measure_trained(&model, &photos, None, &eval_folder, output)?;
+    let evaluated = measure_trained(&model, &photos, &Further::default(), &eval_folder, output)?;
 
     let mut report = trained.report;
     report.record.set_quality(&evaluated.record);

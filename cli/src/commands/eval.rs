@@ -4,8 +4,10 @@
 
 use std::path::Path;
 
-use eval::{DetailOptions, Details, Evaluation, Fits, Lpips, PhotoOptions, Photos, Request};
+use dataset::ingest::TrueDepth;
+use eval::{DetailOptions, Details, Evaluation, Fits, Lpips, PhotoOptions, Photos, Request, load_detector};
 use model::{Model, save_json};
+use perceive::Detector;
 
 use crate::args::EvalArgs;
 use crate::eval_report::{Evaluated, text};
@@ -24,6 +26,7 @@ pub(crate) fn run(args: &EvalArgs, output: &Output) -> Result<(), Failure> {
 pub(crate) fn measure(args: &EvalArgs, output: &Output) -> Result<Evaluated, Failure> {
     let backend = backend::open(args.backend)?;
     let lpips = args.lpips.as_deref().map(Lpips::load).transpose()?;
+    let detector = args.detector.as_deref().map(load_detector).transpose()?;
     let model = model::read(&args.model)?;
     let options = DetailOptions {
         levels: args.level,
@@ -40,6 +43,7 @@ pub(crate) fn measure(args: &EvalArgs, output: &Output) -> Result<Evaluated, Fai
         test_every: args.test_every,
         test_stretches: args.test_stretches,
     };
+    let depth = args.depth.then(|| TrueDepth::open(&args.capture)).transpose()?;
     let photos = captures::photos_of(&model, &source, &photos, output)?;
     let out = args.out.clone().unwrap_or_else(|| model.report_folder(&args.model, "eval"));
     let request = Request {
@@ -52,6 +56,8 @@ pub(crate) fn measure(args: &EvalArgs, output: &Output) -> Result<Evaluated, Fai
             pose: args.refine_poses || model.poses.is_some(),
             exposure: args.fit_exposure || model.exposures.is_some(),
         },
+        depth: depth.as_ref(),
+        detector: detector.as_ref(),
         out: &out,
         trained: args.trained as usize,
     };
@@ -62,17 +68,27 @@ pub(crate) fn measure(args: &EvalArgs, output: &Output) -> Result<Evaluated, Fai
     Ok(evaluated)
 }
 
+/// What a trained model is measured by beside its photos.
+#[derive(Default)]
+pub(crate) struct Further<'a> {
+    pub(crate) lpips: Option<&'a Lpips>,
+    pub(crate) depth: Option<&'a TrueDepth>,
+    pub(crate) detector: Option<&'a Detector>,
+}
+
 /// Measures a model that was just trained on the CPU or a GPU and writes `report.json`. Renders on the CPU.
 pub(crate) fn measure_trained(
     model: &Model,
     photos: &Photos,
-    lpips: Option<&Lpips>,
+    further: &Further,
     out: &Path,
     output: &Output,
 ) -> Result<Evaluated, Failure> {
     let (details, backend) = (Details::default(), train::Backend::Cpu);
     let fits = Fits { pose: model.poses.is_some(), exposure: model.exposures.is_some() };
-    let request = Request { model, details: &details, photos, backend: &backend, lpips, fits, out, trained: 0 };
+    let Further { lpips, depth, detector } = *further;
+    let (details, backend) = (&details, &backend);
+    let request = Request { model, details, photos, backend, lpips, fits, depth, detector, out, trained: 0 };
     let evaluated = evaluated(&request, output)?;
     save_json(&out.join("report.json"), &evaluated)?;
     Ok(evaluated)
@@ -94,7 +110,8 @@ fn evaluated(request: &Request, output: &Output) -> Result<Evaluated, Failure> {
         ..Record::new("eval")
     };
     record.set_figures(&evaluation.views);
-    let Evaluation { views, by_kind, stretches, trained_on, sheet, cuts, seams, .. } = evaluation;
+    record.detections_kept = evaluation.detections.as_ref().and_then(|found| found.groups.held_out.all.share_kept);
+    let Evaluation { views, by_kind, stretches, trained_on, depth, detections, sheet, cuts, seams, .. } = evaluation;
     let evaluated = Evaluated::new(record, views);
-    Ok(Evaluated { by_kind, stretches, trained_on, sheet: Some(sheet), cuts, seams, ..evaluated })
+    Ok(Evaluated { by_kind, stretches, trained_on, depth, detections, sheet: Some(sheet), cuts, seams, ..evaluated })
 }

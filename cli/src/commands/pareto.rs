@@ -7,7 +7,8 @@ use std::fs;
 use std::path::PathBuf;
 
 use ::bench::{ResultLine, read};
-use eval::{Lpips, Photos};
+use dataset::ingest::TrueDepth;
+use eval::{Lpips, Photos, load_detector};
 use scene::BadInput;
 use serde::Serialize;
 use store::Store;
@@ -16,7 +17,7 @@ use train::random;
 use crate::args::{Auto, Backend, Named, ParetoArgs, PlanOptions, TrainArgs};
 use crate::captures;
 use crate::clock;
-use crate::commands::eval::measure_trained;
+use crate::commands::eval::{Further, measure_trained};
 use crate::commands::train::{Trained, resolved, store_url, train};
 use crate::eval_report::text;
 use crate::failure::{Failure, cannot};
@@ -44,9 +45,11 @@ struct Swept<'a> {
 
 pub(crate) fn run(args: &ParetoArgs, output: &Output) -> Result<(), Failure> {
     let lpips = args.lpips.as_deref().map(Lpips::load).transpose()?;
+    let detector = args.detector.as_deref().map(load_detector).transpose()?;
     if args.sweep.train.plan.evaluate {
         return Err(BadInput::new("--evaluate", "measures what each run is measured on anyway", "leave it").into());
     }
+    let further = Further { lpips: lpips.as_ref(), detector: detector.as_ref(), depth: None };
     let runs = runs(args)?;
     let file = args.results.join(RUNS);
     let mut existing = if file.exists() { read(&file)? } else { Vec::new() };
@@ -63,7 +66,7 @@ pub(crate) fn run(args: &ParetoArgs, output: &Output) -> Result<(), Failure> {
                 if runs.len() > 1 {
                     output.note(format!("run {} of {}", n + 1, runs.len()));
                 }
-                let (line, figures) = train_and_measure(run, lpips.as_ref(), output)?;
+                let (line, figures) = train_and_measure(run, &further, args.depth, output)?;
                 append_run(&args.results, &line)?;
                 if runs.len() > 1 {
                     // Photos and checkpoints would fill the disk once per run.
@@ -157,8 +160,14 @@ fn known(run: &Run, existing: &[ResultLine], output: &Output) -> Result<Option<R
     Ok(existing.iter().rfind(|line| alike(line) && line.config_hash == hash).cloned())
 }
 
-/// Trains and measures a run; returns its line and the figures as text.
-fn train_and_measure(run: &Run, lpips: Option<&Lpips>, output: &Output) -> Result<(ResultLine, String), Failure> {
+/// Trains and measures a run, with its depth if asked; returns its line and the figures as text.
+fn train_and_measure(
+    run: &Run,
+    further: &Further,
+    depth: bool,
+    output: &Output,
+) -> Result<(ResultLine, String), Failure> {
+    let depth = depth.then(|| TrueDepth::open(&run.train.capture)).transpose()?;
     clock::reset_peak_memory();
     let Trained { capture, report, curve } = train(&run.train, output)?;
     let model = model::read(&run.train.out)?;
@@ -168,10 +177,16 @@ fn train_and_measure(run: &Run, lpips: Option<&Lpips>, output: &Output) -> Resul
     let plan = &run.train.plan;
     let split = model.split(&capture, None, None);
     let photos = Photos::ingested(capture, store, split, plan.downscale);
-    let evaluated = measure_trained(&model, &photos, lpips, &out, output)?;
+    let evaluated = measure_trained(&model, &photos, &Further { depth: depth.as_ref(), ..*further }, &out, output)?;
     record.scene.clone_from(&run.scene);
     record.set_quality(&evaluated.record);
-    Ok((line_of(&run.label, &record, curve), text(&evaluated)))
+    let depth = evaluated.depth.as_ref().map(|report| report.groups.held_out.all);
+    let line = ResultLine {
+        depth_absrel: depth.and_then(|of| of.absrel),
+        depth_delta1: depth.and_then(|of| of.delta1),
+        ..line_of(&run.label, &record, curve)
+    };
+    Ok((line, text(&evaluated)))
 }
 
 /// A result line as text.

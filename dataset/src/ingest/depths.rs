@@ -71,19 +71,39 @@ impl<'a> Depths<'a> {
         last_undistorter: &mut LastUndistorter,
     ) -> Result<Measured, IngestError> {
         let view = &capture.views[number];
-        let (width, height) = (view.camera.pinhole.width, view.camera.pinhole.height);
         let has_lidar = self.has_lidar(number);
         let pixels = (has_lidar || view.masked).then(|| finest(view, store)).transpose()?;
         let mask = pixels.as_ref().and_then(|pixels| pixels.mask.as_deref());
-        let is_used = |x: u32, y: u32| mask.is_none_or(|mask| mask[y as usize * width as usize + x as usize] >= 128);
+        let is_used = is_used(view.camera.pinhole.width, mask);
+        let (depths, map) = self.samples(capture, number, &is_used, last_undistorter)?;
+        let depth = if depths.is_empty() { None } else { Some(store.put(depths.encode())?) };
+        let colours = match &pixels {
+            Some(pixels) if has_lidar => self.colours(capture, number, pixels, is_used),
+            _ => Vec::new(),
+        };
+        Ok(Measured { depth, samples: depths.len(), colours, map })
+    }
+
+    /// The depths of a view at used pixels, without its photo, and what became of its depth map.
+    ///
+    /// # Errors
+    /// A sweep or a map that cannot be read.
+    pub(super) fn samples(
+        &self,
+        capture: &Capture,
+        number: usize,
+        is_used: &dyn Fn(u32, u32) -> bool,
+        last_undistorter: &mut LastUndistorter,
+    ) -> Result<(DepthSamples, Option<FromMap>), BadInput> {
+        let camera = &capture.views[number].camera;
         let mut returns = Vec::new();
         for &sweep in &self.of_view[number] {
             returns.extend(self.sweeps[sweep as usize].read()?.into_iter().map(|found| found.place));
         }
-        let seen = visible(&view.camera, (0..).zip(returns));
+        let seen = visible(camera, (0..).zip(returns));
         let mut seen: Vec<(u32, u32, f32)> =
             seen.into_iter().filter(|s| is_used(s.x, s.y)).map(|s| (s.x, s.y, s.depth)).collect();
-        let map = self.maps.measure(capture, number, &is_used, last_undistorter)?;
+        let map = self.maps.measure(capture, number, is_used, last_undistorter)?;
         let mut held: Vec<(u32, u32)> = seen.iter().map(|&(x, y, _)| (y, x)).collect();
         held.sort_unstable();
         let map = map.map(|mut map| {
@@ -91,13 +111,8 @@ impl<'a> Depths<'a> {
             seen.extend(samples.filter(|&(x, y, _)| held.binary_search(&(y, x)).is_err()));
             map
         });
-        let depths = DepthSamples::new(width, height, seen.into_iter());
-        let depth = if depths.is_empty() { None } else { Some(store.put(depths.encode())?) };
-        let colours = match &pixels {
-            Some(pixels) if has_lidar => self.colours(capture, number, pixels, is_used),
-            _ => Vec::new(),
-        };
-        Ok(Measured { depth, samples: depths.len(), colours, map })
+        let (width, height) = (camera.pinhole.width, camera.pinhole.height);
+        Ok((DepthSamples::new(width, height, seen.into_iter()), map))
     }
 
     /// The colours of the points that a view colours.
@@ -117,6 +132,11 @@ impl<'a> Depths<'a> {
         };
         self.coloured_by.get(&(number as u32)).into_iter().flatten().map(colour).collect()
     }
+}
+
+/// Whether a mask of this width leaves a pixel.
+pub(super) fn is_used(width: u32, mask: Option<&[u8]>) -> impl Fn(u32, u32) -> bool {
+    move |x, y| mask.is_none_or(|mask| mask[y as usize * width as usize + x as usize] >= 128)
 }
 
 /// The pixel at a position, the nearest one outside of the image.

@@ -36,13 +36,14 @@ const FLOORS: [(&str, u32); 20] = [
 ];
 
 /// What must not be reachable through normal dependencies, however indirectly.
-const ABSENT: [(&str, &[&str]); 10] = [
+const ABSENT: [(&str, &[&str]); 11] = [
     ("scene", &["tokio", "object_store", "tonic", "rayon", "wgpu", "image"]),
     ("blocks", &["tokio", "object_store", "tonic", "rayon", "wgpu", "image"]),
     ("cluster", &["tokio", "object_store", "tonic", "rayon", "wgpu", "image"]),
     ("city", &["tokio", "object_store", "tonic"]),
     ("render", &["tokio", "object_store", "tonic"]),
     ("train", &["tokio", "object_store", "tonic"]),
+    ("perceive", &["tokio", "object_store", "tonic", "render", "dataset", "image"]),
     ("model", &["dataset", "train", "clap", "indicatif"]),
     ("eval", &["clap", "indicatif"]),
     ("telemetry", &["cluster", "proto", "store", "train"]),

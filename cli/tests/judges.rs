@@ -1,0 +1,118 @@
+//! `plat eval --depth` and `--detector` as run by scripts.
+
+mod common;
+
+use std::fs;
+use std::path::PathBuf;
+
+use common::{done, plat, refused, small};
+use dataset::synth::{self, Settings};
+use serde_json::Value;
+
+/// A file of the data shared between machines.
+fn shared(name: &str) -> Option<PathBuf> {
+    let path = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../shared/data").join(name);
+    let found = path.canonicalize().ok();
+    if found.is_none() {
+        println!("skipped: ../shared/data not present");
+    }
+    found
+}
+
+#[test]
+fn depth_is_compared_with_the_truth_and_with_lidar() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    let settings = Settings { truth: true, lidar: true, ..small(32, 96, 64) };
+    synth::write(&at.join("city"), &settings, &|_, _, _| ()).unwrap();
+    let job = ["train", "city", "--steps", "400", "--budget", "3000", "--tolerance-db", "0", "--blocks", "whole"];
+    let train = |out: &str, more: &[&str]| done(at, &[&job[..], &["--no-lidar", "--out", out], more].concat());
+    train("plain", &[]);
+    train("deep", &["--depth-weight", "1", "--depths", "city/depth"]);
+
+    let plain = done(at, &["eval", "plain", "city", "--depth", "--trained", "2", "--test-every", "4"]);
+    let depth = &plain["depth"];
+    let figure = |of: &Value, key: &str| of[key].as_f64().unwrap_or(f64::NAN);
+    assert_eq!((&depth["source"], &depth["views"]), (&"truth".into(), &8.into()));
+    assert_eq!(depth["by_view"].as_array().unwrap().len(), 10);
+    for of in [depth, &depth["aerial"], &depth["street"], &depth["trained_on"]] {
+        assert!(figure(of, "absrel") > 0.0 && figure(of, "rmse") > 0.0, "{of}");
+        assert!((0.0..=1.0).contains(&figure(of, "delta1")) && figure(of, "pixels") > 1000.0, "{of}");
+    }
+    let sum = figure(&depth["aerial"], "pixels") + figure(&depth["street"], "pixels");
+    assert_eq!(sum, figure(depth, "pixels"));
+    // The other figures are as without it, and a model that was trained by true depths has better ones.
+    let alone = done(at, &["eval", "plain", "city", "--test-every", "4"]);
+    assert!(alone.get("depth").is_none() && alone["views"] == plain["views"]);
+    let deep = done(at, &["eval", "deep", "city", "--depth", "--test-every", "4"]);
+    let [before, after] = [depth, &deep["depth"]].map(|of| figure(of, "absrel"));
+    assert!(after < before, "{after} {before}");
+    assert!(figure(&deep["depth"], "delta1") > figure(depth, "delta1"));
+    let text = String::from_utf8(plat(at, &["eval", "plain", "city", "--depth"]).stdout).unwrap();
+    assert!(text.contains("depth against truth") && text.contains("held out, street"), "{text}");
+
+    // A benchmark's line has them too.
+    let run = ["bench", "pareto", "city", "--label", "l", "--results", "r", "--out", "p", "--depth", "--no-lidar"];
+    let line = done(at, &[&run[..], &["--steps", "20", "--budget", "300", "--blocks", "whole"]].concat());
+    assert!(figure(&line, "depth_absrel") > 0.0 && figure(&line, "depth_delta1") <= 1.0, "{line}");
+
+    // Files of views that are not evaluated are not read.
+    let photos: Vec<String> = plain["depth"]["by_view"].as_array().unwrap()[..8]
+        .iter()
+        .map(|view| view["view"].as_str().unwrap().trim_end_matches(".png").to_owned())
+        .collect();
+    for file in fs::read_dir(at.join("city/depth")).unwrap().map(|file| file.unwrap().path()) {
+        if !photos.contains(&file.file_stem().unwrap().to_string_lossy().into_owned()) {
+            fs::write(file, "none").unwrap();
+        }
+    }
+    let words = ["eval", "plain", "city", "--depth", "--test-every", "4", "--quiet"];
+    assert_eq!(done(at, &words)["depth"]["absrel"], depth["absrel"]);
+    let first = format!("{}.npy", photos[0]);
+    fs::write(at.join("city/depth").join(&first), "none").unwrap();
+    refused(at, &words, &first);
+    fs::remove_dir_all(at.join("city/depth")).unwrap();
+    refused(at, &words, "manifest.json says");
+
+    // Without truth its lidar, which sees little of what cars see; without lidar nothing.
+    fs::remove_file(at.join("city/manifest.json")).unwrap();
+    let lidar = done(at, &words);
+    let found = &lidar["depth"];
+    assert_eq!(found["source"], "lidar");
+    assert!((1.0..figure(depth, "pixels")).contains(&figure(found, "pixels")), "{found}");
+    fs::remove_dir_all(at.join("city/lidar")).unwrap();
+    refused(at, &words, "has no depths to compare with");
+}
+
+#[test]
+fn a_detector_is_run_on_photos_and_renders() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    common::city(at, 16, 96, 64);
+    done(at, &["train", "city", "--out", "out", "--steps", "60", "--budget", "600", "--tolerance-db", "0"]);
+    let words = |file: &'static str| ["eval", "out", "city", "--quiet", "--detector", file];
+    fs::write(at.join("text.onnx"), "no network").unwrap();
+    refused(at, &words("text.onnx"), "text.onnx: is not an ONNX graph");
+    refused(at, &words("missing.onnx"), "missing.onnx");
+    let [Some(other), Some(yolox)] =
+        ["fastestdet_352.onnx", "yolox_nano_416.onnx"].map(|n| shared(&format!("detectors/{n}")))
+    else {
+        return;
+    };
+    fs::copy(other, at.join("other.onnx")).unwrap();
+    refused(at, &words("other.onnx"), "1×85×22×22 out");
+    fs::copy(yolox, at.join("yolox.onnx")).unwrap();
+    let said = done(at, &words("yolox.onnx"));
+    let found = &said["detections"];
+    assert_eq!((&found["views"], found["by_view"].as_array().unwrap().len()), (&2.into(), 2));
+    for group in ["vehicles", "people", "all"] {
+        let count = |key: &str| found[group][key].as_u64().unwrap();
+        assert!(count("kept") <= count("photos") && count("kept") + count("extra") == count("renders"), "{found}");
+    }
+    assert_eq!(said["detections_kept"], found["share_kept"]);
+    // A card beside it is read.
+    fs::write(at.join("yolox.toml"), "classes = ['car']").unwrap();
+    refused(at, &words("yolox.onnx"), "YOLOX of 1 classes");
+    fs::write(at.join("yolox.toml"), [0xff, 0xfe]).unwrap();
+    refused(at, &words("yolox.onnx"), "yolox.toml");
+}

@@ -1,0 +1,52 @@
+//! Reads the files of networks.
+
+use std::fs::File;
+use std::io::Read;
+use std::path::Path;
+
+use perceive::Detector;
+use scene::BadInput;
+
+/// Networks that are used here have 4 to 60 MB.
+const FILE_LIMIT: u64 = 1 << 30;
+/// Model cards have a kilobyte.
+const CARD_LIMIT: u64 = 1 << 16;
+
+/// The bytes of a network's file.
+///
+/// # Errors
+/// A file that cannot be read or is too large.
+pub(crate) fn read_network(path: &Path, advice: &'static str) -> Result<Vec<u8>, BadInput> {
+    read(path, FILE_LIMIT, advice)
+}
+
+/// Loads a detector from an ONNX file, with the model card of its name and the extension `toml` if there is one beside
+/// it.
+///
+/// # Errors
+/// A file that cannot be read, or a network that is not a detector whose output is understood.
+pub fn load_detector(path: &Path) -> Result<Detector, BadInput> {
+    let bytes = read_network(path, "give a detector in an ONNX file")?;
+    let beside = path.with_extension("toml");
+    let card = if beside.is_file() {
+        let advice = "correct this model card or remove it";
+        let text = String::from_utf8(read(&beside, CARD_LIMIT, advice)?);
+        Some(text.map_err(|_| BadInput::new(beside.display().to_string(), "is not text", advice))?)
+    } else {
+        None
+    };
+    Detector::load(&path.display().to_string(), bytes, card.as_deref())
+}
+
+fn read(path: &Path, limit: u64, advice: &'static str) -> Result<Vec<u8>, BadInput> {
+    let bad = |problem: String| BadInput::new(path.display().to_string(), problem, advice);
+    let mut bytes = Vec::new();
+    let opened = File::open(path).map(|opened| opened.take(limit + 1));
+    opened
+        .and_then(|mut opened| opened.read_to_end(&mut bytes))
+        .map_err(|error| bad(format!("cannot be read ({error})")))?;
+    if bytes.len() as u64 > limit {
+        return Err(bad(format!("is larger than {} kB", limit >> 10)));
+    }
+    Ok(bytes)
+}

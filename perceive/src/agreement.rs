@@ -1,0 +1,158 @@
+//! How far the detections on a photo and on a render of the same view agree.
+//!
+//! A detection on the photo is *kept* if the render has one of the same group of classes that overlaps it by at least
+//! 0.5. Cars, buses and trucks are one group: which of them a van is may change with a few pixels. Every other class is
+//! a group of its own.
+
+use std::ops::AddAssign;
+
+use serde::Serialize;
+
+use crate::boxes::{Detection, iou};
+
+/// Least overlap of a box on the render with that on the photo.
+const MATCHES: f32 = 0.5;
+const VEHICLES: [&str; 3] = ["car", "bus", "truck"];
+const PEOPLE: [&str; 1] = ["person"];
+
+/// Numbers of detections. The field names are keys of `eval/report.json`.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
+pub struct Counts {
+    /// On photos.
+    pub photos: u64,
+    /// On renders.
+    pub renders: u64,
+    /// On photos, and also on the render.
+    pub kept: u64,
+    /// On renders without one on the photo.
+    pub extra: u64,
+}
+
+/// Detections on photos and renders by groups of classes. The field names are keys of `eval/report.json`.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
+pub struct Agreement {
+    /// Cars, buses and trucks.
+    pub vehicles: Counts,
+    /// People.
+    pub people: Counts,
+    /// All classes.
+    pub all: Counts,
+}
+
+impl Agreement {
+    /// The groups with their names.
+    pub fn named(&self) -> [(&'static str, Counts); 3] {
+        [("vehicles", self.vehicles), ("people", self.people), ("all classes", self.all)]
+    }
+}
+
+impl AddAssign for Counts {
+    fn add_assign(&mut self, more: Self) {
+        self.photos += more.photos;
+        self.renders += more.renders;
+        self.kept += more.kept;
+        self.extra += more.extra;
+    }
+}
+
+impl AddAssign for Agreement {
+    fn add_assign(&mut self, more: Self) {
+        self.vehicles += more.vehicles;
+        self.people += more.people;
+        self.all += more.all;
+    }
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Group {
+    Vehicles,
+    People,
+    Class(usize),
+}
+
+/// Compares detections on a photo and on its render; `classes` are the names of the detector's classes. In order of
+/// their scores, detections on the render take that on the photo which they overlap most and no other has taken.
+pub fn agreement(photo: &[Detection], render: &[Detection], classes: &[String]) -> Agreement {
+    let group = |of: &Detection| {
+        let name = classes.get(of.class).map_or("", String::as_str);
+        match of.class {
+            _ if VEHICLES.contains(&name) => Group::Vehicles,
+            _ if PEOPLE.contains(&name) => Group::People,
+            class => Group::Class(class),
+        }
+    };
+    let mut taken = vec![false; photo.len()];
+    let mut by_score: Vec<&Detection> = render.iter().collect();
+    by_score.sort_by(|a, b| b.score.total_cmp(&a.score));
+    let mut agreement = Agreement::default();
+    let mut add = |of: &Detection, counts: Counts| {
+        agreement.all += counts;
+        match group(of) {
+            Group::Vehicles => agreement.vehicles += counts,
+            Group::People => agreement.people += counts,
+            Group::Class(_) => {}
+        }
+    };
+    photo.iter().for_each(|of| add(of, Counts { photos: 1, ..Counts::default() }));
+    for of in by_score {
+        let free = (0..photo.len()).filter(|&i| !taken[i] && group(&photo[i]) == group(of));
+        let overlaps = free.map(|i| (i, iou(photo[i].corners, of.corners))).filter(|(_, overlap)| *overlap >= MATCHES);
+        let best = overlaps.reduce(|best, next| if next.1 > best.1 { next } else { best });
+        let (kept, extra) = if best.is_some() { (1, 0) } else { (0, 1) };
+        if let Some((i, _)) = best {
+            taken[i] = true;
+        }
+        add(of, Counts { photos: 0, renders: 1, kept, extra });
+    }
+    agreement
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::card::Written;
+
+    const PERSON: usize = 0;
+    const CAR: usize = 2;
+    const TRUCK: usize = 7;
+    const BENCH: usize = 13;
+
+    fn at(class: usize, score: f32, left: f32) -> Detection {
+        Detection { class, score, corners: [left, 0.0, left + 10.0, 10.0] }
+    }
+
+    fn compared(photo: &[Detection], render: &[Detection]) -> Agreement {
+        agreement(photo, render, &Written::default().classes)
+    }
+
+    fn counts(photos: u64, renders: u64, kept: u64) -> Counts {
+        Counts { photos, renders, kept, extra: renders - kept }
+    }
+
+    #[test]
+    fn kept_and_extra_are_counted_by_group() {
+        // A car that became a truck, a person moved too far, a bench kept, a bench that is none.
+        let photo = [at(CAR, 0.9, 0.0), at(PERSON, 0.8, 100.0), at(BENCH, 0.5, 200.0)];
+        let render = [at(TRUCK, 0.4, 2.0), at(PERSON, 0.9, 106.0), at(BENCH, 0.5, 200.0), at(BENCH, 0.9, 300.0)];
+        let found = compared(&photo, &render);
+        assert_eq!((found.vehicles, found.people, found.all), (counts(1, 1, 1), counts(1, 1, 0), counts(3, 4, 2)));
+        // A person is no bench.
+        assert_eq!(compared(&[at(PERSON, 0.9, 0.0)], &[at(BENCH, 0.9, 0.0)]).all, counts(1, 1, 0));
+        assert_eq!(compared(&photo, &photo).all, counts(3, 3, 3));
+        assert_eq!(compared(&[], &[]), Agreement::default());
+        let mut sum = found;
+        sum += found;
+        assert_eq!(sum.all, counts(6, 8, 4));
+    }
+
+    #[test]
+    fn matches_are_one_to_one_and_the_best_score_chooses_first() {
+        // Two boxes on the render over one on the photo: one is extra.
+        assert_eq!(compared(&[at(CAR, 0.9, 0.0)], &[at(CAR, 0.9, 0.0), at(CAR, 0.8, 1.0)]).all, counts(1, 2, 1));
+        // The better one takes the photo's nearest box; the other still has its own.
+        let photo = [at(CAR, 0.9, 0.0), at(CAR, 0.9, 3.0)];
+        assert_eq!(compared(&photo, &[at(CAR, 0.5, 3.0), at(CAR, 0.6, 1.0)]).all, counts(2, 2, 2));
+        // The better one takes the only box that the other could have had.
+        assert_eq!(compared(&photo[..1], &[at(CAR, 0.5, 0.0), at(CAR, 0.6, 3.0)]).all, counts(1, 2, 1));
+    }
+}

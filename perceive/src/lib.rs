@@ -1,0 +1,32 @@
+//! What a detector sees in photos and in renders, and how far both agree.
+//!
+//! A [`Detector`] is an ONNX network with a [`Card`] that says how pictures go in and boxes come out. [`agreement`]
+//! compares the detections on a photo with those on a render of the same view. [`network`] runs graphs of others so
+//! that they cannot crash the program.
+//!
+//! Architecture invariant: functions of bytes and pixels; no files, no network, no clock. The caller reads the files.
+
+pub mod agreement;
+pub mod boxes;
+pub mod card;
+mod coco;
+mod detector;
+mod letterbox;
+pub mod network;
+mod yolox;
+
+pub use agreement::{Agreement, Counts, agreement};
+pub use boxes::{Detection, iou};
+pub use card::Card;
+pub use detector::{Detector, SCORE};
+
+/// A picture: rows from the top, three bytes a pixel, red first.
+#[derive(Debug, Clone, Copy)]
+pub struct Picture<'a> {
+    /// `3 · width · height` bytes.
+    pub rgb: &'a [u8],
+    /// Width in pixels.
+    pub width: usize,
+    /// Height in pixels.
+    pub height: usize,
+}
