@@ -14,6 +14,7 @@ mod files;
 mod frustum_points;
 mod kitti;
 mod kitti360;
+mod kitti_raw;
 mod lidar;
 mod masks;
 mod moving_boxes;
@@ -68,8 +69,8 @@ pub struct Source {
     pub photos: Vec<Photo>,
     /// Names of the capture's images that are not used, with the reason.
     pub left_out: Vec<(String, String)>,
-    /// `colmap`, `transforms`, `opensfm`, `dgp`, `nuscenes`, `kitti` or `kitti360`, followed by ` without points` if its points were sampled from the
-    /// overlap of its views.
+    /// `colmap`, `transforms`, `opensfm`, `dgp`, `nuscenes`, `kitti`, `kitti360` or `kitti-raw`, followed by ` without points` if its points were
+    /// sampled from the overlap of its views.
     pub format: &'static str,
     /// Lidar sweeps. The last [`seeds`](Self::seeds) points of the capture come from them.
     pub sweeps: Vec<Sweep>,
@@ -99,10 +100,12 @@ impl Source {
 pub fn open(path: &Path, options: &OpenOptions) -> Result<Source, BadInput> {
     let named = nuscenes::named_scene(path);
     let root = CaptureRoot::new(named.map_or(path, |(folder, _)| folder))?;
-    let ParsedCapture { mut format, images, points, origin, left_out: unused, sweeps, labels } = match named {
-        Some((_, scene)) => nuscenes::read(&root, Some(scene), options)?,
-        None => parse(&root, path, options)?,
-    };
+    let ParsedCapture { mut format, images, points, origin, left_out: unused, sweeps, labels, root: other } =
+        match named {
+            Some((_, scene)) => nuscenes::read(&root, Some(scene), options)?,
+            None => parse(&root, path, options)?,
+        };
+    let root = other.unwrap_or(root);
     let (images, photos, mut left_out) = find_photos(&root, images, options)?;
     left_out.extend(unused);
     let views = views(&images, &photos)?;
@@ -127,6 +130,7 @@ pub fn open(path: &Path, options: &OpenOptions) -> Result<Source, BadInput> {
             "dgp" => "dgp without points",
             "nuscenes" => "nuscenes without points",
             "kitti" => "kitti without points",
+            "kitti-raw" => "kitti-raw without points",
             _ => "kitti360 without points",
         };
     }
@@ -164,6 +168,9 @@ fn parse(root: &CaptureRoot, path: &Path, options: &OpenOptions) -> Result<Parse
     if kitti360::is_present(root) {
         return kitti360::read(root, options);
     }
+    if let Some(drive) = kitti_raw::find(root)? {
+        return kitti_raw::read(drive, options);
+    }
     if let Some(folder) = colmap::find(root, &["colmap/sparse/0"]) {
         return colmap::read(root, &folder, options);
     }
@@ -173,7 +180,7 @@ fn parse(root: &CaptureRoot, path: &Path, options: &OpenOptions) -> Result<Parse
         return Err(BadInput::new(files::show(path), problem, advice));
     }
     let problem = "has neither a COLMAP model in sparse/0 nor a transforms.json, a reconstruction.json, or the files of DGP, \
-                   nuScenes, KITTI or KITTI-360";
+                   nuScenes, KITTI, KITTI-360 or KITTI raw";
     Err(BadInput::new(files::show(path), problem, "give a folder that has one of them"))
 }
 

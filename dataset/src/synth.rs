@@ -14,6 +14,7 @@
 //! | `sweeps` | `lidar/`, `radar/` |
 //! | `tracks_and_boxes` | `tracks.json`, `boxes3d.json` |
 //! | `nuscenes` | `nuscenes/` |
+//! | `kitti_raw` | `kitti_raw/` |
 //! | `gltf` | `city.glb` |
 //! | `occupancy` | `occupancy/` |
 //! | `gallery` | nothing: draws an overview of layouts, labels and faults |
@@ -26,6 +27,7 @@ mod cameras;
 mod gallery;
 mod gltf;
 mod ground_truth;
+mod kitti_raw;
 mod lidar_turn;
 mod manifest;
 mod nuscenes;
@@ -73,6 +75,9 @@ pub fn write(out: &Path, settings: &Settings, progress: Progress) -> Result<Summ
     tracks_and_boxes::write_boxes(out, &rendered.boxes)?;
     if settings.nuscenes {
         nuscenes::write(out, &world, &shots, &stations, &turns, settings, progress)?;
+    }
+    if settings.kitti_raw {
+        kitti_raw::write(out, &shots, &legs, &stations, settings, progress)?;
     }
     if settings.mesh {
         gltf::write(out, &city)?;

@@ -37,18 +37,8 @@ pub fn read_calibration(bytes: &[u8]) -> Result<Calibration, CodecError> {
     let mut cameras = BTreeMap::new();
     for number in 0..4 {
         let Some(p) = rows(&format!("P{number}"))? else { continue };
-        let [fx, fy, cx, cy] = [p[0], p[5], p[2], p[6]];
-        if fx <= 0.0 || fy <= 0.0 || [p[1], p[4], p[8], p[9]] != [0.0; 4] || p[10] != 1.0 {
-            return Err(CodecError::new(format!("P{number} is not the projection of a rectified camera")));
-        }
-        // The last column is K · t.
-        let z = p[11];
-        let translation = DVec3::new((p[3] - cx * z) / fx, (p[7] - cy * z) / fy, z);
-        let pose = Rigid { rotation: DQuat::IDENTITY, translation };
-        if !pose.is_sane() {
-            return Err(CodecError::new(format!("P{number} is out of range")));
-        }
-        cameras.insert(number, (CameraModel::Pinhole([fx, fy, cx, cy]), pose));
+        let not_rectified = || CodecError::new(format!("P{number} is not the projection of a rectified camera"));
+        cameras.insert(number, projection(&p).ok_or_else(not_rectified)?);
     }
     if cameras.is_empty() {
         return Err(CodecError::new("has none of P0 to P3"));
@@ -56,6 +46,19 @@ pub fn read_calibration(bytes: &[u8]) -> Result<Calibration, CodecError> {
     let not_rigid = || CodecError::new("Tr is not a rigid transform");
     let camera_from_velodyne = rows("Tr")?.map(|rows| rigid(&rows).ok_or_else(not_rigid)).transpose()?;
     Ok(Calibration { cameras, camera_from_velodyne })
+}
+
+/// Intrinsics and pose of a rectified camera from its projection `K · [I | t]`, row by row; `None` for another matrix.
+pub(crate) fn projection(p: &[f64; 12]) -> Option<(CameraModel, Rigid)> {
+    let [fx, fy, cx, cy] = [p[0], p[5], p[2], p[6]];
+    if fx <= 0.0 || fy <= 0.0 || [p[1], p[4], p[8], p[9]] != [0.0; 4] || p[10] != 1.0 {
+        return None;
+    }
+    // The last column is K · t.
+    let z = p[11];
+    let pose =
+        Rigid { rotation: DQuat::IDENTITY, translation: DVec3::new((p[3] - cx * z) / fx, (p[7] - cy * z) / fy, z) };
+    pose.is_sane().then_some((CameraModel::Pinhole([fx, fy, cx, cy]), pose))
 }
 
 /// Reads `poses.txt`: world_from_camera 0, by frame.

@@ -17,6 +17,7 @@ pub mod ids;
 pub mod image;
 pub mod kitti;
 pub mod kitti360;
+pub mod kitti_raw;
 pub mod lidar;
 pub mod npy;
 pub mod nuscenes;

@@ -6,7 +6,7 @@
 //! | `world_from_sensor` | pose: `rotation` (quaternion x, y, z, w) and `translation` (metres) |
 //! | `photos` | names of the photos taken during the sweep, without extensions; optional |
 //! | `readings` | the number of points; optional |
-//! | `turn_seconds`, `velocity`, `spin` | duration of the sweep, and the sensor's motion in the world (m/s, rad/s); optional |
+//! | `turn_seconds`, `velocity`, `spin` | duration of the sweep, clockwise, and the sensor's motion in the world (m/s, rad/s); optional |
 
 use glam::{DQuat, DVec3};
 use serde::Deserialize;
@@ -41,8 +41,10 @@ pub struct SweepPose {
 /// The motion of a lidar during a sweep.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Turn {
-    /// Duration of the sweep: a turn, clockwise from the rear, so that the middle of the sweep points ahead.
+    /// Duration of the sweep: a turn from the rear, so that the middle of the sweep points ahead.
     pub seconds: f64,
+    /// Whether it turns clockwise, seen from above.
+    pub clockwise: bool,
     /// World metres per second.
     pub velocity: DVec3,
     /// Angular velocity in the world: axis times radians per second.
@@ -50,9 +52,15 @@ pub struct Turn {
 }
 
 impl Turn {
+    /// Seconds from the middle of the sweep to when the sensor measured `point`, which is in its own axes.
+    pub fn delay(&self, point: DVec3) -> f64 {
+        let turned = point.y.atan2(point.x) / std::f64::consts::TAU * self.seconds;
+        if self.clockwise { -turned } else { turned }
+    }
+
     /// The sensor's pose when it measured `point`, which is in its own axes. `middle` is the pose at the middle.
     pub fn pose(&self, middle: &Rigid, point: DVec3) -> Rigid {
-        let delay = -point.y.atan2(point.x) / std::f64::consts::TAU * self.seconds;
+        let delay = self.delay(point);
         Rigid {
             rotation: (DQuat::from_scaled_axis(self.spin * delay) * middle.rotation).normalize(),
             translation: middle.translation + self.velocity * delay,
@@ -64,7 +72,7 @@ impl SweepPose {
     /// The motion, if the file has it.
     pub fn turn(&self) -> Option<Turn> {
         let Self { turn_seconds: seconds, velocity, spin, .. } = *self;
-        (seconds > 0.0).then_some(Turn { seconds, velocity, spin })
+        (seconds > 0.0).then_some(Turn { seconds, clockwise: true, velocity, spin })
     }
 
     fn check(&self) -> Result<(), &'static str> {

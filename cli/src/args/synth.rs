@@ -78,6 +78,9 @@ pub(crate) struct SynthArgs {
     /// Write the drives of the cars in the layout of nuScenes too: photos, boxes and, with --lidar, sweeps
     #[arg(long)]
     pub(crate) nuscenes: bool,
+    /// Write the drives of the cars in the layout of KITTI raw too: photos of the cameras that look ahead and, with --lidar, sweeps
+    #[arg(long)]
+    pub(crate) kitti_raw: bool,
     /// Write the city as glTF
     #[arg(long)]
     pub(crate) mesh: bool,
@@ -139,6 +142,9 @@ with --radar: radar/NAME.csv (readings, then their ground truth), radar/poses.js
 with --nuscenes, in nuscenes/, which plat and the nuScenes devkit read (a scene is a drive of a car, scene-LEG):
   v1.0-mini/*.json       thirteen tables; the boxes are of vehicles and people within 70 m, seen or hit by the lidar
   samples/CAM_*/NAME.png, samples/LIDAR_TOP/NAME.pcd.bin (float32 x 5, corrected for the car's motion), maps/none.png
+with --kitti-raw, in kitti_raw/1970_01_01/, which plat and pykitti read (a drive of a car is 1970_01_01_drive_LEG_sync):
+  calib_*.txt, and of each drive image_02 and image_03 (the cameras that look ahead), oxts (the car on the road under its
+  centre) and velodyne_points (float32 x 4, counter-clockwise, in the sensor's axes at the firing), each with data/FRAME.*
 with --mesh:  city.glb   glTF 2: a node for each actor (class, instance), a mesh for each asset, materials without patterns
 with --occupancy: occupancy/X_Y.npz for each block: semantic (uint8, 255 free) and instance (uint32) by z, y, x;
               origin (the lowest corner) and voxel (its side) in metres, world_from_grid (4 x 4; the identity)

@@ -87,6 +87,7 @@ fn settings(args: &SynthArgs) -> Settings {
         radar: args.radar,
         mesh: args.mesh,
         nuscenes: args.nuscenes,
+        kitti_raw: args.kitti_raw,
         occupancy: args.occupancy,
         around: args.occupancy_around.clone(),
         spacing: args.spacing,

@@ -66,6 +66,7 @@ pub(super) fn read(root: &CaptureRoot, path: &Path, options: &OpenOptions) -> Re
             sweeps.push(ParsedSweep {
                 path: named(root, path, &sweep.file)?,
                 format: PointFormat::Npz,
+                turn: None,
                 world_from_sensor: sweep.world_from_sensor,
                 images: (first..images.len() as u32).collect(),
             });

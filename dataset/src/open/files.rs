@@ -132,6 +132,16 @@ pub(super) fn show(path: &Path) -> String {
     path.display().to_string()
 }
 
+/// Names that an error lists.
+const LISTED: usize = 5;
+
+/// Names for a message: the first ones, and the number of the others.
+pub(super) fn listed<S: AsRef<str>>(names: impl ExactSizeIterator<Item = S>) -> String {
+    let more = names.len().saturating_sub(LISTED);
+    let first: Vec<String> = names.take(LISTED).map(|name| name.as_ref().chars().take(40).collect()).collect();
+    first.join(", ") + &if more > 0 { format!(" and {more} more") } else { String::new() }
+}
+
 /// The name of a photo without `images/` and extension.
 pub(super) fn stem(name: &str) -> &str {
     let name = name.strip_prefix("images/").unwrap_or(name);

@@ -95,7 +95,7 @@ pub(super) fn read(root: &CaptureRoot, of: &Sequence, options: &OpenOptions) -> 
         if let (Some(path), Some(from_velodyne)) = (sweep, camera_from_velodyne) {
             let world_from_sensor: Rigid = world_from_first.compose(&from_velodyne);
             let images = (first..images.len() as u32).collect();
-            sweeps.push(ParsedSweep { path, format: PointFormat::Floats(4), world_from_sensor, images });
+            sweeps.push(ParsedSweep { path, format: PointFormat::Floats(4), world_from_sensor, turn: None, images });
         }
     }
     if images.is_empty() {

@@ -111,7 +111,7 @@ pub(super) fn read(root: &CaptureRoot, options: &OpenOptions) -> Result<ParsedCa
     }
     let sweep = |(path, world_from_imu, images): Scan| {
         let world_from_sensor = world_from_imu.compose(&imu_from_velo);
-        ParsedSweep { path, format: PointFormat::Floats(4), world_from_sensor, images }
+        ParsedSweep { path, format: PointFormat::Floats(4), world_from_sensor, turn: None, images }
     };
     let sweeps = scans.into_iter().map(sweep).collect();
     Ok(ParsedCapture { sweeps, ..ParsedCapture::new("kitti360", images, RawPoints::default()) })

@@ -68,10 +68,10 @@ pub(super) fn find(root: &CaptureRoot, views: &[View]) -> Result<Vec<Sweep>, Bad
 pub(super) fn with_views(parsed: Vec<ParsedSweep>, images: &[PosedImage]) -> Vec<Sweep> {
     let index: BTreeMap<u32, u32> = images.iter().map(|image| image.id).zip(0..).collect();
     let sweep = |sweep: ParsedSweep| {
-        let ParsedSweep { path, format, world_from_sensor, images } = sweep;
+        let ParsedSweep { path, format, world_from_sensor, turn, images } = sweep;
         let mut views: Vec<u32> = images.iter().filter_map(|id| index.get(id).copied()).collect();
         views.sort_unstable();
-        Sweep { path, format, readings: None, world_from_sensor, turn: None, views }
+        Sweep { path, format, readings: None, world_from_sensor, turn, views }
     };
     parsed.into_iter().map(sweep).collect()
 }

@@ -17,7 +17,7 @@ use scene::{BadInput, Rigid};
 
 use self::boxes::Boxes;
 use self::tables::Tables;
-use super::files::{CaptureRoot, Found};
+use super::files::{CaptureRoot, Found, listed};
 use super::parsed::{OpenOptions, ParsedCapture, ParsedSweep, PosedImage, RawPoints};
 use crate::lidar::PointFormat;
 
@@ -26,8 +26,6 @@ mod tables;
 
 /// A photo belongs to the sweep nearest in time, within this.
 const SAME_MICROSECONDS: u64 = 100_000;
-/// Names of scenes that an error lists.
-const LISTED: usize = 5;
 
 /// The folder of a data set and the name of a scene, if the path is `FOLDER/SCENE`, which is no folder itself.
 pub(super) fn named_scene(path: &Path) -> Option<(&Path, &str)> {
@@ -79,7 +77,10 @@ pub(super) fn read(root: &CaptureRoot, scene: Option<&str>, options: &OpenOption
             "lidar" if options.lidar => {
                 if let Found::File(path) = root.image(&datum.file)? {
                     let (format, images) = (PointFormat::Floats(5), Vec::new());
-                    sweeps.push((datum.microseconds, ParsedSweep { path, format, world_from_sensor, images }));
+                    sweeps.push((
+                        datum.microseconds,
+                        ParsedSweep { path, format, world_from_sensor, turn: None, images },
+                    ));
                 }
             }
             _ => {}
@@ -110,9 +111,7 @@ fn choose<'a>(root: &'a CaptureRoot, wanted: Option<&str>) -> Result<(Tables<'a>
         }
     }
     let names: Vec<&str> = scenes.keys().map(String::as_str).collect();
-    let listed = names.iter().take(LISTED).map(|name| name.chars().take(40).collect::<String>()).collect::<Vec<_>>();
-    let more = names.len().saturating_sub(LISTED);
-    let listed = listed.join(", ") + &if more > 0 { format!(" and {more} more") } else { String::new() };
+    let listed = listed(names.iter());
     let chosen = match (wanted, names.as_slice()) {
         (_, []) => return Err(BadInput::new(root.to_string(), "has no scene", "download the data set again")),
         (Some(name), _) => name,

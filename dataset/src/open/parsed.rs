@@ -4,9 +4,11 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 use glam::DVec3;
+use scene::lidar::Turn;
 use scene::transforms::Intrinsics;
 use scene::{GeoOrigin, Rigid, SparsePoints};
 
+use super::files::CaptureRoot;
 use crate::depth_maps::DepthMapOptions;
 use crate::lidar::PointFormat;
 
@@ -36,6 +38,8 @@ pub(super) struct ParsedCapture {
     pub(super) sweeps: Vec<ParsedSweep>,
     /// Number of annotated boxes by class.
     pub(super) labels: BTreeMap<String, usize>,
+    /// The folder that its paths are relative to, if not the one that was given.
+    pub(super) root: Option<CaptureRoot>,
 }
 
 impl ParsedCapture {
@@ -49,6 +53,8 @@ pub(super) struct ParsedSweep {
     pub(super) path: PathBuf,
     pub(super) format: PointFormat,
     pub(super) world_from_sensor: Rigid,
+    /// The sensor's motion, if points have to be corrected for it.
+    pub(super) turn: Option<Turn>,
     /// The images taken during the sweep, by id.
     pub(super) images: Vec<u32>,
 }

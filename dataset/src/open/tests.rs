@@ -8,6 +8,7 @@ use super::*;
 
 mod drives;
 mod formats;
+mod kitti_raw;
 mod nuscenes;
 mod reprojection;
 

@@ -14,7 +14,7 @@ use super::settings::{Settings, Summary, SynthError};
 
 const NAME: &str = "manifest.json";
 /// All folders of a synthetic capture.
-const FOLDERS: [&str; 14] = [
+const FOLDERS: [&str; 15] = [
     "images",
     "masks",
     "sparse",
@@ -28,6 +28,7 @@ const FOLDERS: [&str; 14] = [
     "lidar",
     "radar",
     "occupancy",
+    "kitti_raw",
     "nuscenes",
 ];
 /// All files of a synthetic capture except the manifest.

@@ -159,7 +159,7 @@ fn push_drive(
 }
 
 /// The mount of the car's camera that took a shot; `None` for other cameras.
-fn mount_of<'a>(mounts: &'a [Mount], shot: &Shot) -> Option<&'a Mount> {
+pub(super) fn mount_of<'a>(mounts: &'a [Mount], shot: &Shot) -> Option<&'a Mount> {
     let name = shot.sensor.strip_prefix("street-")?;
     mounts.iter().find(|mount| mount.name == name)
 }
@@ -181,7 +181,7 @@ fn calibrated(channel: &str, mounting: &Rigid, matrix: &serde_json::Value) -> se
 }
 
 /// A level camera: x right, y down, z ahead.
-fn vehicle_from_camera(mount: &Mount) -> Rigid {
+pub(super) fn vehicle_from_camera(mount: &Mount) -> Rigid {
     let ahead = DQuat::from_rotation_z(mount.yaw_degrees.to_radians()) * DVec3::X;
     let axes = DMat3::from_cols(ahead.cross(DVec3::Z), DVec3::NEG_Z, ahead);
     Rigid { rotation: DQuat::from_mat3(&axes).normalize(), translation: mount.offset }

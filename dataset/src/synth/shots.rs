@@ -1,6 +1,8 @@
 //! Plans the shots: an aerial block, cars and fixed cameras on posts. Cars are on all streets, thinned evenly to their share, or
 //! drive whole streets with a given spacing until their share is used up.
 
+use std::collections::BTreeMap;
+
 use city::sense::drives::{Drives, drives};
 use city::sense::rig::{Rig, drive, legs, shots_of};
 use city::sense::survey::{Fixed, Survey, fixed, survey};
@@ -39,6 +41,8 @@ pub(super) struct Station {
     pub(super) leg: usize,
     /// City time.
     pub(super) seconds: f64,
+    /// Number among the stations of its leg.
+    pub(super) frame: usize,
     /// Names of the photos taken there.
     pub(super) photos: Vec<String>,
 }
@@ -47,7 +51,7 @@ impl Station {
     /// The station at a waypoint (indices of the leg and within it) with the photos taken there.
     fn of<'a>(legs: &[Vec<Waypoint>], (leg, i): (usize, usize), shots: impl Iterator<Item = &'a Shot>) -> Self {
         let photos = shots.map(|shot| format!("street-{}", shot.name)).collect();
-        Self { name: format!("street-{leg:04}-{i:05}"), leg, seconds: legs[leg][i].seconds, photos }
+        Self { name: format!("street-{leg:04}-{i:05}"), leg, seconds: legs[leg][i].seconds, frame: 0, photos }
     }
 }
 
@@ -72,7 +76,13 @@ pub(super) fn plan(world: &World, settings: &Settings) -> Result<PlannedShots, B
     let street = settings.views as usize - aerial - posts;
     let city = world.city();
     let refuse = |error: SenseError| unsupported(&error);
-    let street = street_shots(city, settings, street).map_err(refuse)?;
+    let mut street = street_shots(city, settings, street).map_err(refuse)?;
+    let mut frames: BTreeMap<usize, usize> = BTreeMap::new();
+    for station in &mut street.stations {
+        let next = frames.entry(station.leg).or_default();
+        station.frame = *next;
+        *next += 1;
+    }
     let taken = [
         aerial_shots(city, settings, aerial).map_err(refuse)?,
         street.shots,

@@ -17,6 +17,7 @@ use scene::{Rigid, npy};
 use serde_json::json;
 use store::file::{SaveError, save};
 
+use super::kitti_raw;
 use super::lidar_turn::LidarTurn;
 use super::nuscenes;
 use super::output::create_folder;
@@ -46,6 +47,9 @@ pub(super) fn write(
             save_points(folder, station, &returns)?;
             if settings.nuscenes {
                 nuscenes::save_sweep(&out.join(nuscenes::FOLDER), station, pose, motion, &returns)?;
+            }
+            if settings.kitti_raw {
+                kitti_raw::save_sweep(out, station, pose, motion, &returns)?;
             }
             let mut hits = BTreeMap::new();
             returns.iter().for_each(|found| *hits.entry(found.instance).or_default() += 1);

@@ -10,6 +10,7 @@ use super::*;
 use crate::depth_samples::DepthSamples;
 use crate::open::{OpenOptions, open};
 
+mod kitti_raw;
 mod nuscenes;
 
 fn small() -> Settings {
@@ -178,6 +179,7 @@ fn settings_out_of_range_are_refused_before_anything_is_written() {
         Settings { aerial: 0.6, fixed: 0.5, ..small() },
         Settings { fixed: -0.1, ..small() },
         Settings { aerial: 0.5, fixed: 0.5, nuscenes: true, ..small() },
+        Settings { aerial: 0.5, fixed: 0.5, kitti_raw: true, ..small() },
         Settings { faults: vec![Fault { kind: FaultKind::Fog, strength: 2.0, seed: 0 }], ..small() },
         Settings { city: CitySettings { area_km2: 26.0, ..small().city }, ..small() },
     ] {
@@ -198,6 +200,7 @@ fn everything() -> Settings {
         radar: true,
         mesh: true,
         nuscenes: true,
+        kitti_raw: true,
         occupancy: Some(2.0),
         ..small()
     }
