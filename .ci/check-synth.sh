@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Whether others read what `plat synth` writes: small captures of it, opened by pycolmap, the devkit of nuScenes and
-# Khronos' glTF validator. Fetches them into a folder of its own. PLAT names the program; without it, it is built.
+# Whether others read what `plat synth` writes: small captures of it, opened by pycolmap, the devkit of nuScenes,
+# pykitti and Khronos' glTF validator. Fetches them into a folder of its own. PLAT names the program; without it, it is built.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
@@ -9,10 +9,11 @@ trap 'rm -rf "$scratch"' EXIT
 synth() { if [[ -n "${PLAT:-}" ]]; then "$PLAT" synth "$@"; else cargo run --release --locked -- synth "$@"; fi; }
 synth --out "$scratch/city" --area-km2 0.05 --views 24 --size 96x54 --mesh --quiet
 synth --out "$scratch/drives" --area-km2 0.02 --views 96 --aerial 0 --size 192x108 --spacing 8 --traffic heavy \
-    --lidar --nuscenes --truth --quiet
+    --lidar --nuscenes --kitti-raw --truth --quiet
 
 python3 -m venv "$scratch/venv"
-"$scratch/venv/bin/pip" install --quiet --disable-pip-version-check pycolmap==4.2.1 nuscenes-devkit==1.2.0
+"$scratch/venv/bin/pip" install --quiet --disable-pip-version-check pycolmap==4.2.1 nuscenes-devkit==1.2.0 \
+    pykitti==0.3.1 opencv-python-headless
 "$scratch/venv/bin/python" - "$scratch/city" <<'PYTHON'
 import json, pathlib, sys
 import pycolmap
@@ -77,6 +78,34 @@ print(f"nuScenes devkit: {len(data.scene)} scenes, {photos} photos, {sweeps} swe
       f"{len(data.sample_annotation)} boxes; cameras within {off:.1e} of COLMAP's, {len(errors)} returns, depths off by {100 * median:.2f} % (median)")
 assert photos == model.num_images() and sweeps > 0 and len(data.sample_annotation) > 0
 assert off < 1e-4 and len(errors) > 1000 and median < 0.02
+PYTHON
+
+# pykitti's cameras are COLMAP's, in a world whose origin is the first frame of the drive.
+"$scratch/venv/bin/python" - "$scratch/drives" <<'PYTHON'
+import pathlib, sys
+import numpy, pycolmap, pykitti
+
+city = pathlib.Path(sys.argv[1])
+model = pycolmap.Reconstruction(str(city / "sparse/0"))
+cameras = {pathlib.Path(image.name).stem: image for image in model.images.values()}
+photos, sweeps, off = 0, 0, 0.0
+for folder in sorted((city / "kitti_raw/1970_01_01").glob("*_sync")):
+    leg = folder.name.split("_")[-2]
+    drive = pykitti.raw(str(city / "kitti_raw"), "1970_01_01", leg)
+    calibration, origin = drive.calib, None
+    for side, files, camera in ("left", drive.cam2_files, calibration.T_cam2_imu), ("right", drive.cam3_files, calibration.T_cam3_imu):
+        taken = sorted(name for name in cameras if name.startswith(f"street-front-{side}-{leg}-"))
+        assert len(taken) == len(files), (folder, len(taken), len(files))
+        for file, name in zip(files, taken):
+            ours = drive.oxts[int(pathlib.Path(file).stem)].T_w_imu @ numpy.linalg.inv(camera)
+            theirs = cameras[name].cam_from_world().matrix()
+            centre = -theirs[:, :3].T @ theirs[:, 3]
+            origin = centre - ours[:3, 3] if origin is None else origin
+            off = max(off, abs(ours[:3, 3] + origin - centre).max(), abs(ours[:3, :3].T - theirs[:, :3]).max())
+            photos += 1
+    sweeps += len(drive.velo_files)
+print(f"pykitti: {photos} photos, {sweeps} sweeps; cameras within {off:.1e} of COLMAP's")
+assert photos > 0 and sweeps > 0 and off < 1e-4
 PYTHON
 
 npm install --silent --no-audit --no-fund --prefix "$scratch/npm" gltf-validator@2.0.0-dev.3.10

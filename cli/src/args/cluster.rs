@@ -126,7 +126,7 @@ pub(crate) struct WorkerArgs {
 
 #[derive(Debug, Clone, Args)]
 pub(crate) struct SubmitArgs {
-    /// Folder of the capture: COLMAP, transforms.json, OpenSfM, DGP, KITTI or KITTI-360
+    /// Folder of the capture: COLMAP, transforms.json, OpenSfM, DGP, nuScenes, KITTI, KITTI-360 or KITTI raw
     pub(crate) capture: PathBuf,
     #[command(flatten)]
     pub(crate) connection: Connection,

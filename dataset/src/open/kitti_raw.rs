@@ -119,7 +119,8 @@ pub(super) fn read(drive: Drive, options: &OpenOptions) -> Result<ParsedCapture,
         for (number, lens) in cameras.iter().filter(|(number, _)| used.contains(number)) {
             // Drives are also shared with JPEG instead of PNG.
             let file = format!("{drive}/image_0{number}/data/{frame}");
-            let Some((file, extension)) = existing(&root, &file).or(options.cameras_only.then(|| (file, "png"))) else {
+            let Some((file, extension)) = existing(&root, &file).or(options.cameras_only.then_some((file, "png")))
+            else {
                 continue;
             };
             images.push(PosedImage {

@@ -81,7 +81,10 @@ pub(crate) fn swelling() -> Vec<Seed> {
     }
     let matrix = format!(r#"[{{"token": "", "sensor_token": "", "camera_intrinsic": [{}]"#, "[0,0,0],".repeat(200_000));
     corpus.plain("a matrix of many rows", matrix, &nuscenes_codecs()[5]);
-    let text = format!("P_rect_00: {}", "1 ".repeat(1_000_000));
+    let text = "1 ".repeat(1_000_000);
+    corpus.plain("a long line of oxts", text.as_str(), &kitti_raw_codecs()[2]);
+    let text = format!("P_rect_00: {text}");
+    corpus.plain("a long line in calib_cam_to_cam.txt", text.as_str(), &kitti_raw_codecs()[0]);
     corpus.plain("a long line in perspective.txt", text, &kitti_codecs()[0]);
     for line in ["comment\n", "property char a\n", "obj_info\n"] {
         let text = format!("ply\nformat ascii 1.0\nelement vertex 1\n{}end_header\n1\n", line.repeat(200_000));
@@ -226,6 +229,9 @@ impl Corpus {
         let floats = |n: usize| (0..n).flat_map(|i| (i as f32 * 0.7 - 9.0).to_le_bytes()).collect::<Vec<u8>>();
         self.plain("scan.bin", floats(400), &scan);
 
+        for ((name, text), codec) in KITTI_RAW.into_iter().zip(&kitti_raw_codecs()) {
+            self.plain(name, text, codec);
+        }
         for ((name, table), codec) in NUSCENES.into_iter().zip(&nuscenes_codecs()) {
             self.plain(name, table, codec);
         }
@@ -339,6 +345,20 @@ const RECONSTRUCTION: &str = r#"[{"cameras": {
   "points": {"7": {"color": [255, 0, 12.4], "coordinates": [1, 2, 3]}, "10": {"coordinates": [4, 5, 6]}},
   "reference_lla": {"latitude": 47.5, "longitude": 8.5, "altitude": 400}},
   {"cameras": {}, "shots": {"z.jpg": {"camera": "", "rotation": [0, 0, 0], "translation": [0, 0, 0]}}}]"#;
+/// KITTI raw: a file of each kind.
+const KITTI_RAW: [(&str, &str); 3] = [
+    (
+        "calib_cam_to_cam.txt",
+        "calib_time: 09-Jan-2012 13:57:47\nS_rect_00: 80 40\nR_rect_00: 1 0 0 0 1 0 0 0 1\n\
+         P_rect_00: 50 0 40 0 0 50 20 0 0 0 1 0\nS_rect_02: 80 40\nP_rect_02: 50 0 40 -3.5 0 50 20 0.2 0 0 1 0.003\n",
+    ),
+    ("calib_velo_to_cam.txt", "R: 0 -1 0 0 0 -1 1 0 0\nT: 0.1 -0.08 -0.27\ndelta_f: 0 0\n"),
+    (
+        "0000000000.txt",
+        "49.01 8.42 112.8 0.02 1e-05 -1.22 -3.3 1.1 3.5 0.03 -0.03 -0.3 0.04 9.9 -0.3 -0.2 9.9 -0.01 0.02 0.14 -0.01 \
+         0.02 0.14 0.5 0.06 4 10 4 4 0\n",
+    ),
+];
 const PERSPECTIVE: &str = "calib_time: x\nS_rect_00: 80 40\nR_rect_00: 1 0 0 0 1 0 0 0 1\n\
     P_rect_00: 50 0 40 0 0 50 20 0 0 0 1 0\nS_rect_01: 80 40\nP_rect_01: 50 0 40 -30 0 50 20 0 0 0 1 0\n";
 const CAM_TO_POSE: &str = "image_00: 0 0 1 1 1 0 0 0 0 1 0 0\nimage_01: 0 0 1 1 1 0 0 0.6 0 1 0 0\n";

@@ -14,7 +14,7 @@ use image::{ImageFormat, RgbImage};
 use scene::frame::{self, Kind};
 use scene::transforms::{Frame, Intrinsics, Transforms};
 use scene::{CameraModel, Capture, CodecError, Exposures, Rect, Rigid};
-use scene::{colmap, kitti360, npy, nuscenes, opensfm, ply, spz, transforms};
+use scene::{colmap, kitti_raw, kitti360, npy, nuscenes, opensfm, ply, spz, transforms};
 use store::Store;
 
 use crate::corpus::{CLOUD, PHOTO_SIZE, encoded};
@@ -115,6 +115,21 @@ pub(crate) fn kitti_codecs() -> [Read; 5] {
         codec("kitti360", kitti360::read_cam_to_velo, |pose| pose.is_sane()),
         codec("kitti360", kitti360::read_poses, |poses| poses.values().all(Rigid::is_sane)),
         codec("kitti360", |bytes| kitti360::read_scan(bytes, 1), |points| points.iter().all(|p| p.is_finite())),
+    ]
+}
+
+/// `calib_cam_to_cam.txt`, a mounting, and a file of oxts.
+pub(crate) fn kitti_raw_codecs() -> [Read; 3] {
+    [
+        codec("kitti_raw", kitti_raw::read_cameras, |found| {
+            let sane = |c: &kitti_raw::RawCamera| camera_is_sane(&c.model, c.width, c.height) && c.from_first.is_sane();
+            found.cameras.values().all(sane) && found.rectified_from_camera.is_sane()
+        }),
+        codec("kitti_raw", kitti_raw::read_mounting, |pose| pose.is_sane()),
+        codec("kitti_raw", kitti_raw::read_oxts, |oxts| {
+            let world = kitti_raw::Mercator::new(&oxts.place);
+            world.world_from_imu(&oxts).is_sane() && oxts.velocity.is_finite() && oxts.spin.is_finite()
+        }),
     ]
 }
 
