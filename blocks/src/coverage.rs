@@ -39,11 +39,6 @@ impl PixelCoverage {
         }
     }
 
-    /// Pixels of all windows. Overlaps count several times, as they do in the training work.
-    pub(crate) fn in_windows(&self) -> u64 {
-        self.0.values().map(|of_view| of_view.in_windows).sum()
-    }
-
     /// For each view, how many more pixels are covered than by `coarser`: detail that is new at this level. Each view
     /// contributes at least the share `min_share` of its covered pixels, so that every level gets some work.
     pub(crate) fn new_pixels(&self, coarser: &Self, min_share: f64) -> f64 {
@@ -84,7 +79,6 @@ mod tests {
             coverage
         };
         let area = camera.full().area();
-        assert_eq!(covered(0, 3).in_windows(), 3 * area);
         assert_eq!(covered(0, 3).new_pixels(&PixelCoverage::default(), 0.0), area as f64);
         assert_eq!(covered(0, 3).new_pixels(&covered(1, 1), 0.0), 0.75 * area as f64);
         assert_eq!(covered(0, 3).new_pixels(&covered(0, 1), 0.05), 0.05 * area as f64);

@@ -5,7 +5,6 @@ use std::collections::{BTreeMap, BTreeSet};
 use scene::{BlockId, Capture};
 
 use crate::budgets::BLOCK_SPLATS;
-use crate::coverage::PixelCoverage;
 use crate::ground::{Ground, quantile};
 use crate::lod::{context_of, finished_neighbours, training_order};
 use crate::plan::{MAX_LEVELS, Mode, PlanError, Task};
@@ -21,10 +20,8 @@ const MIN_MEAN_VIEWS: usize = 24;
 const MIN_MEAN_POINTS: usize = 500;
 /// ... and together at least this share of all sparse points.
 const MIN_COVERED_SHARE: f64 = 0.9;
-/// A further level is added only if at least this share of its pixels is new. Along a road every view observes all
-/// blocks ahead, so a further level costs several times its benefit ...
-const MIN_NEW_PIXELS: f64 = 1.0 / 3.0;
-/// ... or if the parents would exceed the capacity of a block, in splats ([`BLOCK_SPLATS`]) or in pixels.
+/// A further level is added only if its parents would exceed the capacity of a block, in splats ([`BLOCK_SPLATS`]) or in
+/// pixels: at equal work a scene in one piece is better.
 const BLOCK_PIXELS: u64 = 500_000_000;
 /// A leaf is split again if it has more than this many times the points of the median leaf ...
 const CROWDED: f64 = 4.0;
@@ -80,8 +77,8 @@ impl Layout<'_> {
         }
     }
 
-    /// The deepest level that the resolution allows, whose blocks have enough views and points, and that is worth its
-    /// cost.
+    /// The deepest level that the resolution allows, whose blocks have enough views and points, and without which a
+    /// block would hold too much.
     pub(crate) fn choose_levels(&self, finest_metres: f64, budget: u32) -> u8 {
         let points = self.capture.points.len();
         let by_resolution = (self.ground.edge_metres / (LEAF_EDGE_PIXELS * finest_metres)).log2().floor();
@@ -95,31 +92,16 @@ impl Layout<'_> {
                 covered as f64 >= MIN_COVERED_SHARE * points as f64
                     && views >= MIN_MEAN_VIEWS * tasks.len()
                     && covered >= MIN_MEAN_POINTS * tasks.len()
-                    && self.is_worthwhile(level, &tasks, finest_metres, budget)
+                    && self.is_needed(level, finest_metres, budget)
             })
             .unwrap_or(0)
     }
 
-    /// True when these leaves add enough new pixels to their parents, or when the parents alone would exceed the
-    /// capacity of a block.
-    fn is_worthwhile(
-        &self,
-        level: u8,
-        leaves: &BTreeMap<BlockId, ViewSelection>,
-        finest_metres: f64,
-        budget: u32,
-    ) -> bool {
-        let parents = self.trainable_blocks(level - 1, 2.0 * finest_metres);
-        let [coverage, coarser] = [leaves, &parents].map(|selections| {
-            let mut coverage = PixelCoverage::default();
-            selections.values().for_each(|s| coverage.add(&s.views, self.capture));
-            coverage
-        });
-        let blocks = parents.len().max(1) as u64;
+    /// True when the blocks above this level alone would exceed the capacity of a block.
+    fn is_needed(&self, level: u8, finest_metres: f64, budget: u32) -> bool {
+        let parents = self.trainable_blocks(level - 1, 2.0 * finest_metres).len().max(1) as u64;
         let pixels: u64 = self.capture.views.iter().map(|view| view.camera.full().area()).sum();
-        coverage.new_pixels(&coarser, 0.0) >= MIN_NEW_PIXELS * coverage.in_windows() as f64
-            || u64::from(budget) > u64::from(BLOCK_SPLATS) * blocks
-            || pixels > BLOCK_PIXELS * blocks
+        u64::from(budget) > u64::from(BLOCK_SPLATS) * parents || pixels > BLOCK_PIXELS * parents
     }
 
     /// Lays out the tasks, without budgets and steps. Returns the depth that was reached and the tasks: a tree with

@@ -15,7 +15,7 @@ use crate::output::Output;
 pub(crate) fn plan_of(source: &Source, options: &PlanOptions) -> Result<(Capture, Plan), Failure> {
     let capture = captures::shrunk(&source.capture, options.downscale)?;
     let id = ArtefactId::of(&frame::encode(dataset::ingest::CAPTURE, &capture, &[]));
-    let settings = options.settings(&capture);
+    let settings = options.settings(&capture, source.seeds.len());
     if settings.depth_weight > 0.0 && !source.is_measured() && capture.points.seen_by.is_empty() {
         let problem = "the capture has neither lidar nor depth maps, and does not say which photos observed its sparse \
                        points: there are no target depths";

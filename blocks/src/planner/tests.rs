@@ -71,24 +71,30 @@ fn a_tree_is_complete_and_ordered() {
     assert!(lint(&plan, &capture).is_empty(), "{:?}", lint(&plan, &capture));
 }
 
-#[test]
-fn automatic_levels_follow_resolution_views_and_points() {
-    // 300 m at 0.12 m a pixel are 2,500 pixels: one division leaves at least 768 per leaf.
-    assert_eq!(plan_of(&aerial(12, 300.0, 20_000), Mode::Tree, None).levels, 1);
-    assert_eq!(plan_of(&aerial(12, 300.0, 1000), Mode::Tree, None).levels, 0, "too few points");
-    assert_eq!(plan_of(&aerial(4, 300.0, 20_000), Mode::Tree, None).levels, 0, "too few views");
-    assert_eq!(plan_of(&aerial(8, 60.0, 20_000), Mode::Tree, None).levels, 0, "too small");
+/// The plan of more splats than a block holds, with automatic levels.
+fn crowded_plan_of(capture: &Capture) -> Plan {
+    let settings = PlanSettings { budget: 500_000, ..settings(Mode::Tree, None) };
+    plan(capture, ArtefactId::of(b"capture"), &settings, "cpu").unwrap()
 }
 
 #[test]
-fn automatic_levels_are_worth_their_work_or_needed() {
-    // Views along a street observe all blocks ahead.
-    let capture = street(120, 20_000);
-    let levels = |budget: u32| {
-        let settings = PlanSettings { budget, ..settings(Mode::Tree, None) };
-        plan(&capture, ArtefactId::of(b"capture"), &settings, "cpu").unwrap().levels
-    };
-    assert_eq!([50_000, 400_000, 2_000_000].map(levels), [0, 0, 1]);
+fn automatic_levels_follow_resolution_views_and_points() {
+    // 300 m at 0.12 m a pixel are 2,500 pixels: one division leaves at least 768 per leaf.
+    assert_eq!(crowded_plan_of(&aerial(12, 300.0, 20_000)).levels, 1);
+    assert_eq!(crowded_plan_of(&aerial(12, 300.0, 1000)).levels, 0, "too few points");
+    assert_eq!(crowded_plan_of(&aerial(4, 300.0, 20_000)).levels, 0, "too few views");
+    assert_eq!(crowded_plan_of(&aerial(8, 60.0, 20_000)).levels, 0, "too small");
+}
+
+#[test]
+fn automatic_levels_divide_only_what_no_block_can_hold() {
+    for capture in [street(120, 20_000), aerial(12, 300.0, 20_000)] {
+        let levels = |budget: u32| {
+            let settings = PlanSettings { budget, ..settings(Mode::Tree, None) };
+            plan(&capture, ArtefactId::of(b"capture"), &settings, "cpu").unwrap().levels
+        };
+        assert_eq!([50_000, 400_000, 2_000_000].map(levels), [0, 0, 1]);
+    }
 }
 
 /// In an aerial capture every level trains on the photos about as often as a single block would.
@@ -327,7 +333,7 @@ fn crowded_leaves_are_split() {
     let cameras: Vec<Camera> = even.views.iter().map(|view| view.camera).collect();
     let [even, crowded] = [even.points.positions, crowd].map(|points| {
         let capture = capture(&cameras, points, true);
-        (plan_of(&capture, Mode::Tree, None), capture)
+        (crowded_plan_of(&capture), capture)
     });
     assert_eq!(even.0.levels, 1);
     let (plan, capture) = crowded;

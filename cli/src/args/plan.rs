@@ -55,7 +55,7 @@ pub(crate) struct PlanOptions {
     /// This fills a large GPU with small photos; on a CPU it saves nothing
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = views_per_step())]
     pub(crate) views_per_step: u32,
-    /// Splats of the merged model before pruning; auto takes three per sparse point, from 5,000 to 2,000,000
+    /// Splats of the merged model before pruning; auto takes three for each sparse point and for two of lidar, from 5,000 to 2,000,000
     #[arg(long, value_name = "N|auto", default_value_t)]
     pub(crate) budget: Auto<u32>,
     /// Prune the finest blocks within this loss of PSNR on their training views, dB; 0 prunes nothing
@@ -122,13 +122,15 @@ pub(crate) struct PlanOptions {
 }
 
 impl PlanOptions {
-    /// The planner's settings for a capture.
+    /// The planner's settings for a capture whose last `lidar` points were measured by lidar.
     ///
     /// Budget and steps grow with points and views, as more would overfit: at a quarter of its size `street_lund` (25 views,
     /// 1,540 points) reaches 16.1 dB held out with 6,000 splats and 1,500 steps, 15.3 dB with 20,000 and 3,000.
-    pub(crate) fn settings(&self, capture: &Capture) -> PlanSettings {
+    pub(crate) fn settings(&self, capture: &Capture, lidar: usize) -> PlanSettings {
         let times = |count: usize, each: u32| u32::try_from(count).unwrap_or(u32::MAX).saturating_mul(each);
-        let budget = || times(capture.points.len(), 3).clamp(5000, 2_000_000);
+        // Lidar points are dense: splats that start from them are split less.
+        let sparse = capture.points.len().saturating_sub(lidar);
+        let budget = || times(sparse, 3).saturating_add(times(lidar, 3) / 2).clamp(5000, 2_000_000);
         let steps = || times(capture.views.len(), 60).max(500);
         PlanSettings {
             mode: match self.blocks {

@@ -17,9 +17,9 @@ const VOXEL_METRES: f64 = 0.1;
 /// Factor by which voxels grow while there are too many.
 const GROWTH: f64 = 1.25;
 /// Most initial points, as a multiple of the capture's sparse points.
-const PER_SPARSE_POINT: usize = 2;
+const PER_SPARSE_POINT: usize = 4;
 /// Bounds of that maximum.
-const MAX_POINTS: std::ops::RangeInclusive<usize> = 20_000..=1_000_000;
+const MAX_POINTS: std::ops::RangeInclusive<usize> = 40_000..=1_000_000;
 /// Returns that are kept until it is known which of them a camera sees, as a multiple of the maximum.
 const UNSEEN_FACTOR: usize = 4;
 /// Most sweeps that are read for initial points, spread evenly.
