@@ -1,0 +1,29 @@
+#!/usr/bin/env bash
+# The streets' lines of bench/results: what eye-level photos of generated cities gain, three seeds, one thread, nothing pruned.
+# Takes the names of those to train (all where none is named), and the ONNX file of a detector in DETECTOR, if one is there. Photos are kept in
+# out/streets. On one core the thin city takes ten minutes, the dense streets half an hour each, the city of 0.3 km² a quarter of an hour.
+set -euo pipefail
+cd "$(dirname "${BASH_SOURCE[0]}")/.."
+plat=${PLAT:-target/release/plat}
+detector=(${DETECTOR:+--detector "$(realpath --relative-to=. "$DETECTOR")"})
+
+# Name, steps, splats, every how many views one is held out, options of synth.
+while read -r name steps budget every options; do
+    [[ $# == 0 || " $* " == *" $name "* ]] || continue
+    capture="out/streets/$name"
+    # shellcheck disable=SC2086
+    [[ -e "$capture/manifest.json" ]] && grep -q '"complete": *true' "$capture/manifest.json" ||
+        "$plat" --quiet synth $options --size 480x270 --lidar --truth --out "$capture"
+    for lidar in "without lidar" "with lidar"; do
+        without=()
+        [[ $lidar == "with lidar" ]] || without=(--no-lidar)
+        "$plat" --quiet bench pareto "$capture" --scene "$name" --label "plat, $lidar" --seed 0,1,2 --threads 1 --tolerance-db 0 \
+            --steps "$steps" --budget "$budget" --test-every "$every" --eval-every 0 --depth "${detector[@]}" --fresh "${without[@]}" \
+            --out "out/streets/$name-model"
+    done
+done <<'STREETS'
+thin_city 1400 140000 4 --area-km2 0.1 --views 170
+city_0.3 3400 340000 8 --area-km2 0.3 --views 500
+dense_5m 6000 150000 8 --area-km2 0.05 --views 600 --aerial 0.05 --traffic light --spacing 5
+dense_2m 12000 200000 8 --area-km2 0.05 --views 1200 --aerial 0.05 --traffic light --spacing 2
+STREETS
