@@ -19,7 +19,7 @@ while read -r name steps budget every options; do
         [[ $lidar == "with lidar" ]] || without=(--no-lidar)
         "$plat" --quiet bench pareto "$capture" --scene "$name" --label "plat, $lidar" --seed 0,1,2 --threads 1 --tolerance-db 0 \
             --steps "$steps" --budget "$budget" --test-every "$every" --eval-every 0 --depth "${detector[@]}" --fresh "${without[@]}" \
-            --out "out/streets/$name-model"
+            --out "out/streets/$name-${lidar// /-}"
     done
 done <<'STREETS'
 thin_city 1400 140000 4 --area-km2 0.1 --views 170
