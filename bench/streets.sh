@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # The streets' lines of bench/results: what eye-level photos of generated cities gain, three seeds, one thread, nothing pruned.
 # Takes the names of those to train (all where none is named), and the ONNX file of a detector in DETECTOR, if one is there. Photos are kept in
-# out/streets. On one core the thin city takes ten minutes, the dense streets half an hour each, the city of 0.3 km² a quarter of an hour.
+# out/streets. On one core the thin city takes ten minutes; the others have not been run with three seeds yet.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 plat=${PLAT:-target/release/plat}

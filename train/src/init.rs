@@ -92,7 +92,7 @@ fn principal_axes(matrix: DMat3) -> ([f64; 3], DMat3) {
     ([0, 1, 2].map(|axis| diagonal.col(axis)[axis]), axes)
 }
 
-/// Indices of at count `count` points, ascending, evenly spaced along a Morton curve, so that relative density is kept.
+/// Indices of at most `count` points, ascending, evenly spaced along a Morton curve, so that relative density is kept.
 pub fn subsample(points: &[DVec3], count: usize) -> Vec<usize> {
     let n = points.len();
     if n <= count {

@@ -44,7 +44,7 @@ pub(crate) struct PlanOptions {
     /// How the scene is divided
     #[arg(long, value_enum, default_value = "tree")]
     pub(crate) blocks: Blocks,
-    /// Levels below the root; auto chooses by extent, resolution, views and points
+    /// Levels below the root; auto divides only what no block can hold, as deep as extent, resolution, views and points allow
     #[arg(long, value_name = "N|auto", default_value_t)]
     pub(crate) levels: Auto<u8>,
     /// Optimiser steps, counted in full images of the whole scene, so that every division costs about the same; auto takes 60
