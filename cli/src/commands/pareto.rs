@@ -55,7 +55,7 @@ pub(crate) fn run(args: &ParetoArgs, output: &Output) -> Result<(), Failure> {
     let mut existing = if file.exists() { read(&file)? } else { Vec::new() };
     let (mut lines, mut text, mut skipped) = (Vec::new(), String::new(), 0);
     for (n, run) in runs.iter().enumerate() {
-        let known = if args.sweep.train.fresh { None } else { known(run, &existing, output)? };
+        let known = if args.sweep.train.fresh { None } else { known(run, &existing, args, output)? };
         let line = match known {
             Some(line) => {
                 skipped += 1;
@@ -145,11 +145,20 @@ fn combination(args: &ParetoArgs, capture: &Named, train: TrainArgs) -> Run {
     Run { label, scene, train: TrainArgs { out, capture: capture.path.clone(), fresh: true, ..train } }
 }
 
-/// The existing line of this run, if it is of this commit and machine.
-fn known(run: &Run, existing: &[ResultLine], output: &Output) -> Result<Option<ResultLine>, Failure> {
+/// The existing line of this run, if it is of this commit and machine and has the figures that are asked for.
+fn known(
+    run: &Run,
+    existing: &[ResultLine],
+    args: &ParetoArgs,
+    output: &Output,
+) -> Result<Option<ResultLine>, Failure> {
     let machine = ::bench::machine();
     let alike = |line: &&ResultLine| {
-        line.label == run.label && line.scene == run.scene && line.commit == commit() && line.machine == machine
+        line.label == run.label
+            && line.scene == run.scene
+            && line.commit == commit()
+            && line.machine == machine
+            && has_figures(line, args.depth, args.detector.is_some())
     };
     if !existing.iter().any(|line| alike(&line)) {
         return Ok(None);
@@ -158,6 +167,11 @@ fn known(run: &Run, existing: &[ResultLine], output: &Output) -> Result<Option<R
     let (_, plan) = plan_of(&source, &run.train.plan)?;
     let hash = Some(resolved(&run.train, &plan).1.to_string());
     Ok(existing.iter().rfind(|line| alike(line) && line.config_hash == hash).cloned())
+}
+
+/// Whether a line has the figures of `--depth` and `--detector` where they are asked for.
+fn has_figures(line: &ResultLine, depth: bool, detector: bool) -> bool {
+    (!depth || line.depth_delta1.is_some()) && (!detector || line.detections_kept.is_some())
 }
 
 /// Trains and measures a run, with its depth if asked; returns its line and the figures as text.
@@ -213,6 +227,7 @@ mod tests {
 
     use super::*;
     use crate::args::{BenchCommand, Cli, Command};
+    use crate::run_record::Record;
 
     fn runs_of(words: &[&str]) -> Result<Vec<Run>, String> {
         let all = ["plat", "bench", "pareto", "--label", "l", "--out", "o"].iter().chain(words);
@@ -251,6 +266,23 @@ mod tests {
         };
         assert_eq!((run.scene.as_str(), run.train.out.as_path()), ("s", Path::new("o")));
         assert_eq!((run.train.plan.steps.0, run.train.store.as_deref()), (Some(10), Some("st")));
+    }
+
+    #[test]
+    fn a_line_without_the_figures_asked_for_does_not_stand_for_the_run() {
+        let line = |depth, kept| ResultLine {
+            depth_delta1: depth,
+            detections_kept: kept,
+            ..line_of("l", &Record::new("train"), Vec::new())
+        };
+        let answers = |of: &ResultLine| {
+            [(false, false), (true, false), (false, true), (true, true)]
+                .map(|(depth, found)| has_figures(of, depth, found))
+        };
+        assert_eq!(answers(&line(None, None)), [true, false, false, false]);
+        assert_eq!(answers(&line(Some(0.5), None)), [true, true, false, false]);
+        assert_eq!(answers(&line(None, Some(1.0))), [true, false, true, false]);
+        assert_eq!(answers(&line(Some(0.5), Some(1.0))), [true; 4]);
     }
 
     #[test]
