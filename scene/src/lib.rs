@@ -22,12 +22,14 @@ pub mod lidar;
 pub mod npy;
 pub mod nuscenes;
 pub mod opensfm;
+pub mod parquet;
 pub mod ply;
 pub mod poses;
 pub mod random;
 pub mod splats;
 pub mod spz;
 pub mod transforms;
+pub mod waymo;
 
 pub use camera::{Camera, CameraModel, Pinhole, Rect, Rigid};
 pub use capture::{Capture, GeoOrigin, SparsePoints, View};
