@@ -306,7 +306,8 @@ pub fn returns(
         let (row, column) = (pixel / width as usize, pixel % width as usize);
         let inclination = laser.inclination(row, height as usize);
         let azimuth = PI - 2.0 * PI * (column as f64 + 0.5) / f64::from(width) - mounted;
-        let direction = DVec3::new(azimuth.cos() * inclination.cos(), azimuth.sin() * inclination.cos(), inclination.sin());
+        let direction =
+            DVec3::new(azimuth.cos() * inclination.cos(), azimuth.sin() * inclination.cos(), inclination.sin());
         let point = laser.vehicle_from_laser.apply(direction * f64::from(range));
         let place = match poses.map(|poses| &poses[6 * pixel..6 * pixel + 6]) {
             Some(&[roll, pitch, yaw, x, y, z]) => {

@@ -17,9 +17,16 @@ pub(super) struct Hybrid {
 }
 
 enum Run {
-    Repeated { value: u32, left: u64 },
+    Repeated {
+        value: u32,
+        left: u64,
+    },
     /// Values from number `next` to `end` of those that begin at a byte.
-    Packed { start: usize, next: u64, end: u64 },
+    Packed {
+        start: usize,
+        next: u64,
+        end: u64,
+    },
 }
 
 impl Hybrid {
@@ -157,7 +164,11 @@ mod tests {
             assert!(hybrid.next().is_err());
         }
         assert!(Hybrid::new(bytes.to_vec(), 3).skip(15).is_err());
-        assert!(levels(bytes.to_vec(), 6, 5).is_err() && levels(bytes.to_vec(), 7, 14).is_ok() && levels(vec![], 1, 1).is_err());
+        assert!(
+            levels(bytes.to_vec(), 6, 5).is_err()
+                && levels(bytes.to_vec(), 7, 14).is_ok()
+                && levels(vec![], 1, 1).is_err()
+        );
         assert!(levels(vec![], 0, 0).unwrap().is_empty());
     }
 

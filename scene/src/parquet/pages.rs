@@ -50,7 +50,8 @@ pub(super) struct Page {
 /// Not a header, or one that claims more than is there.
 pub(super) fn page(source: &impl Source, at: u64, end: u64) -> Result<Page, CodecError> {
     let mut reader = Reader::new(reader(source, at)?, MAX_HEADER_BYTES.min(end.saturating_sub(at)));
-    let (mut kind, mut unpacked, mut length, mut slots, mut encoding, mut lengths, mut packed) = (-1, -1, -1, -1, 0, None, true);
+    let (mut kind, mut unpacked, mut length, mut slots, mut encoding, mut lengths, mut packed) =
+        (-1, -1, -1, -1, 0, None, true);
     reader.structure(|reader, number, field| {
         match (number, field) {
             (1, I32) => kind = reader.integer()?,
@@ -215,7 +216,9 @@ fn unpacked(packed: Take<BufReader<Box<dyn Read>>>, codec: i64, length: u64) -> 
             Box::new(decoder.take(length))
         }
         other => {
-            let problem = format!("has a column of compression {other}, which is not read (Snappy, gzip, Brotli and Zstandard are)");
+            let problem = format!(
+                "has a column of compression {other}, which is not read (Snappy, gzip, Brotli and Zstandard are)"
+            );
             return Err(CodecError::new(problem));
         }
     })

@@ -75,7 +75,8 @@ impl<R: Read> Snappy<R> {
                 2 => ((tag >> 2) + 1, self.number(2)? as usize),
                 _ => ((tag >> 2) + 1, self.number(4)? as usize),
             };
-            let from = before.checked_sub(offset).filter(|_| offset > 0 && offset <= REACH).or((length == 0).then_some(0));
+            let from =
+                before.checked_sub(offset).filter(|_| offset > 0 && offset <= REACH).or((length == 0).then_some(0));
             let from = from.ok_or_else(damaged)?;
             // A copy may reach into what it writes.
             for i in from..from + usize::from(length) {

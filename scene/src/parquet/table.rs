@@ -210,7 +210,10 @@ impl<S: Source> Table<S> {
             stream.next += 1;
             if stream.next > number {
                 if length > limit {
-                    return Err(at_column(column, &format!("has in row {row} a value of {length} bytes, over {limit}")));
+                    return Err(at_column(
+                        column,
+                        &format!("has in row {row} a value of {length} bytes, over {limit}"),
+                    ));
                 }
                 break pages::held(&mut stream.values, length)?;
             }
@@ -303,11 +306,15 @@ impl<S: Source> Table<S> {
             if wanted.start < wanted.end {
                 let Opened { repetition, definition, values } = pages::open(&self.source, column, chunk, &page)?;
                 let [from, to] = [wanted.start, wanted.end].map(|slot| slot - held.start);
-                let is_there = |slot: u64| definition.get(slot as usize).is_none_or(|&level| level == column.max_definition);
-                let passed = if definition.is_empty() { from } else { (0..from).filter(|&slot| is_there(slot)).count() as u64 };
+                let is_there =
+                    |slot: u64| definition.get(slot as usize).is_none_or(|&level| level == column.max_definition);
+                let passed =
+                    if definition.is_empty() { from } else { (0..from).filter(|&slot| is_there(slot)).count() as u64 };
                 let mut values = Values::new(column, &page, values, dictionary.as_ref(), passed)?;
                 for slot in from..to {
-                    let value = is_there(slot).then(|| values.next().and_then(|value| convert(column.physical, value))).transpose()?;
+                    let value = is_there(slot)
+                        .then(|| values.next().and_then(|value| convert(column.physical, value)))
+                        .transpose()?;
                     take(repetition.get(slot as usize).is_none_or(|&level| level == 0), value)?;
                 }
             }
@@ -460,7 +467,8 @@ impl<'a> Values<'a> {
             }
             Stored::Coded(indices, dictionary) => {
                 let value = dictionary.get(indices.next()? as usize, self.size);
-                let value = value.ok_or_else(|| CodecError::new("has a page that names a value that its dictionary lacks"))?;
+                let value =
+                    value.ok_or_else(|| CodecError::new("has a page that names a value that its dictionary lacks"))?;
                 if self.size == 0 {
                     return Ok(Value::Bytes(value.to_vec()));
                 }

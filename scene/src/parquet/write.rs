@@ -190,7 +190,8 @@ impl Writer {
 /// The metadata of a column's chunk.
 fn chunk(&(name, physical, _, is_list): &Leaf, slots: usize, start: i64, size: i64) -> Vec<u8> {
     let encodings = [0, 3].map(integer);
-    let path: Vec<Vec<u8>> = [name, "list", "element"][..if is_list { 3 } else { 1 }].iter().map(|name| text(name)).collect();
+    let path: Vec<Vec<u8>> =
+        [name, "list", "element"][..if is_list { 3 } else { 1 }].iter().map(|name| text(name)).collect();
     let data = Fields::default()
         .i32(1, physical)
         .list(2, I32, &encodings)
