@@ -8,12 +8,10 @@
 mod depths;
 mod error;
 mod from_map;
+mod photo_files;
 mod true_depth;
 mod undistorter;
 
-use std::fs::File;
-use std::io::Read;
-use std::path::Path;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Mutex, PoisonError};
 
@@ -26,6 +24,7 @@ use self::depths::Depths;
 pub use self::error::IngestError;
 pub use self::from_map::Used;
 pub use self::true_depth::{TrueDepth, ViewDepths};
+use self::photo_files::{PhotoFiles, read};
 use self::undistorter::{LastUndistorter, undistorter};
 use crate::open::{Photo, Source};
 use crate::photo::DecodedPhoto;
@@ -83,8 +82,8 @@ pub fn ingest(
     }
     let job = Job { store, downscale: options.downscale };
     let done = Mutex::new(0);
-    let views = in_threads(options.threads, photos.len(), |i, undistorter| {
-        let view = job.view(&source.capture.views[i], &photos[i], undistorter)?;
+    let views = in_threads(options.threads, photos.len(), |i, kept: &mut Kept| {
+        let view = job.view(&source.capture.views[i], &photos[i], kept)?;
         let mut done = done.lock().unwrap_or_else(PoisonError::into_inner);
         *done += 1;
         progress(*done, photos.len());
@@ -151,6 +150,13 @@ pub fn load_capture(store: &BlockingStore, id: ArtefactId) -> Result<Capture, In
     Ok(capture)
 }
 
+/// What a thread keeps from one photo to the next.
+#[derive(Default)]
+struct Kept {
+    files: PhotoFiles,
+    undistorter: LastUndistorter,
+}
+
 struct Job<'a> {
     store: &'a BlockingStore,
     downscale: u32,
@@ -166,19 +172,14 @@ struct IngestRecord {
 
 impl Job<'_> {
     /// The view with its mips, and whether its photo was decoded.
-    fn view(
-        &self,
-        view: &View,
-        photo: &Photo,
-        last_undistorter: &mut LastUndistorter,
-    ) -> Result<(View, bool), IngestError> {
+    fn view(&self, view: &View, photo: &Photo, kept: &mut Kept) -> Result<(View, bool), IngestError> {
         let (w, h) = (photo.width, photo.height);
         let ideal = view.camera.pinhole;
         for (w, h) in [(w, h), (ideal.width, ideal.height)] {
             if !(1..=mip_tiles::MAX_PIXELS).contains(&(u64::from(w) * u64::from(h))) {
                 let problem =
                     format!("has a camera of {w}×{h} pixels, which is none or over {}", mip_tiles::MAX_PIXELS);
-                return Err(BadInput::new(show(&photo.path), problem, "correct its camera's width and height").into());
+                return Err(BadInput::new(photo.shown(), problem, "correct its camera's width and height").into());
             }
         }
         let pinhole = downscaled(ideal, self.downscale);
@@ -187,7 +188,7 @@ impl Job<'_> {
             return Err(BadInput::new("--downscale", problem, "give a smaller factor").into());
         }
         let limit = photo::max_file_bytes(w, h);
-        let bytes = read(&photo.path, limit)?;
+        let bytes = kept.files.read(photo, limit)?;
         let mask = photo.mask.as_ref().map(|path| Ok::<_, BadInput>((path, read(path, limit)?))).transpose()?;
         let name = self.record_name(photo, &bytes, mask.as_ref().map(|(_, bytes)| bytes.as_slice()));
         let cached = self.load_record(&name)?;
@@ -195,14 +196,14 @@ impl Job<'_> {
         let record = match cached {
             Some(record) => record,
             None => {
-                let mut pixels = photo::decode(&bytes, w, h).map_err(|e| at(&photo.path, &e))?;
+                let mut pixels = photo::decode(&bytes, w, h).map_err(|e| at(photo.shown(), &e))?;
                 drop(bytes);
                 if let Some((path, bytes)) = mask {
-                    let usable = photo::decode_mask(&bytes, w, h).map_err(|e| at(path, &e))?;
+                    let usable = photo::decode_mask(&bytes, w, h).map_err(|e| at(path.display().to_string(), &e))?;
                     pixels.mask = Some(intersected(pixels.mask.take(), usable));
                 }
-                let finest = self.finest(pixels, photo, undistorter(photo, ideal, last_undistorter)?);
-                self.store_mips(finest, &name, &photo.path)?
+                let finest = self.finest(pixels, photo, undistorter(photo, ideal, &mut kept.undistorter)?);
+                self.store_mips(finest, &name, photo)?
             }
         };
         let camera = Camera { pinhole, ..view.camera };
@@ -239,11 +240,11 @@ impl Job<'_> {
         pixels
     }
 
-    fn store_mips(&self, finest: Pixels, name: &str, path: &Path) -> Result<IngestRecord, IngestError> {
+    fn store_mips(&self, finest: Pixels, name: &str, photo: &Photo) -> Result<IngestRecord, IngestError> {
         let masked = finest.mask.is_some();
         let mut encoded = Vec::new();
         mips::for_each_mip(finest, |mip| {
-            encoded.push(mip_tiles::encode(mip).map_err(|e| at(path, &e))?);
+            encoded.push(mip_tiles::encode(mip).map_err(|e| at(photo.shown(), &e))?);
             Ok::<_, IngestError>(())
         })?;
         let lengths: Vec<u64> = encoded.iter().map(|bytes: &Vec<u8>| bytes.len() as u64).collect();
@@ -299,24 +300,8 @@ fn intersected(mask: Option<Vec<u8>>, mut other: Vec<u8>) -> Vec<u8> {
     other
 }
 
-fn read(path: &Path, limit: u64) -> Result<Vec<u8>, BadInput> {
-    let failed = |e: std::io::Error| BadInput::new(show(path), format!("cannot be read ({e})"), "check the file");
-    let file = File::open(path).map_err(failed)?;
-    let mut bytes = Vec::new();
-    file.take(limit + 1).read_to_end(&mut bytes).map_err(failed)?;
-    if bytes.len() as u64 > limit {
-        let problem = format!("is larger than any photo of its camera can be ({} MB)", limit >> 20);
-        return Err(BadInput::new(show(path), problem, "check the file and its camera's width and height"));
-    }
-    Ok(bytes)
-}
-
-fn at(path: &Path, error: &scene::CodecError) -> BadInput {
-    BadInput::new(show(path), error.to_string(), "replace the file or take its image out of the capture")
-}
-
-fn show(path: &Path) -> String {
-    path.display().to_string()
+fn at(file: String, error: &scene::CodecError) -> BadInput {
+    BadInput::new(file, error.to_string(), "replace the file or take its image out of the capture")
 }
 
 #[cfg(test)]

@@ -16,5 +16,6 @@ mod observations;
 pub mod open;
 mod photo;
 pub mod synth;
+mod tables;
 pub mod undistortion;
 pub mod windows;

@@ -5,6 +5,7 @@
 
 mod npz;
 mod occlusion;
+mod range_image;
 pub(crate) mod seeds;
 
 use std::fs::File;
@@ -16,6 +17,7 @@ use scene::lidar::{Turn, read_points};
 use scene::{BadInput, Rigid};
 
 pub(crate) use self::occlusion::{Seen, visible};
+pub use self::range_image::RangeImage;
 
 /// The largest file of a sweep: ten times a turn of a scanner with 128 beams.
 const MAX_FILE_BYTES: u64 = 64 << 20;
@@ -40,12 +42,14 @@ pub struct Sweep {
 }
 
 /// How a file holds the points of a sweep.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub enum PointFormat {
     /// This many f32 a point, of which the first three are x, y and z (KITTI: 4, nuScenes: 5).
     Floats(usize),
     /// The array `data` of an npz file, or its first one: a row a point, of which the first three columns are x, y and z (DGP).
     Npz,
+    /// A range image in a table (Waymo).
+    RangeImage(Box<RangeImage>),
 }
 
 /// A return of the lidar.
@@ -63,6 +67,10 @@ impl Sweep {
     /// # Errors
     /// A file that cannot be read, is too large, is damaged, or holds another number of points than announced.
     pub(crate) fn read(&self) -> Result<Vec<Return>, BadInput> {
+        if let PointFormat::RangeImage(image) = &self.format {
+            let is_used = |found: &Return| RANGE_METRES.contains(&f64::from(found.range));
+            return Ok(image.read(&self.path)?.into_iter().filter(is_used).collect());
+        }
         let bad = |problem: String| BadInput::new(self.path.display().to_string(), problem, "download the sweep again");
         let file = File::open(&self.path).map_err(|e| bad(format!("cannot be read ({e})")))?;
         let mut bytes = Vec::new();
@@ -70,9 +78,9 @@ impl Sweep {
         if bytes.len() as u64 > MAX_FILE_BYTES {
             return Err(bad(format!("is larger than {} MB, too large for a sweep", MAX_FILE_BYTES >> 20)));
         }
-        let (bytes, floats) = match self.format {
-            PointFormat::Floats(floats) => (bytes, floats),
-            PointFormat::Npz => npz::rows(&bytes).map_err(|e| bad(e.to_string()))?,
+        let (bytes, floats) = match &self.format {
+            PointFormat::Floats(floats) => (bytes, *floats),
+            PointFormat::Npz | PointFormat::RangeImage(_) => npz::rows(&bytes).map_err(|e| bad(e.to_string()))?,
         };
         let count = (bytes.len() / (4 * floats)) as u64;
         if let Some(readings) = self.readings.filter(|readings| *readings != count) {

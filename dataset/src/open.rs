@@ -23,6 +23,7 @@ mod opensfm;
 mod parsed;
 mod transforms;
 mod truth;
+mod waymo;
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -46,6 +47,8 @@ use crate::undistortion;
 pub struct Photo {
     /// Canonical path of the image file, inside the capture.
     pub path: PathBuf,
+    /// If the file is a table of photos, the row of this one.
+    pub row: Option<u64>,
     /// Canonical path of the mask, of the photo's size: bright pixels are usable, dark ones excluded.
     pub mask: Option<PathBuf>,
     /// The lens, in pixels of this file.
@@ -60,6 +63,14 @@ pub struct Photo {
     pub moving: Vec<[DVec3; 8]>,
 }
 
+impl Photo {
+    /// Its file, and its row if it is in a table, for messages.
+    pub(crate) fn shown(&self) -> String {
+        let file = files::show(&self.path);
+        self.row.map_or_else(|| file.clone(), |row| format!("{file} (row {row})"))
+    }
+}
+
 /// An opened capture: everything but the pixels.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Source {
@@ -69,7 +80,7 @@ pub struct Source {
     pub photos: Vec<Photo>,
     /// Names of the capture's images that are not used, with the reason.
     pub left_out: Vec<(String, String)>,
-    /// `colmap`, `transforms`, `opensfm`, `dgp`, `nuscenes`, `kitti`, `kitti360` or `kitti-raw`, followed by ` without points` if its points were
+    /// `colmap`, `transforms`, `opensfm`, `dgp`, `nuscenes`, `kitti`, `kitti360`, `kitti-raw` or `waymo`, followed by ` without points` if its points were
     /// sampled from the overlap of its views.
     pub format: &'static str,
     /// Lidar sweeps. The last [`seeds`](Self::seeds) points of the capture come from them.
@@ -92,18 +103,19 @@ impl Source {
     }
 }
 
-/// Opens a capture: a folder, the path of a `transforms.json` or `reconstruction.json`, or `FOLDER/SCENE` for a scene of
-/// nuScenes.
+/// Opens a capture: a folder, the path of a `transforms.json` or `reconstruction.json`, or `FOLDER/NAME` for a scene of
+/// nuScenes or a segment of Waymo.
 ///
 /// # Errors
 /// The invalid file, its defect, and advice.
 pub fn open(path: &Path, options: &OpenOptions) -> Result<Source, BadInput> {
-    let named = nuscenes::named_scene(path);
-    let root = CaptureRoot::new(named.map_or(path, |(folder, _)| folder))?;
+    let (named, segment) = (nuscenes::named_scene(path), waymo::named_segment(path));
+    let root = CaptureRoot::new(named.or(segment).map_or(path, |(folder, _)| folder))?;
     let ParsedCapture { mut format, images, points, origin, left_out: unused, sweeps, labels, root: other } =
-        match named {
-            Some((_, scene)) => nuscenes::read(&root, Some(scene), options)?,
-            None => parse(&root, path, options)?,
+        match (named, segment) {
+            (Some((_, scene)), _) => nuscenes::read(&root, Some(scene), options)?,
+            (None, Some((_, segment))) => waymo::read(&root, Some(segment), options)?,
+            (None, None) => parse(&root, path, options)?,
         };
     let root = other.unwrap_or(root);
     let (images, photos, mut left_out) = find_photos(&root, images, options)?;
@@ -131,6 +143,7 @@ pub fn open(path: &Path, options: &OpenOptions) -> Result<Source, BadInput> {
             "nuscenes" => "nuscenes without points",
             "kitti" => "kitti without points",
             "kitti-raw" => "kitti-raw without points",
+            "waymo" => "waymo without points",
             _ => "kitti360 without points",
         };
     }
@@ -171,6 +184,9 @@ fn parse(root: &CaptureRoot, path: &Path, options: &OpenOptions) -> Result<Parse
     if let Some(drive) = kitti_raw::find(root)? {
         return kitti_raw::read(drive, options);
     }
+    if waymo::is_present(root) {
+        return waymo::read(root, None, options);
+    }
     if let Some(folder) = colmap::find(root, &["colmap/sparse/0"]) {
         return colmap::read(root, &folder, options);
     }
@@ -180,7 +196,7 @@ fn parse(root: &CaptureRoot, path: &Path, options: &OpenOptions) -> Result<Parse
         return Err(BadInput::new(files::show(path), problem, advice));
     }
     let problem = "has neither a COLMAP model in sparse/0 nor a transforms.json, a reconstruction.json, or the files of DGP, \
-                   nuScenes, KITTI, KITTI-360 or KITTI raw";
+                   nuScenes, KITTI, KITTI-360, KITTI raw or Waymo";
     Err(BadInput::new(files::show(path), problem, "give a folder that has one of them"))
 }
 
@@ -237,6 +253,7 @@ fn photo(
             let model = image.intrinsics.model(width, height);
             return Ok(Some(Photo {
                 path: root.path(&image.file),
+                row: None,
                 mask: None,
                 model,
                 width,
@@ -246,7 +263,11 @@ fn photo(
             }));
         }
     };
-    let (width, height) = files::image_size(&path)?;
+    let (width, height) = match (image.row, image.intrinsics.size) {
+        // Its calibration gives the size, so that no photo of the table is read.
+        (Some(_), Some((width, height))) => files::check_size(&path, width, height).map(|()| (width, height))?,
+        _ => files::image_size(&path)?,
+    };
     let model = scaled_model(&image.intrinsics, width, height).ok_or_else(|| {
         let (w, h) = image.intrinsics.size.unwrap_or_default();
         let problem = format!("has {width}×{height} pixels, its camera {w}×{h}, which is another shape");
@@ -260,10 +281,11 @@ fn photo(
                 return Err(BadInput::new(files::show(&path), problem, "put the mask there or take it out"));
             }
         },
+        None if image.row.is_some() => masks::find(root, masks, &image.name, Path::new(&image.name), options),
         None => masks::find(root, masks, &image.file, &path, options),
     };
     let depth = maps.map(|maps| maps.find(root, image)).transpose()?.flatten();
-    Ok(Some(Photo { path, mask, model, width, height, depth, moving: image.moving.clone() }))
+    Ok(Some(Photo { path, row: image.row, mask, model, width, height, depth, moving: image.moving.clone() }))
 }
 
 /// The lens in pixels of a photo of this size. The photo may be a uniformly scaled copy of the camera's image; `None` for another
@@ -300,7 +322,7 @@ fn views(images: &[PosedImage], photos: &[Photo]) -> Result<Vec<View>, BadInput>
             .or_insert_with(|| undistortion::ideal_pinhole(&photo.model, photo.width, photo.height));
         let pinhole = pinhole.ok_or_else(|| {
             let problem = "was taken with a lens whose distortion cannot be inverted inside the photo";
-            BadInput::new(files::show(&photo.path), problem, "check the parameters of its camera")
+            BadInput::new(photo.shown(), problem, "check the parameters of its camera")
         })?;
         let camera = Camera { pinhole, camera_from_world: image.camera_from_world };
         Ok(View {

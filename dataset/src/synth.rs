@@ -15,6 +15,7 @@
 //! | `tracks_and_boxes` | `tracks.json`, `boxes3d.json` |
 //! | `nuscenes` | `nuscenes/` |
 //! | `kitti_raw` | `kitti_raw/` |
+//! | `waymo` | `waymo/` |
 //! | `gltf` | `city.glb` |
 //! | `occupancy` | `occupancy/` |
 //! | `gallery` | nothing: draws an overview of layouts, labels and faults |
@@ -39,6 +40,7 @@ mod shots;
 mod sparse;
 mod sweeps;
 mod tracks_and_boxes;
+mod waymo;
 
 use std::path::Path;
 
@@ -78,6 +80,9 @@ pub fn write(out: &Path, settings: &Settings, progress: Progress) -> Result<Summ
     }
     if settings.kitti_raw {
         kitti_raw::write(out, &shots, &legs, &stations, settings, progress)?;
+    }
+    if settings.waymo {
+        waymo::write(out, &world, &shots, &legs, &stations, &turns, settings, progress)?;
     }
     if settings.mesh {
         gltf::write(out, &city)?;

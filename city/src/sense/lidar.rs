@@ -140,7 +140,8 @@ impl Lidar {
         check_count((last.seconds - first.seconds) * self.turns_per_second)
     }
 
-    fn columns(&self) -> u32 {
+    /// Firings of each beam in a revolution.
+    pub fn columns(&self) -> u32 {
         (self.firings_per_second / self.turns_per_second / f64::from(self.channels)).round().clamp(1.0, 1e9) as u32
     }
 

@@ -26,6 +26,7 @@ fn source(folder: &Path, count: u32) -> Source {
         std::fs::write(folder.join(&name), encoded(image, format)).unwrap();
         let photo = Photo {
             path: folder.join(&name),
+            row: None,
             mask: None,
             depth: None,
             model: model(),

@@ -22,7 +22,7 @@ pub(super) fn undistorter<'a>(
         None => {
             let advice = "check the parameters of its camera";
             Err(BadInput::new(
-                photo.path.display().to_string(),
+                photo.shown(),
                 "was taken with a lens whose distortion cannot be inverted",
                 advice,
             ))

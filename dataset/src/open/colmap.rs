@@ -40,6 +40,7 @@ pub(super) fn read(root: &CaptureRoot, folder: &str, options: &OpenOptions) -> R
         })?;
         let size = Some((camera.width, camera.height));
         Ok(PosedImage {
+            row: None,
             id: image.id,
             file: format!("{photos}{}", image.name),
             name: image.name,

@@ -52,6 +52,7 @@ pub(super) fn read(root: &CaptureRoot, path: &Path, options: &OpenOptions) -> Re
                 boxes.push((id, photo.world_from_sensor, found));
             }
             images.push(PosedImage {
+                row: None,
                 id,
                 name: photo.file.clone(),
                 file: photo.file.clone(),

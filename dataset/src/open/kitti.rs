@@ -81,6 +81,7 @@ pub(super) fn read(root: &CaptureRoot, of: &Sequence, options: &OpenOptions) -> 
                 continue;
             }
             images.push(PosedImage {
+                row: None,
                 id: images.len() as u32,
                 name,
                 file,

@@ -77,6 +77,7 @@ pub(super) fn read(root: &CaptureRoot, options: &OpenOptions) -> Result<ParsedCa
                     seen.entry(frame).or_default().push(images.len() as u32);
                 }
                 images.push(PosedImage {
+                    row: None,
                     id: images.len() as u32,
                     name: format!("{drive}/{camera}/{frame:010}.png"),
                     file,

@@ -124,6 +124,7 @@ pub(super) fn read(drive: Drive, options: &OpenOptions) -> Result<ParsedCapture,
                 continue;
             };
             images.push(PosedImage {
+                row: None,
                 id: images.len() as u32,
                 name: format!("image_0{number}/{frame}.{extension}"),
                 file,

@@ -1,12 +1,18 @@
-//! Boxes of annotated objects: which of them move, and their corners.
+//! Boxes of annotated objects: which of them move, and where those are at a photo's time.
 
 use std::collections::{BTreeMap, BTreeSet};
 
 use glam::DVec3;
-use scene::Rigid;
+use scene::{CameraModel, Rigid};
 
 /// An object moves if its places in the world differ by more, metres.
 const MOVED_METRES: f64 = 0.5;
+/// An object keeps its first and last place for this long before and after. nuScenes annotates every half second.
+const ALONE_MICROSECONDS: u64 = 300_000;
+/// Between boxes that are farther apart in time the object's place is unknown.
+const GAP_MICROSECONDS: u64 = 1_600_000;
+/// Boxes in a photo are nearer, metres.
+const MAX_DEPTH_METRES: f64 = 200.0;
 
 /// The objects that move, of all places of each.
 pub(super) fn moving<K: Ord>(places: impl Iterator<Item = (K, DVec3)>) -> BTreeSet<K> {
@@ -23,4 +29,77 @@ pub(super) fn moving<K: Ord>(places: impl Iterator<Item = (K, DVec3)>) -> BTreeS
 pub(super) fn corners(pose: &Rigid, size: DVec3) -> [DVec3; 8] {
     let sign = |i: usize, bit: usize| if i & bit == 0 { -0.5 } else { 0.5 };
     std::array::from_fn(|i| pose.apply(size * DVec3::new(sign(i, 1), sign(i, 2), sign(i, 4))))
+}
+
+/// A box of an object.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Placed {
+    pub(super) microseconds: i64,
+    pub(super) world_from_box: Rigid,
+    /// Metres along its axes.
+    pub(super) size: DVec3,
+}
+
+/// For each moving object its boxes, by time.
+pub(super) struct Tracks(Vec<Vec<Placed>>);
+
+impl Tracks {
+    /// Of boxes with their objects, each object's in the order of time.
+    pub(super) fn new<K: Ord>(boxes: impl Iterator<Item = (K, Placed)>) -> Self {
+        let mut by_object: BTreeMap<K, Vec<Placed>> = BTreeMap::new();
+        boxes.for_each(|(object, found)| by_object.entry(object).or_default().push(found));
+        Self(by_object.into_values().collect())
+    }
+
+    /// Corners in the camera's axes of the moving objects that may be in a photo.
+    pub(super) fn seen(
+        &self,
+        microseconds: i64,
+        camera_from_world: &Rigid,
+        lens: &CameraModel,
+        size: Option<(u32, u32)>,
+    ) -> Vec<[DVec3; 8]> {
+        let at = |boxes: &Vec<Placed>| {
+            let (world_from_box, size) = at(boxes, microseconds)?;
+            Some(corners(&camera_from_world.compose(&world_from_box), size))
+        };
+        self.0.iter().filter_map(at).filter(|corners| is_in_view(corners, lens, size)).collect()
+    }
+}
+
+/// An object's pose and size at a time, between its boxes; `None` if they are too far away in time.
+fn at(boxes: &[Placed], microseconds: i64) -> Option<(Rigid, DVec3)> {
+    let after = boxes.partition_point(|found| found.microseconds < microseconds);
+    let near = |found: &Placed| {
+        let pose = (found.world_from_box, found.size);
+        (found.microseconds.abs_diff(microseconds) <= ALONE_MICROSECONDS).then_some(pose)
+    };
+    match (after.checked_sub(1).and_then(|i| boxes.get(i)), boxes.get(after)) {
+        (Some(a), Some(b)) if b.microseconds.abs_diff(a.microseconds) <= GAP_MICROSECONDS => {
+            let span = b.microseconds.abs_diff(a.microseconds).max(1);
+            let share = microseconds.abs_diff(a.microseconds) as f64 / span as f64;
+            let (from, to) = (a.world_from_box, b.world_from_box);
+            let rotation = from.rotation.slerp(to.rotation, share).normalize();
+            let translation = from.translation.lerp(to.translation, share);
+            Some((Rigid { rotation, translation }, a.size.max(b.size)))
+        }
+        (a, b) => a.and_then(near).or_else(|| b.and_then(near)),
+    }
+}
+
+/// Whether the box may be in the photo: not if all corners are behind the camera, far away, or beyond one edge.
+fn is_in_view(corners: &[DVec3; 8], lens: &CameraModel, size: Option<(u32, u32)>) -> bool {
+    if corners.iter().all(|p| p.z <= 0.0) || corners.iter().any(|p| p.length() > MAX_DEPTH_METRES) {
+        return false;
+    }
+    let Some((width, height)) = size else { return true };
+    let [fx, fy, cx, cy] = lens.focal_and_centre();
+    // An edge and the camera span a plane; half spaces stay right for corners behind the camera.
+    let beyond = [
+        corners.iter().all(|p| fx * p.x + cx * p.z < 0.0),
+        corners.iter().all(|p| fx * p.x + (cx - f64::from(width)) * p.z > 0.0),
+        corners.iter().all(|p| fy * p.y + cy * p.z < 0.0),
+        corners.iter().all(|p| fy * p.y + (cy - f64::from(height)) * p.z > 0.0),
+    ];
+    !beyond.contains(&true)
 }

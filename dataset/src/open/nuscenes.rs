@@ -142,6 +142,7 @@ fn image(
     let camera_from_world = world_from_sensor.inverse();
     let size = Some(datum.size).filter(|(width, height)| *width > 0 && *height > 0);
     Ok(PosedImage {
+        row: None,
         id,
         name: datum.file.clone(),
         file: datum.file.clone(),
@@ -149,7 +150,7 @@ fn image(
         mask: None,
         intrinsics: Intrinsics::from_model(model, size),
         camera_from_world,
-        moving: boxes.seen(datum.microseconds, &camera_from_world, model, size),
+        moving: boxes.moving.seen(datum.microseconds, &camera_from_world, model, size),
     })
 }
 

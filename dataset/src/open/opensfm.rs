@@ -23,6 +23,7 @@ pub(super) fn read(root: &CaptureRoot, path: &Path) -> Result<ParsedCapture, Bad
         .map_err(|e| BadInput::new(files::show(path), e.to_string(), "correct the file or reconstruct again"))?;
     let folder = if root.path("images").is_dir() { "images/" } else { "" };
     let images = shots.into_iter().zip(0..).map(|(shot, id)| PosedImage {
+        row: None,
         id,
         file: format!("{folder}{}", shot.name),
         name: shot.name,

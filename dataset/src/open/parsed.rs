@@ -65,6 +65,8 @@ pub(super) struct PosedImage {
     pub(super) name: String,
     /// Path of the image file, relative to the capture.
     pub(super) file: String,
+    /// If the file is a table of photos, the row of this one.
+    pub(super) row: Option<u64>,
     /// Path of its mask, relative to the capture, if the capture names one.
     pub(super) mask: Option<String>,
     /// Path of its depth map, relative to the capture, if the capture names one.

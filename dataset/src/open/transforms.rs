@@ -40,6 +40,7 @@ pub(super) fn read(root: &CaptureRoot, paths: &[PathBuf]) -> Result<ParsedCaptur
             }
             names.insert(name.clone());
             images.push(PosedImage {
+                row: None,
                 id: images.len() as u32,
                 file: name.clone(),
                 name,

@@ -14,7 +14,7 @@ use super::settings::{Settings, Summary, SynthError};
 
 const NAME: &str = "manifest.json";
 /// All folders of a synthetic capture.
-const FOLDERS: [&str; 15] = [
+const FOLDERS: [&str; 16] = [
     "images",
     "masks",
     "sparse",
@@ -30,6 +30,7 @@ const FOLDERS: [&str; 15] = [
     "occupancy",
     "kitti_raw",
     "nuscenes",
+    "waymo",
 ];
 /// All files of a synthetic capture except the manifest.
 const FILES: [&str; 6] =

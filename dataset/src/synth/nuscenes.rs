@@ -29,8 +29,9 @@ use scene::Rigid;
 use serde_json::json;
 use store::file::{SaveError, save};
 
-use self::objects::{Object, Scene};
-use self::sample::Sample;
+use self::objects::Scene;
+pub(super) use self::objects::{Object, around};
+pub(super) use self::sample::Sample;
 pub(super) use self::sweep::{LIDAR, save_sweep};
 use self::tables::{Tables, chained, quaternion, token};
 use super::lidar_turn::LidarTurn;
@@ -139,7 +140,7 @@ fn push_drive(
     let row =
         |sample: &Sample| json!({ "token": sample.token(), "timestamp": sample.microseconds(), "scene_token": scene });
     tables.extend("sample", chained(samples.iter().map(row).collect()));
-    let objects: Vec<Vec<Object>> = samples.par_iter().map(|sample| objects::around(world, sample)).collect();
+    let objects: Vec<Vec<Object>> = samples.par_iter().map(|sample| around(world, sample)).collect();
     objects::push(tables, &Scene { name: &name, city: world.city(), samples, objects: &objects });
     let end = |sample: Option<&Sample>| sample.map_or(String::new(), Sample::token);
     tables.push(

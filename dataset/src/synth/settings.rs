@@ -43,6 +43,9 @@ pub struct Settings {
     /// Whether to write the drives of the cars in the layout of KITTI raw too.
     #[serde(skip_serializing_if = "is_unset")]
     pub kitti_raw: bool,
+    /// Whether to write the drives of the cars in the layout of the Waymo Open Dataset too.
+    #[serde(skip_serializing_if = "is_unset")]
+    pub waymo: bool,
     /// Voxel size of the occupancy grids, metres, 0.05 to 10. `None` writes no grids.
     pub occupancy: Option<f64>,
     /// Regions of the occupancy grids, 1,000 at most. Empty covers the whole city.
@@ -100,6 +103,7 @@ impl Default for Settings {
             mesh: false,
             nuscenes: false,
             kitti_raw: false,
+            waymo: false,
             occupancy: None,
             around: Vec::new(),
             spacing: None,
@@ -134,6 +138,9 @@ impl Settings {
             }
             s if s.kitti_raw && s.aerial + s.fixed >= 1.0 => {
                 refuse("the number of photos from cars, for KITTI raw,", "choose shares that sum to less than 1")
+            }
+            s if s.waymo && s.aerial + s.fixed >= 1.0 => {
+                refuse("the number of photos from cars, for Waymo,", "choose shares that sum to less than 1")
             }
             s if s.around.len() > 1000 => refuse("the number of places to fill with voxels", "choose 1,000 at most"),
             s if s.faults.iter().any(|f| !f.is_valid()) => refuse("the strength of a fault", "choose 0 to 1"),

@@ -7,10 +7,10 @@ use super::super::shots::Station;
 use super::tables::token;
 
 /// A place of a drive with its readings.
-pub(super) struct Sample<'a> {
-    pub(super) station: &'a Station,
-    pub(super) photos: Vec<&'a Shot>,
-    pub(super) turn: Option<&'a LidarTurn>,
+pub(crate) struct Sample<'a> {
+    pub(crate) station: &'a Station,
+    pub(crate) photos: Vec<&'a Shot>,
+    pub(crate) turn: Option<&'a LidarTurn>,
 }
 
 impl Sample<'_> {
@@ -18,7 +18,7 @@ impl Sample<'_> {
         token(&["sample", &self.station.name])
     }
 
-    pub(super) fn microseconds(&self) -> i64 {
+    pub(crate) fn microseconds(&self) -> i64 {
         (self.station.seconds * 1e6).round() as i64
     }
 }
