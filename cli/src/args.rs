@@ -120,7 +120,7 @@ pub(crate) struct DoctorArgs {
 
 #[derive(Debug, Clone, Args)]
 pub(crate) struct InspectArgs {
-    /// Folder of the capture: COLMAP, transforms.json, OpenSfM, DGP, nuScenes, KITTI, KITTI-360 or KITTI raw
+    /// Folder of the capture: COLMAP, transforms.json, OpenSfM, DGP, nuScenes, KITTI, KITTI-360, KITTI raw or Waymo
     pub(crate) capture: PathBuf,
     /// Draw where too few photos see the ground from nearby, over cameras and points
     #[arg(long, value_name = "FILE")]
@@ -131,7 +131,7 @@ pub(crate) struct InspectArgs {
 
 #[derive(Debug, Clone, Args)]
 pub(crate) struct PlanArgs {
-    /// Folder of the capture: COLMAP, transforms.json, OpenSfM, DGP, nuScenes, KITTI, KITTI-360 or KITTI raw
+    /// Folder of the capture: COLMAP, transforms.json, OpenSfM, DGP, nuScenes, KITTI, KITTI-360, KITTI raw or Waymo
     pub(crate) capture: PathBuf,
     /// Write the plan as JSON
     #[arg(long, value_name = "FILE")]
@@ -146,7 +146,7 @@ pub(crate) struct PlanArgs {
 #[derive(Debug, Clone, Args, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub(crate) struct TrainArgs {
-    /// Folder of the capture: COLMAP, transforms.json, OpenSfM, DGP, nuScenes, KITTI, KITTI-360 or KITTI raw
+    /// Folder of the capture: COLMAP, transforms.json, OpenSfM, DGP, nuScenes, KITTI, KITTI-360, KITTI raw or Waymo
     #[serde(skip)]
     pub(crate) capture: PathBuf,
     /// Folder for the model and its reports

@@ -62,7 +62,7 @@ pub(crate) struct ParetoArgs {
 
 #[derive(Debug, Clone, Args)]
 pub(crate) struct IngestArgs {
-    /// Folder of the capture: COLMAP, transforms.json, OpenSfM, DGP, nuScenes, KITTI, KITTI-360 or KITTI raw
+    /// Folder of the capture: COLMAP, transforms.json, OpenSfM, DGP, nuScenes, KITTI, KITTI-360, KITTI raw or Waymo
     pub(crate) capture: PathBuf,
     /// Use photos at one N-th of their size
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
@@ -168,7 +168,7 @@ pub(crate) struct AdaptiveArgs {
 
 #[derive(Debug, Clone, Args)]
 pub(crate) struct ScaleArgs {
-    /// Folder of the capture: COLMAP, transforms.json, OpenSfM, DGP, nuScenes, KITTI, KITTI-360 or KITTI raw
+    /// Folder of the capture: COLMAP, transforms.json, OpenSfM, DGP, nuScenes, KITTI, KITTI-360, KITTI raw or Waymo
     pub(crate) capture: PathBuf,
     /// Numbers of workers; each worker has one thread
     #[arg(long, value_name = "N,N", value_delimiter = ',', default_value = "1,2", value_parser = clap::value_parser!(u32).range(1..=64))]
@@ -206,7 +206,7 @@ pub(crate) struct ChartArgs {
 
 #[derive(Debug, Clone, Args)]
 pub(crate) struct AblateArgs {
-    /// Folder of the capture: COLMAP, transforms.json, OpenSfM, DGP, nuScenes, KITTI, KITTI-360 or KITTI raw
+    /// Folder of the capture: COLMAP, transforms.json, OpenSfM, DGP, nuScenes, KITTI, KITTI-360, KITTI raw or Waymo
     pub(crate) capture: PathBuf,
     /// Use photos at one N-th of their size
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]

@@ -42,7 +42,7 @@ impl Args for Sweep {
     fn augment_args(command: Command) -> Command {
         let list = |arg: Arg| arg.value_delimiter(',');
         let mut command = TrainArgs::augment_args(command).mut_arg("capture", |arg| {
-            let help = "Folders of captures (COLMAP, transforms.json, OpenSfM, DGP, nuScenes, KITTI, KITTI-360 or KITTI raw), each with its name in the chart; by default that of its folder";
+            let help = "Folders of captures (COLMAP, transforms.json, OpenSfM, DGP, nuScenes, KITTI, KITTI-360, KITTI raw or Waymo), each with its name in the chart; by default that of its folder";
             arg.action(ArgAction::Append).num_args(1..).value_name("NAME=PATH").help(help)
         });
         for id in ["steps", "budget", "tolerance_db", "backend", "seed"] {

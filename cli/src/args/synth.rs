@@ -81,6 +81,10 @@ pub(crate) struct SynthArgs {
     /// Write the drives of the cars in the layout of KITTI raw too: photos of the cameras that look ahead and, with --lidar, sweeps
     #[arg(long)]
     pub(crate) kitti_raw: bool,
+    /// Write the drives of the cars in the layout of the Waymo Open Dataset (Perception, version 2) too: photos of the cameras that
+    /// do not look to the rear, boxes and, with --lidar, range images
+    #[arg(long)]
+    pub(crate) waymo: bool,
     /// Write the city as glTF
     #[arg(long)]
     pub(crate) mesh: bool,
@@ -145,6 +149,10 @@ with --nuscenes, in nuscenes/, which plat and the nuScenes devkit read (a scene 
 with --kitti-raw, in kitti_raw/1970_01_01/, which plat and pykitti read (a drive of a car is 1970_01_01_drive_LEG_sync):
   calib_*.txt, and of each drive image_02 and image_03 (the cameras that look ahead), oxts (the car on the road under its
   centre) and velodyne_points (float32 x 4, counter-clockwise, in the sensor's axes at the firing), each with data/FRAME.*
+with --waymo, in waymo/, which plat and the owners' devkit read (a segment is a drive of a car, drive_LEG):
+  COMPONENT/drive_LEG.parquet  camera_calibration, camera_image (JPEG), vehicle_pose, lidar_box, stats and, with --lidar,
+                         lidar_calibration, lidar (range images of the top laser) and lidar_pose; the cameras that look to
+                         the rear have no number there
 with --mesh:  city.glb   glTF 2: a node for each actor (class, instance), a mesh for each asset, materials without patterns
 with --occupancy: occupancy/X_Y.npz for each block: semantic (uint8, 255 free) and instance (uint32) by z, y, x;
               origin (the lowest corner) and voxel (its side) in metres, world_from_grid (4 x 4; the identity)

@@ -88,6 +88,7 @@ fn settings(args: &SynthArgs) -> Settings {
         mesh: args.mesh,
         nuscenes: args.nuscenes,
         kitti_raw: args.kitti_raw,
+        waymo: args.waymo,
         occupancy: args.occupancy,
         around: args.occupancy_around.clone(),
         spacing: args.spacing,

@@ -21,11 +21,7 @@ pub(super) fn undistorter<'a>(
         Some(undistorter) => Ok(&last.insert((key, undistorter)).1),
         None => {
             let advice = "check the parameters of its camera";
-            Err(BadInput::new(
-                photo.shown(),
-                "was taken with a lens whose distortion cannot be inverted",
-                advice,
-            ))
+            Err(BadInput::new(photo.shown(), "was taken with a lens whose distortion cannot be inverted", advice))
         }
     }
 }

@@ -36,7 +36,8 @@ impl RangeImage {
             tables::open(path)?.list(column, row, lengths).map_err(|e| tables::bad(path, &e))
         };
         let ranges = list(path, RANGES, self.row, &self.lengths)?;
-        let poses = self.poses.as_ref().map(|(path, row, lengths)| list(path, PIXEL_POSES, *row, lengths)).transpose()?;
+        let poses =
+            self.poses.as_ref().map(|(path, row, lengths)| list(path, PIXEL_POSES, *row, lengths)).transpose()?;
         let found = waymo::returns(&ranges, self.shape, &self.laser, poses.as_deref(), &self.world_from_vehicle);
         let found = found.map_err(|e| tables::bad(path, &e))?;
         Ok(found.into_iter().map(|WaymoReturn { place, range, .. }| Return { place, range }).collect())

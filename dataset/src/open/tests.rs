@@ -11,6 +11,7 @@ mod formats;
 mod kitti_raw;
 mod nuscenes;
 mod reprojection;
+mod waymo;
 
 use crate::synth::{self, Settings};
 

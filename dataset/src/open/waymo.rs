@@ -56,7 +56,11 @@ fn segments(root: &CaptureRoot) -> BTreeMap<String, &'static str> {
 }
 
 /// Parses the segment of this name, or the only one.
-pub(super) fn read(root: &CaptureRoot, segment: Option<&str>, options: &OpenOptions) -> Result<ParsedCapture, BadInput> {
+pub(super) fn read(
+    root: &CaptureRoot,
+    segment: Option<&str>,
+    options: &OpenOptions,
+) -> Result<ParsedCapture, BadInput> {
     let segment = choose(root, segment)?;
     let photos = segment.read(PHOTOS, waymo::read_photos)?;
     let vehicles = segment.find("vehicle_pose").map(|_| segment.read("vehicle_pose", waymo::read_vehicle_poses));
@@ -131,7 +135,8 @@ impl Segment<'_> {
             return Err(self.bad(PHOTOS, "has no photo".into()));
         }
         let image = |(id, photo): (u32, &WaymoPhoto)| {
-            let lacks = || self.bad(PHOTOS, format!("has a photo of camera {}, which its calibration lacks", photo.camera));
+            let lacks =
+                || self.bad(PHOTOS, format!("has a photo of camera {}, which its calibration lacks", photo.camera));
             let camera = cameras.get(&photo.camera).ok_or_else(lacks)?;
             let name = usize::try_from(photo.camera - 1).ok().and_then(|number| waymo::CAMERAS.get(number));
             let name = name.map_or_else(|| format!("CAMERA_{}", photo.camera), |name| (*name).to_owned());
@@ -178,7 +183,8 @@ impl Segment<'_> {
         vehicles: Option<&BTreeMap<i64, Rigid>>,
     ) -> Result<Vec<ParsedSweep>, BadInput> {
         let lasers = self.read("lidar_calibration", waymo::read_lasers)?;
-        let vehicles = vehicles.map_or_else(|| self.read("vehicle_pose", waymo::read_vehicle_poses), |all| Ok(all.clone()))?;
+        let vehicles =
+            vehicles.map_or_else(|| self.read("vehicle_pose", waymo::read_vehicle_poses), |all| Ok(all.clone()))?;
         let turns = self.read("lidar", |table| waymo::read_turns(table, RANGES, 4))?;
         let poses = match self.find("lidar_pose") {
             Some(path) => Some((path, self.read("lidar_pose", |table| waymo::read_turns(table, PIXEL_POSES, 6))?)),
@@ -196,12 +202,14 @@ impl Segment<'_> {
         let (all, mut sweeps) = (lengths(&turns), Vec::new());
         let path = self.root.path(&self.file("lidar"));
         for (row, turn) in (0..).zip(&turns).filter(|(_, turn)| turn.length() > 0) {
-            let lacks = || self.bad("lidar", format!("has a range image of laser {}, which its calibration lacks", turn.laser));
+            let lacks =
+                || self.bad("lidar", format!("has a range image of laser {}, which its calibration lacks", turn.laser));
             let laser = lasers.get(&turn.laser).ok_or_else(lacks)?;
             let world_from_vehicle = *self.vehicle("lidar", &vehicles, turn.frame)?;
             let pose = pose_of.get(&(turn.frame, turn.laser));
             if let Some((row, shape)) = pose.filter(|(_, shape)| shape[..2] != turn.shape[..2]) {
-                let problem = format!("has in row {row} poses of shape {shape:?} for a range image of shape {:?}", turn.shape);
+                let problem =
+                    format!("has in row {row} poses of shape {shape:?} for a range image of shape {:?}", turn.shape);
                 return Err(self.bad("lidar_pose", problem));
             }
             let poses = pose.zip(poses.as_ref()).zip(pose_lengths.as_ref());

@@ -12,6 +12,7 @@ use crate::open::{OpenOptions, open};
 
 mod kitti_raw;
 mod nuscenes;
+mod waymo;
 
 fn small() -> Settings {
     let city = CitySettings { layout: Layout::Grid, traffic: Traffic::Heavy, ..CitySettings::default() };

@@ -34,10 +34,20 @@ use super::shots::Station;
 /// The folder below the capture.
 pub(super) const FOLDER: &str = "waymo";
 
+/// When the city's clock begins: all times have the same number of digits then, as the data set's have.
+const START_SECONDS: i64 = 1_500_000_000;
+
 /// A place of a drive with the vehicle's true pose.
 struct Frame<'a> {
     sample: Sample<'a>,
     world_from_vehicle: Rigid,
+}
+
+impl Frame<'_> {
+    /// Its time, microseconds.
+    fn time(&self) -> i64 {
+        START_SECONDS * 1_000_000 + self.sample.microseconds()
+    }
 }
 
 /// A drive.
@@ -86,7 +96,7 @@ pub(super) fn write(
 }
 
 fn write_poses(segment: &Segment) -> Result<(), SynthError> {
-    let mut columns = keys(&segment.name, segment.frames.iter().map(|frame| frame.sample.microseconds()));
+    let mut columns = keys(&segment.name, segment.frames.iter().map(|frame| frame.time()));
     let poses = segment.frames.iter().map(|frame| matrix(&frame.world_from_vehicle));
     columns.push(("[VehiclePoseComponent].world_from_vehicle.transform", Cells::Doubles(poses.collect())));
     Component::write(segment.out, "vehicle_pose", &segment.name, columns)
@@ -94,7 +104,7 @@ fn write_poses(segment: &Segment) -> Result<(), SynthError> {
 
 fn write_stats(segment: &Segment) -> Result<(), SynthError> {
     let rows = segment.frames.len();
-    let mut columns = keys(&segment.name, segment.frames.iter().map(|frame| frame.sample.microseconds()));
+    let mut columns = keys(&segment.name, segment.frames.iter().map(|frame| frame.time()));
     let text = |text: &str| Cells::Text(vec![text.to_owned(); rows]);
     columns.extend([
         ("[StatsComponent].time_of_day", text("Day")),

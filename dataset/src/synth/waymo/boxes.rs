@@ -41,7 +41,7 @@ pub(super) fn write(segment: &Segment, world: &World) -> Result<(), SynthError> 
             let centre = pose.apply((0.5 * (low + high)).as_dvec3());
             let ahead = vehicle_from_world.rotation * (pose.rotation * DVec3::X);
             rows.push(Row {
-                microseconds: frame.sample.microseconds(),
+                microseconds: frame.time(),
                 object: format!("{}-{}", segment.name, actor.instance),
                 class: class(actor.class),
                 centre: vehicle_from_world.apply(centre),

@@ -59,7 +59,7 @@ pub(super) fn write(segment: &Segment) -> Result<(), SynthError> {
         let rows = frames.len();
         let shape = |depth: i32| Cells::Int32s(vec![vec![height as i32, width as i32, depth]; rows]);
         let keys = || {
-            let mut keys = keys(&segment.name, frames.iter().map(|frame| frame.sample.microseconds()));
+            let mut keys = keys(&segment.name, frames.iter().map(|frame| frame.time()));
             keys.push(("key.laser_name", Cells::Int8(vec![TOP; rows])));
             keys
         };

@@ -15,7 +15,7 @@ use store::file::SaveError;
 use super::super::nuscenes::vehicle_from_camera;
 use super::super::settings::SynthError;
 use super::component::{Columns, Component, keys, matrix};
-use super::{Frame, Segment};
+use super::{Frame, START_SECONDS, Segment};
 
 /// Photos of a group of rows: what is in memory at a time.
 const GROUP: usize = 64;
@@ -47,7 +47,7 @@ pub(super) fn write<'a>(segment: &Segment<'a>, cameras: &[Camera]) -> Result<boo
     let taken = segment.frames.iter().flat_map(|frame| frame.sample.photos.iter().map(move |shot| (frame, *shot)));
     let row = |(frame, shot): (&Frame, &'a Shot)| {
         let name = shot.sensor.strip_prefix("street-")?;
-        Some((frame.sample.microseconds(), cameras.iter().find(|camera| camera.mount.name == name)?, shot))
+        Some((frame.time(), cameras.iter().find(|camera| camera.mount.name == name)?, shot))
     };
     let rows: Vec<(i64, &Camera, &Shot)> = taken.filter_map(row).collect();
     let Some((_, _, first)) = rows.first() else { return Ok(false) };
@@ -92,7 +92,9 @@ fn group(segment: &Segment, rows: &[(i64, &Camera, &Shot)]) -> Result<Columns, S
         matrix(&world_from_camera.after(&vehicle_from_camera(&camera.mount).inverse()))
     };
     let doubles = |value: &dyn Fn(&Shot) -> f64| Cells::Double(rows.iter().map(|(.., shot)| value(shot)).collect());
-    let floats = |value: &dyn Fn(&Shot) -> f64| Cells::Float(rows.iter().map(|(.., shot)| value(shot) as f32).collect());
+    let floats =
+        |value: &dyn Fn(&Shot) -> f64| Cells::Float(rows.iter().map(|(.., shot)| value(shot) as f32).collect());
+    let seconds = |shot: &Shot| START_SECONDS as f64 + shot.seconds;
     let mut columns = keys(&segment.name, rows.iter().map(|(time, ..)| *time));
     columns.extend([
         ("key.camera_name", Cells::Int8(rows.iter().map(|(_, camera, _)| camera.number).collect())),
@@ -104,10 +106,10 @@ fn group(segment: &Segment, rows: &[(i64, &Camera, &Shot)]) -> Result<Columns, S
         ("[CameraImageComponent].velocity.angular_velocity.x", doubles(&|shot| shot.motion.spin.x)),
         ("[CameraImageComponent].velocity.angular_velocity.y", doubles(&|shot| shot.motion.spin.y)),
         ("[CameraImageComponent].velocity.angular_velocity.z", doubles(&|shot| shot.motion.spin.z)),
-        ("[CameraImageComponent].pose_timestamp", doubles(&|shot| shot.seconds)),
+        ("[CameraImageComponent].pose_timestamp", doubles(&seconds)),
         ("[CameraImageComponent].rolling_shutter_params.shutter", doubles(&|_| 0.0)),
-        ("[CameraImageComponent].rolling_shutter_params.camera_trigger_time", doubles(&|shot| shot.seconds)),
-        ("[CameraImageComponent].rolling_shutter_params.camera_readout_done_time", doubles(&|shot| shot.seconds)),
+        ("[CameraImageComponent].rolling_shutter_params.camera_trigger_time", doubles(&seconds)),
+        ("[CameraImageComponent].rolling_shutter_params.camera_readout_done_time", doubles(&seconds)),
     ]);
     Ok(columns)
 }
@@ -118,6 +120,8 @@ fn jpeg(out: &Path, shot: &Shot) -> Result<Vec<u8>, SaveError> {
     let png = fs::read(&from).map_err(|e| SaveError::new(&from, &e))?;
     let photo = image::load_from_memory(&png).map_err(|e| SaveError::new(&from, &e))?.into_rgb8();
     let mut bytes = Vec::new();
-    photo.write_with_encoder(JpegEncoder::new_with_quality(&mut bytes, QUALITY)).map_err(|e| SaveError::new(&from, &e))?;
+    photo
+        .write_with_encoder(JpegEncoder::new_with_quality(&mut bytes, QUALITY))
+        .map_err(|e| SaveError::new(&from, &e))?;
     Ok(bytes)
 }
