@@ -22,6 +22,8 @@ fuzz_target!(|bytes: &[u8]| {
         assert!(poses.values().all(|pose| pose.is_sane()));
     }
     let _ = waymo::read_lasers(&table);
+    // Columns of the seeds that pyarrow wrote.
+    let _ = (table.texts("text"), table.lists("values"), table.bytes("photo", 4, 1 << 20));
     for (values, depth) in [(waymo::RANGES, 4), (waymo::PIXEL_POSES, 6)] {
         let Ok(turns) = waymo::read_turns(&table, values, depth) else { continue };
         let lengths: Vec<u32> = turns.iter().map(|turn| turn.length()).collect();

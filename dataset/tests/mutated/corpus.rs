@@ -12,6 +12,7 @@ use dataset::synth::{self, Settings};
 use glam::Vec3;
 use image::{DynamicImage, ImageFormat, Luma, Rgb, RgbImage, Rgba, RgbaImage};
 use scene::frame;
+use scene::parquet::{Cells, Writer};
 use scene::transforms::{Frame, Intrinsics, Transforms};
 use scene::{CameraModel, Exposure, Exposures, Pixels, Splat, Splats};
 use scene::{npy, ply, spz, transforms};
@@ -236,6 +237,15 @@ impl Corpus {
             self.plain(name, table, codec);
         }
 
+        for (name, columns) in waymo() {
+            let mut writer = Writer::default();
+            let bytes = [writer.group(columns), writer.finish()].concat();
+            self.plain(&format!("{name}.parquet"), bytes, &waymo_codec());
+        }
+        for (name, bytes) in BY_PYARROW {
+            self.put(name, bytes.to_vec(), &waymo_codec(), Seal::None, COMPRESSED);
+        }
+
         for degree in [0, 3] {
             let mut splats = Splats::new(degree);
             (0..200).for_each(|i| splats.push(&splat(i)));
@@ -345,6 +355,82 @@ const RECONSTRUCTION: &str = r#"[{"cameras": {
   "points": {"7": {"color": [255, 0, 12.4], "coordinates": [1, 2, 3]}, "10": {"coordinates": [4, 5, 6]}},
   "reference_lla": {"latitude": 47.5, "longitude": 8.5, "altitude": 400}},
   {"cameras": {}, "shots": {"z.jpg": {"camera": "", "rotation": [0, 0, 0], "translation": [0, 0, 0]}}}]"#;
+/// Tables written by pyarrow, from the tests of scene.
+const BY_PYARROW: [(&str, &[u8]); 4] = [
+    ("brotli.parquet", include_bytes!("../../../scene/src/parquet/by_pyarrow/brotli.parquet")),
+    ("gzip.parquet", include_bytes!("../../../scene/src/parquet/by_pyarrow/gzip.parquet")),
+    ("snappy.parquet", include_bytes!("../../../scene/src/parquet/by_pyarrow/snappy_v2.parquet")),
+    ("zstd.parquet", include_bytes!("../../../scene/src/parquet/by_pyarrow/zstd_v2.parquet")),
+];
+
+/// Components of Waymo.
+fn waymo() -> Vec<(&'static str, Vec<(&'static str, Cells)>)> {
+    let pose = vec![0.0, -1.0, 0.0, 5.0, 1.0, 0.0, 0.0, 6.0, 0.0, 0.0, 1.0, 7.0, 0.0, 0.0, 0.0, 1.0];
+    let poses = |rows: usize| Cells::Doubles(vec![pose.clone(); rows]);
+    let doubles = |rows: usize| Cells::Double((0..rows).map(|row| 1.0 + row as f64 / 3.0).collect());
+    let times = |rows: i64| ("key.frame_timestamp_micros", Cells::Int64((0..rows).collect()));
+    let mut cameras = vec![("key.camera_name", Cells::Int8(vec![1, 2]))];
+    for name in [
+        "[CameraCalibrationComponent].intrinsic.f_u",
+        "[CameraCalibrationComponent].intrinsic.f_v",
+        "[CameraCalibrationComponent].intrinsic.c_u",
+        "[CameraCalibrationComponent].intrinsic.c_v",
+        "[CameraCalibrationComponent].intrinsic.k1",
+        "[CameraCalibrationComponent].intrinsic.k2",
+        "[CameraCalibrationComponent].intrinsic.p1",
+        "[CameraCalibrationComponent].intrinsic.p2",
+        "[CameraCalibrationComponent].intrinsic.k3",
+    ] {
+        cameras.push((name, doubles(2)));
+    }
+    cameras.extend([
+        ("[CameraCalibrationComponent].extrinsic.transform", poses(2)),
+        ("[CameraCalibrationComponent].width", Cells::Int32(vec![16, 32])),
+        ("[CameraCalibrationComponent].height", Cells::Int32(vec![9, 18])),
+    ]);
+    let photos = vec![
+        times(2),
+        ("key.camera_name", Cells::Int8(vec![1, 2])),
+        ("[CameraImageComponent].image", Cells::Bytes(vec![vec![7; 90]; 2])),
+        ("[CameraImageComponent].pose.transform", poses(2)),
+        ("[CameraImageComponent].pose_timestamp", doubles(2)),
+    ];
+    let lasers = vec![
+        ("key.laser_name", Cells::Int8(vec![1, 2])),
+        ("[LiDARCalibrationComponent].extrinsic.transform", poses(2)),
+        ("[LiDARCalibrationComponent].beam_inclination.min", Cells::Double(vec![-0.3, -1.0])),
+        ("[LiDARCalibrationComponent].beam_inclination.max", Cells::Double(vec![0.1, 1.0])),
+        ("[LiDARCalibrationComponent].beam_inclination.values", Cells::Doubles(vec![vec![-0.3, 0.1], vec![]])),
+    ];
+    let turns = vec![
+        times(2),
+        ("key.laser_name", Cells::Int8(vec![1, 2])),
+        ("[LiDARComponent].range_image_return1.values", Cells::Floats(vec![vec![3.0; 24], vec![4.0; 8]])),
+        ("[LiDARComponent].range_image_return1.shape", Cells::Int32s(vec![vec![2, 3, 4], vec![1, 2, 4]])),
+    ];
+    let mut boxes = vec![times(2), ("key.laser_object_id", Cells::Text(vec!["a".into(), "bc".into()]))];
+    for name in [
+        "[LiDARBoxComponent].box.center.x",
+        "[LiDARBoxComponent].box.center.y",
+        "[LiDARBoxComponent].box.center.z",
+        "[LiDARBoxComponent].box.size.x",
+        "[LiDARBoxComponent].box.size.y",
+        "[LiDARBoxComponent].box.size.z",
+        "[LiDARBoxComponent].box.heading",
+    ] {
+        boxes.push((name, doubles(2)));
+    }
+    boxes.push(("[LiDARBoxComponent].type", Cells::Int8(vec![1, 4])));
+    vec![
+        ("camera_calibration", cameras),
+        ("camera_image", photos),
+        ("vehicle_pose", vec![times(2), ("[VehiclePoseComponent].world_from_vehicle.transform", poses(2))]),
+        ("lidar_calibration", lasers),
+        ("lidar", turns),
+        ("lidar_box", boxes),
+    ]
+}
+
 /// KITTI raw: a file of each kind.
 const KITTI_RAW: [(&str, &str); 3] = [
     (

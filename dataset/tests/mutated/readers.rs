@@ -3,6 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::rc::Rc;
+use std::sync::Arc;
 
 use dataset::depth_maps::DepthMapOptions;
 use dataset::depth_samples::DepthSamples;
@@ -12,9 +13,10 @@ use dataset::open::{self, OpenOptions};
 use glam::{DQuat, DVec3};
 use image::{ImageFormat, RgbImage};
 use scene::frame::{self, Kind};
+use scene::parquet::Table;
 use scene::transforms::{Frame, Intrinsics, Transforms};
 use scene::{CameraModel, Capture, CodecError, Exposures, Rect, Rigid};
-use scene::{colmap, kitti_raw, kitti360, npy, nuscenes, opensfm, ply, spz, transforms};
+use scene::{colmap, kitti_raw, kitti360, npy, nuscenes, opensfm, ply, spz, transforms, waymo};
 use store::Store;
 
 use crate::corpus::{CLOUD, PHOTO_SIZE, encoded};
@@ -162,6 +164,50 @@ pub(crate) fn nuscenes_codecs() -> [Read; 7] {
             |boxes| boxes.iter().all(|found| found.world_from_box.is_sane() && found.size.min_element() > 0.0),
         ),
     ]
+}
+
+/// A table of Waymo, or one with the columns of scene's tests of Parquet.
+pub(crate) fn waymo_codec() -> Read {
+    codec("waymo", read_table, |()| true)
+}
+
+fn read_table(bytes: &[u8]) -> Result<(), CodecError> {
+    let mut table = Table::open(Arc::<[u8]>::from(bytes))?;
+    if table.has("[CameraCalibrationComponent].width") {
+        let cameras = waymo::read_cameras(&table)?;
+        assert!(cameras.values().all(|c| camera_is_sane(&c.lens, c.width, c.height) && c.vehicle_from_camera.is_sane()));
+    }
+    if table.has("[VehiclePoseComponent].world_from_vehicle.transform") {
+        assert!(waymo::read_vehicle_poses(&table)?.values().all(Rigid::is_sane));
+    }
+    if table.has(waymo::IMAGE) {
+        for photo in waymo::read_photos(&table)?.iter().take(4) {
+            assert!(photo.world_from_vehicle.is_sane());
+            table.bytes(waymo::IMAGE, photo.row, 1 << 20)?;
+        }
+    }
+    if table.has("[LiDARCalibrationComponent].beam_inclination.values") {
+        assert!(waymo::read_lasers(&table)?.values().all(|laser| laser.vehicle_from_laser.is_sane()));
+    }
+    for (column, depth) in [(waymo::RANGES, 4), (waymo::PIXEL_POSES, 6)] {
+        if table.has(column) {
+            let turns = waymo::read_turns(&table, column, depth)?;
+            let lengths: Vec<u32> = turns.iter().map(waymo::WaymoTurn::length).collect();
+            for row in 0..turns.len().min(4) {
+                assert_eq!(table.list(column, row as u64, &lengths)?.len(), lengths[row] as usize);
+            }
+        }
+    }
+    if table.has("[LiDARBoxComponent].type") {
+        let boxes = waymo::read_boxes(&table)?;
+        assert!(boxes.iter().all(|found| found.vehicle_from_box.is_sane() && found.size.min_element() > 0.0));
+    }
+    if table.has("photo") {
+        table.texts("text")?;
+        table.lists("values")?;
+        table.bytes("photo", 4, 1 << 20)?;
+    }
+    Ok(())
 }
 
 pub(crate) fn ply_codec() -> Read {
