@@ -12,7 +12,8 @@
 //! | `footer` | columns, groups of rows, chunks |
 //! | `pages` | headers of pages, and their bytes as a decompressed stream |
 //! | `levels` | runs of small integers: which values are there, where lists begin, indices of a dictionary |
-//! | `table` | the values of a column, of one row or of all |
+//! | `table` | columns as a whole, or single rows of them |
+//! | `values` | the values of a page, plain or from a dictionary |
 //! | `write` | the writer: plain, uncompressed pages |
 //! | `snappy`, `thrift` | the formats below |
 //!
@@ -33,6 +34,7 @@ mod table;
 #[cfg(test)]
 mod tests;
 mod thrift;
+mod values;
 mod write;
 
 pub use self::table::Table;

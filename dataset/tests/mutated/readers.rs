@@ -175,7 +175,9 @@ fn read_table(bytes: &[u8]) -> Result<(), CodecError> {
     let mut table = Table::open(Arc::<[u8]>::from(bytes))?;
     if table.has("[CameraCalibrationComponent].width") {
         let cameras = waymo::read_cameras(&table)?;
-        assert!(cameras.values().all(|c| camera_is_sane(&c.lens, c.width, c.height) && c.vehicle_from_camera.is_sane()));
+        assert!(
+            cameras.values().all(|c| camera_is_sane(&c.lens, c.width, c.height) && c.vehicle_from_camera.is_sane())
+        );
     }
     if table.has("[VehiclePoseComponent].world_from_vehicle.transform") {
         assert!(waymo::read_vehicle_poses(&table)?.values().all(Rigid::is_sane));
