@@ -8,11 +8,16 @@ use dataset::windows::WindowReader;
 use glam::DVec3;
 use scene::{BLOCK_ATTRIBUTE, BlockId, Capture, Exposures, Poses, Splats};
 use train::prune::Pruning;
-use train::{FreeSpace, TrainView};
+use train::{Enclosure, Floor, FreeSpace, TrainView};
 
 use crate::result_cache::ResultCache;
 use crate::task::{ExecuteError, TaskOrder};
 use crate::trainer_context::TrainerContext;
+
+/// Share of the sparse points that lie under the floor of the backdrop. Some are matched wrongly, or in cellars.
+const LOW_PERCENT: usize = 2;
+/// Least height of the eye over that floor, in edges of the root block.
+const EYE_EDGES: f64 = 0.25;
 
 /// A block to be trained.
 pub(crate) struct Block<'a> {
@@ -105,23 +110,33 @@ impl Block<'_> {
     /// root has a backdrop.
     pub(crate) fn size_bounds_metres(&self, views: &[TrainView]) -> [f32; 2] {
         let largest = match self.task.parent {
-            None => 3.0 * train::init::backdrop_size_metres(self.backdrop_sphere(views).1),
+            None => 3.0 * self.enclosure(views).size_metres(),
             Some(_) => 0.5 * self.plan.ground.edge_metres,
         };
         [self.task.rho_metres as f32 * 0.05, largest as f32]
     }
 
-    /// Centre and radius (metres) of the backdrop: centred on the cameras, five times as far as the 98th percentile of points and
-    /// cameras.
-    pub(crate) fn backdrop_sphere(&self, views: &[TrainView]) -> (DVec3, f64) {
+    /// Where the backdrop is: a dome around the cameras, five times as far as the 98th percentile of points and cameras, and a floor
+    /// that only the lowest points lie under.
+    pub(crate) fn enclosure(&self, views: &[TrainView]) -> Enclosure {
         let cameras = views.iter().map(|view| view.camera.centre());
         let centre = cameras.clone().sum::<DVec3>() / views.len().max(1) as f64;
         let points = self.capture.points.positions.iter().copied();
         let mut distances: Vec<f64> =
-            points.chain(cameras).map(|p| p.distance(centre)).filter(|d| d.is_finite()).collect();
+            points.clone().chain(cameras).map(|p| p.distance(centre)).filter(|d| d.is_finite()).collect();
         distances.sort_by(f64::total_cmp);
         let far = distances.get(distances.len() * 98 / 100).copied().unwrap_or(1.0);
-        (centre, 5.0 * far.max(self.plan.ground.edge_metres * 0.5))
+        let ground = &self.plan.ground;
+        let radius_metres = 5.0 * far.max(ground.edge_metres * 0.5);
+
+        let up = ground.to_world(DVec3::Z);
+        let mut heights: Vec<f64> = points.map(|point| point.dot(up)).filter(|height| height.is_finite()).collect();
+        heights.sort_by(f64::total_cmp);
+        let floor = heights.get(heights.len() * LOW_PERCENT / 100).map(|&height_metres| {
+            let above = (centre.dot(up) - height_metres).max(EYE_EDGES * ground.edge_metres);
+            Floor { up, height_metres, eye: centre + up * (height_metres + above - centre.dot(up)) }
+        });
+        Enclosure { centre, radius_metres, floor }
     }
 
     /// The space in the block's halo that its views see through. Only views that are trained on count.
