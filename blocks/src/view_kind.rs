@@ -50,14 +50,33 @@ pub fn view_kinds(capture: &Capture) -> Vec<ViewKind> {
     kinds_of(capture, &Observations::of(capture), &Ground::of(capture))
 }
 
-/// As [`view_kinds`], with the capture's observations and ground.
-pub(crate) fn kinds_of(capture: &Capture, observations: &Observations, ground: &Ground) -> Vec<ViewKind> {
-    let mut outlooks: Vec<Option<Outlook>> = vec![None; capture.views.len()];
+/// The height of each view over the low points among those that it observes, in the capture's unit; `None` where it observes too
+/// few, or the capture has no tracks.
+pub fn view_heights(capture: &Capture) -> Vec<Option<f64>> {
+    let mut heights = vec![None; capture.views.len()];
+    if !capture.points.track_start.is_empty() {
+        outlooks_of(capture, &Observations::of(capture), &Ground::of(capture), |view, outlook| {
+            heights[view] = Some(outlook.height);
+        });
+    }
+    heights
+}
+
+/// Calls `each` with every view that observes enough points, and its outlook.
+fn outlooks_of(capture: &Capture, observations: &Observations, ground: &Ground, mut each: impl FnMut(usize, Outlook)) {
     for (view, points) in observations.points_by_view().into_iter().enumerate() {
         let centre = capture.views[view].camera.centre();
         let places = points.iter().map(|&point| capture.points.positions[point as usize] - centre);
-        outlooks[view] = Outlook::of(places.map(|ray| ground.from_world(ray)));
+        if let Some(outlook) = Outlook::of(places.map(|ray| ground.from_world(ray))) {
+            each(view, outlook);
+        }
     }
+}
+
+/// As [`view_kinds`], with the capture's observations and ground.
+pub(crate) fn kinds_of(capture: &Capture, observations: &Observations, ground: &Ground) -> Vec<ViewKind> {
+    let mut outlooks: Vec<Option<Outlook>> = vec![None; capture.views.len()];
+    outlooks_of(capture, observations, ground, |view, outlook| outlooks[view] = Some(outlook));
     let heights = |steep: bool| -> Vec<f64> {
         outlooks.iter().flatten().filter(|o| o.is_steep == steep).map(|o| o.height).collect()
     };
@@ -161,6 +180,16 @@ mod tests {
         let mut untracked = both();
         (untracked.points.track_start, untracked.points.seen_by) = (Vec::new(), Vec::new());
         assert_eq!(aerial_views(&untracked), expected);
+    }
+
+    #[test]
+    fn heights_are_those_over_the_ground() {
+        let heights = view_heights(&both());
+        let near = |view: usize, height: f64| heights[view].is_some_and(|found| (found / height - 1.0).abs() < 0.2);
+        assert!((0..20).all(|view| near(view, 1.7)) && (20..29).all(|view| near(view, 80.0)), "{heights:?}");
+        let mut untracked = both();
+        (untracked.points.track_start, untracked.points.seen_by) = (Vec::new(), Vec::new());
+        assert!(view_heights(&untracked).iter().all(Option::is_none));
     }
 
     #[test]
