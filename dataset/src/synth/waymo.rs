@@ -13,6 +13,7 @@ mod boxes;
 mod component;
 mod lasers;
 mod photos;
+mod segment;
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -22,41 +23,14 @@ use city::sense::Shot;
 use city::sense::rig::{Mount, sensor_pose_at};
 use city::trace::World;
 use glam::DVec3;
-use scene::Rigid;
 use scene::parquet::Cells;
 
 use self::component::{Component, keys, matrix};
+use self::segment::{Frame, Segment};
 use super::lidar_turn::LidarTurn;
 use super::nuscenes::Sample;
 use super::settings::{Progress, Settings, SynthError};
 use super::shots::Station;
-
-/// The folder below the capture.
-pub(super) const FOLDER: &str = "waymo";
-
-/// When the city's clock begins: all times have the same number of digits then, as the data set's have.
-const START_SECONDS: i64 = 1_500_000_000;
-
-/// A place of a drive with the vehicle's true pose.
-struct Frame<'a> {
-    sample: Sample<'a>,
-    world_from_vehicle: Rigid,
-}
-
-impl Frame<'_> {
-    /// Its time, microseconds.
-    fn time(&self) -> i64 {
-        START_SECONDS * 1_000_000 + self.sample.microseconds()
-    }
-}
-
-/// A drive.
-struct Segment<'a> {
-    out: &'a Path,
-    name: String,
-    leg: &'a [Waypoint],
-    frames: Vec<Frame<'a>>,
-}
 
 /// Writes all segments. The sweeps are in the capture's `lidar/`. `shots` are sorted by name, `turns` those of the stations.
 pub(super) fn write(

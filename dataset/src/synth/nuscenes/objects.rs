@@ -43,11 +43,11 @@ const RAYS: usize = 48;
 const INWARDS: f32 = 0.03;
 
 /// An annotated object of a sample.
-pub(in crate::synth) struct Object {
+pub(crate) struct Object {
     /// Row of [`City::actors`].
-    pub(in crate::synth) actor: usize,
+    pub(crate) actor: usize,
     /// Number of returns on it.
-    pub(in crate::synth) points: u32,
+    pub(crate) points: u32,
     /// Share that the camera sees which sees most of it.
     visible: f64,
 }
@@ -75,7 +75,7 @@ pub(super) fn push_classes(tables: &mut Tables) {
 }
 
 /// The objects of a sample.
-pub(in crate::synth) fn around(world: &World, sample: &Sample) -> Vec<Object> {
+pub(crate) fn around(world: &World, sample: &Sample) -> Vec<Object> {
     let (city, seconds) = (world.city(), sample.station.seconds);
     let moment = world.at(seconds);
     let here = match (sample.turn, sample.photos.first()) {

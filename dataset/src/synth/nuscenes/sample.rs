@@ -7,10 +7,10 @@ use super::super::shots::Station;
 use super::tables::token;
 
 /// A place of a drive with its readings.
-pub(in crate::synth) struct Sample<'a> {
-    pub(in crate::synth) station: &'a Station,
-    pub(in crate::synth) photos: Vec<&'a Shot>,
-    pub(in crate::synth) turn: Option<&'a LidarTurn>,
+pub(crate) struct Sample<'a> {
+    pub(crate) station: &'a Station,
+    pub(crate) photos: Vec<&'a Shot>,
+    pub(crate) turn: Option<&'a LidarTurn>,
 }
 
 impl Sample<'_> {
@@ -18,7 +18,7 @@ impl Sample<'_> {
         token(&["sample", &self.station.name])
     }
 
-    pub(in crate::synth) fn microseconds(&self) -> i64 {
+    pub(crate) fn microseconds(&self) -> i64 {
         (self.station.seconds * 1e6).round() as i64
     }
 }

@@ -9,8 +9,8 @@ use scene::parquet::Cells;
 use super::super::nuscenes::{Object, around};
 use super::super::settings::SynthError;
 use super::super::tracks_and_boxes::bounds;
-use super::Segment;
 use super::component::{Component, keys};
+use super::segment::Segment;
 
 /// A row of the table.
 struct Row {

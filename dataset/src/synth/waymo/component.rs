@@ -9,7 +9,7 @@ use store::file::AtomicFile;
 
 use super::super::output::create_folder;
 use super::super::settings::SynthError;
-use super::FOLDER;
+use super::segment::FOLDER;
 
 /// The columns of a group of rows.
 pub(super) type Columns = Vec<(&'static str, Cells)>;

@@ -15,8 +15,8 @@ use scene::parquet::Cells;
 use store::file::SaveError;
 
 use super::super::settings::SynthError;
-use super::Segment;
 use super::component::{Component, keys, matrix};
+use super::segment::Segment;
 
 /// `LaserName.TOP`.
 const TOP: i8 = 1;

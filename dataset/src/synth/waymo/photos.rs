@@ -15,7 +15,7 @@ use store::file::SaveError;
 use super::super::nuscenes::vehicle_from_camera;
 use super::super::settings::SynthError;
 use super::component::{Columns, Component, keys, matrix};
-use super::{Frame, START_SECONDS, Segment};
+use super::segment::{Frame, START_SECONDS, Segment};
 
 /// Photos of a group of rows: what is in memory at a time.
 const GROUP: usize = 64;
