@@ -13,7 +13,7 @@ synth --out "$scratch/drives" --area-km2 0.02 --views 96 --aerial 0 --size 192x1
 
 python3 -m venv "$scratch/venv"
 "$scratch/venv/bin/pip" install --quiet --disable-pip-version-check pycolmap==4.2.1 nuscenes-devkit==1.2.0 \
-    pykitti==0.3.1 opencv-python-headless pyarrow==26.0.1
+    pykitti==0.3.1 opencv-python-headless pyarrow==18.1.0
 "$scratch/venv/bin/python" - "$scratch/city" <<'PYTHON'
 import json, pathlib, sys
 import pycolmap
