@@ -50,4 +50,4 @@ pub use planner::plan;
 pub use seams::{Face, Seams};
 pub use split::{Part, Split};
 pub use view_cut::ViewTree;
-pub use view_kind::{ViewKind, view_heights, view_kinds};
+pub use view_kind::{ViewKind, view_kinds};

@@ -50,33 +50,14 @@ pub fn view_kinds(capture: &Capture) -> Vec<ViewKind> {
     kinds_of(capture, &Observations::of(capture), &Ground::of(capture))
 }
 
-/// The height of each view over the low points among those that it observes, in the capture's unit; `None` where it observes too
-/// few, or the capture has no tracks.
-pub fn view_heights(capture: &Capture) -> Vec<Option<f64>> {
-    let mut heights = vec![None; capture.views.len()];
-    if !capture.points.track_start.is_empty() {
-        outlooks_of(capture, &Observations::of(capture), &Ground::of(capture), |view, outlook| {
-            heights[view] = Some(outlook.height);
-        });
-    }
-    heights
-}
-
-/// Calls `each` with every view that observes enough points, and its outlook.
-fn outlooks_of(capture: &Capture, observations: &Observations, ground: &Ground, mut each: impl FnMut(usize, Outlook)) {
-    for (view, points) in observations.points_by_view().into_iter().enumerate() {
-        let centre = capture.views[view].camera.centre();
-        let places = points.iter().map(|&point| capture.points.positions[point as usize] - centre);
-        if let Some(outlook) = Outlook::of(places.map(|ray| ground.from_world(ray))) {
-            each(view, outlook);
-        }
-    }
-}
-
 /// As [`view_kinds`], with the capture's observations and ground.
 pub(crate) fn kinds_of(capture: &Capture, observations: &Observations, ground: &Ground) -> Vec<ViewKind> {
     let mut outlooks: Vec<Option<Outlook>> = vec![None; capture.views.len()];
-    outlooks_of(capture, observations, ground, |view, outlook| outlooks[view] = Some(outlook));
+    for (view, points) in observations.points_by_view().into_iter().enumerate() {
+        let centre = capture.views[view].camera.centre();
+        let places = points.iter().map(|&point| capture.points.positions[point as usize] - centre);
+        outlooks[view] = Outlook::of(places.map(|ray| ground.from_world(ray)));
+    }
     let heights = |steep: bool| -> Vec<f64> {
         outlooks.iter().flatten().filter(|o| o.is_steep == steep).map(|o| o.height).collect()
     };
@@ -180,19 +161,6 @@ mod tests {
         let mut untracked = both();
         (untracked.points.track_start, untracked.points.seen_by) = (Vec::new(), Vec::new());
         assert_eq!(aerial_views(&untracked), expected);
-    }
-
-    #[test]
-    fn heights_are_those_over_the_ground() {
-        // The street's lowest points are up to a metre above its ground, the aerial scene's 4 m below its own.
-        for (capture, low, high) in [(street(30, 600), 0.3, 1.6), (aerial(5, 200.0, 3000), 60.0, 64.0)] {
-            let heights: Vec<f64> = view_heights(&capture).into_iter().flatten().collect();
-            assert!(heights.len() * 4 > capture.views.len() * 3, "{heights:?}");
-            assert!(heights.iter().all(|height| (low..=high).contains(height)), "{heights:?}");
-        }
-        let mut untracked = both();
-        (untracked.points.track_start, untracked.points.seen_by) = (Vec::new(), Vec::new());
-        assert!(view_heights(&untracked).iter().all(Option::is_none));
     }
 
     #[test]

@@ -3,7 +3,6 @@
 //! Architecture invariant: no files, no network, no clock. Pixels come through [`WindowSource`]. Random numbers are
 //! counter-based ([`random`]), so a job gives the same splats for any number of threads.
 
-mod backdrop;
 pub mod checkpoint;
 pub mod coarse_to_fine;
 mod depth_loss;
@@ -30,7 +29,6 @@ mod trainer;
 mod view;
 pub mod visibility;
 
-pub use backdrop::{Enclosure, Floor};
 pub use checkpoint::State;
 pub use device::Backend;
 pub use device::step::MAX_VIEWS_PER_STEP;

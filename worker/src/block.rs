@@ -8,21 +8,11 @@ use dataset::windows::WindowReader;
 use glam::DVec3;
 use scene::{BLOCK_ATTRIBUTE, BlockId, Capture, Exposures, Poses, Splats};
 use train::prune::Pruning;
-use train::{Enclosure, Floor, FreeSpace, TrainView};
+use train::{FreeSpace, TrainView};
 
 use crate::result_cache::ResultCache;
 use crate::task::{ExecuteError, TaskOrder};
 use crate::trainer_context::TrainerContext;
-
-/// Share of the sparse points that lie under the floor of the backdrop. Some are matched wrongly, or in cellars.
-const LOW_PERCENT: usize = 2;
-/// Least height of the eye over that floor, in edges of the root block.
-const EYE_EDGES: f64 = 0.25;
-
-/// A view stands near the floor if it is at most this many times as high over it as over the ground that it sees.
-const FLOOR_HEIGHTS: f64 = 2.0;
-/// There is a floor if more than this share of the views stand near it.
-const FLOOR_VIEWS: f64 = 0.75;
 
 /// A block to be trained.
 pub(crate) struct Block<'a> {
@@ -115,14 +105,15 @@ impl Block<'_> {
     /// root has a backdrop.
     pub(crate) fn size_bounds_metres(&self, views: &[TrainView]) -> [f32; 2] {
         let largest = match self.task.parent {
-            None => 3.0 * self.enclosure(views).size_metres(),
+            None => 3.0 * train::init::backdrop_size_metres(self.backdrop_sphere(views).1),
             Some(_) => 0.5 * self.plan.ground.edge_metres,
         };
         [self.task.rho_metres as f32 * 0.05, largest as f32]
     }
 
-    /// Where the backdrop is: a dome around the cameras, five times as far as the 98th percentile of points and cameras, and a floor.
-    pub(crate) fn enclosure(&self, views: &[TrainView]) -> Enclosure {
+    /// Centre and radius (metres) of the backdrop: centred on the cameras, five times as far as the 98th percentile of points and
+    /// cameras.
+    pub(crate) fn backdrop_sphere(&self, views: &[TrainView]) -> (DVec3, f64) {
         let cameras = views.iter().map(|view| view.camera.centre());
         let centre = cameras.clone().sum::<DVec3>() / views.len().max(1) as f64;
         let points = self.capture.points.positions.iter().copied();
@@ -130,31 +121,7 @@ impl Block<'_> {
             points.chain(cameras).map(|p| p.distance(centre)).filter(|d| d.is_finite()).collect();
         distances.sort_by(f64::total_cmp);
         let far = distances.get(distances.len() * 98 / 100).copied().unwrap_or(1.0);
-        let radius_metres = 5.0 * far.max(self.plan.ground.edge_metres * 0.5);
-        Enclosure { centre, radius_metres, floor: self.floor(views, centre) }
-    }
-
-    /// The floor of the backdrop, which only the lowest points lie under. `None` where it would lie far below what the views stand
-    /// on, as in a town on a slope: near roads would be painted on it, and every photo would paint another place.
-    fn floor(&self, views: &[TrainView], centre: DVec3) -> Option<Floor> {
-        let ground = &self.plan.ground;
-        let up = ground.to_world(DVec3::Z);
-        let points = self.capture.points.positions.iter();
-        let mut heights: Vec<f64> = points.map(|point| point.dot(up)).filter(|height| height.is_finite()).collect();
-        heights.sort_by(f64::total_cmp);
-        let height_metres = *heights.get(heights.len() * LOW_PERCENT / 100)?;
-
-        let over_ground = blocks::view_heights(self.capture);
-        let over_both = views.iter().filter_map(|view| {
-            let over_ground = (*over_ground.get(view.view as usize)?)?;
-            Some((view.camera.centre().dot(up) - height_metres, over_ground))
-        });
-        let (views, near) = over_both.fold((0, 0), |(views, near), (over_floor, over_ground)| {
-            (views + 1, near + u32::from(over_floor <= FLOOR_HEIGHTS * over_ground))
-        });
-        let above = (centre.dot(up) - height_metres).max(EYE_EDGES * ground.edge_metres);
-        let eye = centre + up * (height_metres + above - centre.dot(up));
-        (f64::from(near) > FLOOR_VIEWS * f64::from(views)).then_some(Floor { up, height_metres, eye })
+        (centre, 5.0 * far.max(self.plan.ground.edge_metres * 0.5))
     }
 
     /// The space in the block's halo that its views see through. Only views that are trained on count.

@@ -65,7 +65,9 @@ impl Block<'_> {
         let sh_degree = plan.settings.sh_degree;
         let all = plan.settings.mode != Mode::Flat;
         let keep = |p: glam::DVec3| all || views.iter().any(|view| projects_into(view, p));
-        let backdrop = self.enclosure(views).splats(views, self.reader, sh_degree).map_err(ExecuteError::work)?;
+        let (centre, radius) = self.backdrop_sphere(views);
+        let backdrop = train::init::backdrop(views, self.reader, sh_degree, centre, radius);
+        let backdrop = backdrop.map_err(ExecuteError::work)?;
         let points = &self.capture.points;
         let rows: Vec<usize> = (0..points.len()).filter(|&i| keep(points.positions[i])).collect();
         let places: Vec<glam::DVec3> = rows.iter().map(|&i| points.positions[i]).collect();
