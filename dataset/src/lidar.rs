@@ -67,20 +67,14 @@ impl Sweep {
     /// # Errors
     /// A file that cannot be read, is too large, is damaged, or holds another number of points than announced.
     pub(crate) fn read(&self) -> Result<Vec<Return>, BadInput> {
-        if let PointFormat::RangeImage(image) = &self.format {
-            let is_used = |found: &Return| RANGE_METRES.contains(&f64::from(found.range));
-            return Ok(image.read(&self.path)?.into_iter().filter(is_used).collect());
-        }
         let bad = |problem: String| BadInput::new(self.path.display().to_string(), problem, "download the sweep again");
-        let file = File::open(&self.path).map_err(|e| bad(format!("cannot be read ({e})")))?;
-        let mut bytes = Vec::new();
-        file.take(MAX_FILE_BYTES + 1).read_to_end(&mut bytes).map_err(|e| bad(format!("cannot be read ({e})")))?;
-        if bytes.len() as u64 > MAX_FILE_BYTES {
-            return Err(bad(format!("is larger than {} MB, too large for a sweep", MAX_FILE_BYTES >> 20)));
-        }
         let (bytes, floats) = match &self.format {
-            PointFormat::Floats(floats) => (bytes, *floats),
-            PointFormat::Npz | PointFormat::RangeImage(_) => npz::rows(&bytes).map_err(|e| bad(e.to_string()))?,
+            PointFormat::Floats(floats) => (self.bytes(&bad)?, *floats),
+            PointFormat::Npz => npz::rows(&self.bytes(&bad)?).map_err(|e| bad(e.to_string()))?,
+            PointFormat::RangeImage(image) => {
+                let is_used = |found: &Return| RANGE_METRES.contains(&f64::from(found.range));
+                return Ok(image.read(&self.path)?.into_iter().filter(is_used).collect());
+            }
         };
         let count = (bytes.len() / (4 * floats)) as u64;
         if let Some(readings) = self.readings.filter(|readings| *readings != count) {
@@ -96,5 +90,16 @@ impl Sweep {
         };
         let used = points.into_iter().filter(|point| RANGE_METRES.contains(&point.length()));
         Ok(used.map(place).collect())
+    }
+
+    /// The bytes of its file; `bad` says what is wrong with it.
+    fn bytes(&self, bad: &dyn Fn(String) -> BadInput) -> Result<Vec<u8>, BadInput> {
+        let file = File::open(&self.path).map_err(|e| bad(format!("cannot be read ({e})")))?;
+        let mut bytes = Vec::new();
+        file.take(MAX_FILE_BYTES + 1).read_to_end(&mut bytes).map_err(|e| bad(format!("cannot be read ({e})")))?;
+        if bytes.len() as u64 > MAX_FILE_BYTES {
+            return Err(bad(format!("is larger than {} MB, too large for a sweep", MAX_FILE_BYTES >> 20)));
+        }
+        Ok(bytes)
     }
 }
