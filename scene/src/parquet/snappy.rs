@@ -139,7 +139,12 @@ mod tests {
 
         #[test]
         fn damage_is_an_error_or_other_bytes_of_the_told_length(bytes: Vec<u8>) {
-            let _ = decoded(&bytes);
+            let told = bytes.iter().take(5).zip((0..).step_by(7)).fold((0u64, true), |(sum, goes_on), (byte, shift)| {
+                (if goes_on { sum | u64::from(byte & 0x7f) << shift } else { sum }, goes_on && byte & 0x80 != 0)
+            });
+            if let Ok(out) = decoded(&bytes) {
+                prop_assert_eq!(out.len() as u64, told.0);
+            }
         }
     }
 
