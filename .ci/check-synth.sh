@@ -227,7 +227,8 @@ print(f"Waymo's components, read by pyarrow: {len(segments)} segments, {photos} 
 assert photos > 0 and sweeps > 0 and off < 1e-4 and len(errors) > 1000 and median < 0.02 and told > 0 and found >= 0.95 * told
 PYTHON
 inspect() { if [[ -n "${PLAT:-}" ]]; then "$PLAT" inspect "$@"; else cargo run --release --locked -- inspect "$@"; fi; }
-segment=$(basename "$(ls "$scratch/drives/waymo/camera_image" | head -1)" .parquet)
+tables=("$scratch"/drives/waymo/camera_image/*.parquet)
+segment=$(basename "${tables[0]}" .parquet)
 for folder in "$scratch/drives/waymo" "$scratch/packed/brotli" "$scratch/packed/snappy"; do
     inspect "$folder/$segment" --json --quiet | tail -1 |
         python3 -c 'import json, sys; found = json.load(sys.stdin); print([found[key] for key in ("format", "views", "sizes", "masked", "points", "sweeps", "views_with_lidar", "lidar_points", "boxes", "extent_metres")])'

@@ -10,10 +10,6 @@ scratch=$(mktemp -d)
 trap 'rm -rf "$scratch"' EXIT
 step() { printf -- '-- %s (after %d s)\n' "$1" "$SECONDS"; }
 
-step "scripts"
-command -v shellcheck >/dev/null || { apt-get update -qq && apt-get install -qq --yes --no-install-recommends shellcheck; }
-shellcheck .ci/*.sh infra/*/*.sh infra/slurm/*.sbatch
-
 step "Kubernetes"
 command -v kubectl >/dev/null || { apt-get update -qq && apt-get install -qq --yes --no-install-recommends kubernetes-client; }
 python3 -m venv "$scratch/venv"

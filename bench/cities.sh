@@ -10,8 +10,9 @@ plat=${PLAT:-target/release/plat}
 # Area in km², photos, levels: blocks of about the same edge.
 while read -r area views levels; do
     city="out/cities/$area"
-    [[ -e "$city/manifest.json" ]] && grep -q '"complete": *true' "$city/manifest.json" ||
+    if ! grep -qs '"complete": *true' "$city/manifest.json"; then
         "$plat" --quiet synth --area-km2 "$area" --views "$views" --size 480x270 --out "$city"
+    fi
     model="$city-model"
     rm -rf "$model"
     "$plat" --quiet bench pareto "$city" --label "plat tree" --scene "city, $area km²" \

@@ -12,8 +12,9 @@ while read -r name steps budget every options; do
     [[ $# == 0 || " $* " == *" $name "* ]] || continue
     capture="out/streets/$name"
     # shellcheck disable=SC2086
-    [[ -e "$capture/manifest.json" ]] && grep -q '"complete": *true' "$capture/manifest.json" ||
+    if ! grep -qs '"complete": *true' "$capture/manifest.json"; then
         "$plat" --quiet synth $options --size 480x270 --lidar --truth --out "$capture"
+    fi
     for lidar in "without lidar" "with lidar"; do
         without=()
         [[ $lidar == "with lidar" ]] || without=(--no-lidar)
