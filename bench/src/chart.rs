@@ -1,7 +1,7 @@
 //! Draws the chart of quality over cost as SVG for light and dark pages.
 //!
-//! Each scene has a row of panels: held-out PSNR over CPU seconds, PSNR over splats, perceptual measures over CPU seconds. The same lines
-//! give the same bytes.
+//! Each scene has a row of panels: held-out PSNR over CPU seconds (of street and aerial views apart where all runs have both), PSNR over
+//! splats, perceptual measures over CPU seconds. The same lines give the same bytes.
 
 mod panel;
 
@@ -40,7 +40,7 @@ pub fn chart(lines: &[ResultLine], reference: &[ResultLine]) -> String {
                 let series = |runs, labels| series_of(runs, scene, measure, labels);
                 (measure, [series(&references[..], None), series(&runs, Some(&labels[..]))].concat())
             });
-            (scene, with_points.filter(|(_, series)| !series.is_empty()).collect())
+            (scene, shown(with_points.collect()))
         })
         .collect();
     let width_of = |(_, panels): &Row| -> f64 { panels.iter().map(|(measure, _)| measure.width() + GAP).sum() };
@@ -72,6 +72,16 @@ pub fn chart(lines: &[ResultLine], reference: &[ResultLine]) -> String {
         }
     }
     svg + "</svg>\n"
+}
+
+/// The panels that have points. PSNR of all views is left out where street and aerial views say more of the same runs.
+fn shown(panels: Vec<(Measure, Vec<Series>)>) -> Vec<(Measure, Vec<Series>)> {
+    let count = |of: Measure| panels.iter().find(|(measure, _)| *measure == of).map_or(0, |(_, series)| series.len());
+    let apart = count(Measure::Street) == count(Measure::PsnrOverTime);
+    let is_shown = |(measure, series): &(Measure, Vec<Series>)| {
+        !series.is_empty() && !(apart && *measure == Measure::PsnrOverTime)
+    };
+    panels.into_iter().filter(is_shown).collect()
 }
 
 /// The labels of runs in order of first appearance.
@@ -163,6 +173,7 @@ fn style() -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::KindFigures;
     use crate::tests::line;
 
     /// The panels of a chart, each as text.
@@ -200,6 +211,21 @@ mod tests {
         let [fox_psnr, _, fox_perceptual, _, _, _, lpips] = panels(&svg)[..] else { panic!("3 and 4 panels: {svg}") };
         assert!(fox_psnr.contains(">15.00<") && fox_perceptual.contains(">-16.2<"), "{fox_perceptual}");
         assert!(lpips.contains(">0.217<") && lpips.contains("LPIPS") && svg.matches("LPIPS, ").count() == 1, "{lpips}");
+    }
+
+    #[test]
+    fn street_and_aerial_views_have_panels_of_their_own() {
+        let of = |psnr: f64| {
+            let [ssim, perceptual, worst_cc_gap, depth_absrel, depth_delta1, detections_kept] = [None; 6];
+            Some(KindFigures { psnr, ssim, perceptual, worst_cc_gap, depth_absrel, depth_delta1, detections_kept })
+        };
+        let apart = ResultLine { street: of(18.25), aerial: of(24.75), ..line("plat", "city", &[(1.0, 21.5)]) };
+        let svg = chart(&[apart.clone()], &[]);
+        let [street, aerial, _] = panels(&svg)[..] else { panic!("street, aerial, splats: {svg}") };
+        assert!(street.contains(">18.25<") && aerial.contains(">24.75<") && aerial.contains("PSNR of aerial views"));
+        // Another run without them keeps the panel of all views.
+        let svg = chart(&[apart, line("other", "city", &[(1.0, 20.5)])], &[]);
+        assert!(panels(&svg).len() == 4 && panels(&svg)[0].contains(">21.50<"), "{svg}");
     }
 
     #[test]

@@ -78,6 +78,12 @@ pub struct ResultLine {
     /// Share of their pixels whose depth is within a factor of 1.25.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub depth_delta1: Option<f64>,
+    /// Figures of the held-out aerial views, where the capture has both kinds.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub aerial: Option<KindFigures>,
+    /// Those of the held-out street views.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub street: Option<KindFigures>,
     /// Final number of splats.
     pub splats: Option<u64>,
     /// Size of the model, bytes.
@@ -97,6 +103,32 @@ pub struct ResultLine {
     pub curve: Vec<CurvePoint>,
     /// Source of a reference's figures; null for runs of plat.
     pub source: Option<String>,
+}
+
+/// Figures of the held-out views of one kind, aerial or street; as those of [`ResultLine`].
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct KindFigures {
+    /// dB.
+    pub psnr: f64,
+    /// 0..1.
+    pub ssim: Option<f64>,
+    /// SSIMULACRA2, up to 100.
+    pub perceptual: Option<f64>,
+    /// Largest gain of a view's PSNR by an affine colour correction, dB.
+    pub worst_cc_gap: Option<f64>,
+    /// Mean relative error of the rendered depth.
+    pub depth_absrel: Option<f64>,
+    /// Share of pixels whose depth is within a factor of 1.25.
+    pub depth_delta1: Option<f64>,
+    /// Share of the detections on photos that are also detected on renders.
+    pub detections_kept: Option<f64>,
+}
+
+impl KindFigures {
+    fn is_finite(&self) -> bool {
+        let more = [self.ssim, self.perceptual, self.worst_cc_gap, self.depth_absrel, self.depth_delta1];
+        self.psnr.is_finite() && more.iter().chain(&[self.detections_kept]).flatten().all(|v| v.is_finite())
+    }
 }
 
 /// A measurement during training.
@@ -139,6 +171,7 @@ impl ResultLine {
         let more = [self.tolerance_db, self.cc_psnr, self.perceptual, self.zone_psnr, self.detections_kept, self.fps];
         let depth = [self.depth_absrel, self.depth_delta1];
         numbers.iter().chain(&more).chain(&depth).flatten().all(|v| v.is_finite())
+            && [self.aerial, self.street].iter().flatten().all(KindFigures::is_finite)
             && self.curve.iter().all(|p| p.cpu_seconds.is_finite() && p.psnr.is_finite())
     }
 }

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use crate::{CurvePoint, ResultLine};
+use crate::{CurvePoint, KindFigures, ResultLine};
 
 /// The mean over the seeds of a run.
 #[derive(Debug, Clone, PartialEq)]
@@ -78,6 +78,8 @@ fn mean(last: &ResultLine, runs: &[&ResultLine], variant: String) -> Averaged {
         detections_kept: maybe(&|run| run.detections_kept),
         depth_absrel: maybe(&|run| run.depth_absrel),
         depth_delta1: maybe(&|run| run.depth_delta1),
+        aerial: mean_kind(runs, |run| run.aerial),
+        street: mean_kind(runs, |run| run.street),
         splats: whole(&|run| run.splats),
         peak_memory_bytes: whole(&|run| run.peak_memory_bytes),
         curve: mean_curve(last, runs),
@@ -85,6 +87,23 @@ fn mean(last: &ResultLine, runs: &[&ResultLine], variant: String) -> Averaged {
     };
     let spread = runs.iter().map(psnr).fold(f64::MIN, f64::max) - runs.iter().map(psnr).fold(f64::MAX, f64::min);
     Averaged { line, variant, seeds: runs.len(), spread }
+}
+
+/// The mean of the figures of one kind of views; `None` if a run lacks them.
+fn mean_kind(runs: &[&ResultLine], kind: fn(&ResultLine) -> Option<KindFigures>) -> Option<KindFigures> {
+    let figures: Vec<KindFigures> = runs.iter().map(|run| kind(run)).collect::<Option<_>>()?;
+    let count = figures.len() as f64;
+    let maybe =
+        |get: fn(&KindFigures) -> Option<f64>| figures.iter().map(get).sum::<Option<f64>>().map(|sum| sum / count);
+    Some(KindFigures {
+        psnr: figures.iter().map(|of| of.psnr).sum::<f64>() / count,
+        ssim: maybe(|of| of.ssim),
+        perceptual: maybe(|of| of.perceptual),
+        worst_cc_gap: maybe(|of| of.worst_cc_gap),
+        depth_absrel: maybe(|of| of.depth_absrel),
+        depth_delta1: maybe(|of| of.depth_delta1),
+        detections_kept: maybe(|of| of.detections_kept),
+    })
 }
 
 /// The mean of curves of equal length, point by point; else the last run's curve.
@@ -155,10 +174,18 @@ mod tests {
 
     #[test]
     fn the_mean_lacks_figures_that_a_seed_lacks() {
+        let street = |psnr: f64, kept: Option<f64>| {
+            let [ssim, perceptual, worst_cc_gap, depth_absrel, depth_delta1] = [Some(psnr / 40.0); 5];
+            let detections_kept = kept;
+            Some(KindFigures { psnr, ssim, perceptual, worst_cc_gap, depth_absrel, depth_delta1, detections_kept })
+        };
         let mut lines = [of_seed("new", 0, 20.0), of_seed("new", 1, 24.0)];
+        (lines[0].street, lines[1].street) = (street(20.0, Some(1.0)), street(24.0, None));
+        lines[0].aerial = street(20.0, None);
         lines[0].ssim = Some(0.5);
         lines[0].curve.pop();
         let [plat] = &averaged(&lines)[..] else { panic!("one run") };
         assert_eq!((plat.line.ssim, &plat.line.curve), (None, &lines[1].curve));
+        assert_eq!((plat.line.aerial, plat.line.street), (None, street(22.0, None)));
     }
 }

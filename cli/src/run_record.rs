@@ -94,6 +94,8 @@ impl Record {
             detections_kept: self.detections_kept,
             depth_absrel: None,
             depth_delta1: None,
+            aerial: None,
+            street: None,
             splats: Some(self.splats),
             bytes: self.bytes,
             peak_memory_bytes: self.peak_memory_bytes,

@@ -18,6 +18,10 @@ const BOTTOM: f64 = 46.0;
 pub(super) enum Measure {
     /// PSNR over CPU seconds, during training too.
     PsnrOverTime,
+    /// Final PSNR of street views over CPU seconds.
+    Street,
+    /// Final PSNR of aerial views over CPU seconds.
+    Aerial,
     /// Final PSNR over splats.
     PsnrOverSplats,
     /// Final SSIMULACRA2 over CPU seconds.
@@ -45,15 +49,18 @@ pub(super) struct Series {
 }
 
 impl Measure {
-    pub(super) const ALL: [Self; 4] = [Self::PsnrOverTime, Self::PsnrOverSplats, Self::Ssimulacra2, Self::Lpips];
+    pub(super) const ALL: [Self; 6] =
+        [Self::PsnrOverTime, Self::Street, Self::Aerial, Self::PsnrOverSplats, Self::Ssimulacra2, Self::Lpips];
 
     pub(super) fn width(self) -> f64 {
-        if self == Self::PsnrOverTime { 400.0 } else { 250.0 }
+        if matches!(self, Self::PsnrOverTime | Self::Street) { 400.0 } else { 250.0 }
     }
 
     fn names(self) -> (&'static str, &'static str) {
         match self {
             Self::PsnrOverTime => ("CPU time, seconds", "PSNR, dB"),
+            Self::Street => ("CPU time, seconds", "PSNR of street views, dB"),
+            Self::Aerial => ("CPU time, seconds", "PSNR of aerial views, dB"),
             Self::PsnrOverSplats => ("splats", "PSNR, dB"),
             Self::Ssimulacra2 => ("CPU time, seconds", "SSIMULACRA2"),
             Self::Lpips => ("CPU time, seconds", "LPIPS, lower is better"),
@@ -63,7 +70,7 @@ impl Measure {
     /// Minimum span of the axis, and digits of a figure.
     fn span(self) -> (f64, usize) {
         match self {
-            Self::PsnrOverTime | Self::PsnrOverSplats => (4.0, 2),
+            Self::PsnrOverTime | Self::Street | Self::Aerial | Self::PsnrOverSplats => (4.0, 2),
             Self::Ssimulacra2 => (10.0, 1),
             Self::Lpips => (0.1, 3),
         }
@@ -86,6 +93,8 @@ impl Measure {
     pub(super) fn end(self, line: &ResultLine, variant: &str) -> Option<Point> {
         let (x, y) = match self {
             Self::PsnrOverTime => (line.cpu_seconds, line.psnr),
+            Self::Street => (line.cpu_seconds, line.street?.psnr),
+            Self::Aerial => (line.cpu_seconds, line.aerial?.psnr),
             Self::PsnrOverSplats => (line.splats? as f64, line.psnr),
             Self::Ssimulacra2 => (line.cpu_seconds, line.perceptual?),
             Self::Lpips => (line.cpu_seconds, line.lpips?),

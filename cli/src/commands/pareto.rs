@@ -6,9 +6,9 @@
 use std::fs;
 use std::path::PathBuf;
 
-use ::bench::{ResultLine, read};
+use ::bench::{KindFigures, ResultLine, read};
 use dataset::ingest::TrueDepth;
-use eval::{Lpips, Photos, load_detector};
+use eval::{DepthSummary, Lpips, Photos, Summary, load_detector};
 use scene::BadInput;
 use serde::Serialize;
 use store::Store;
@@ -19,7 +19,7 @@ use crate::captures;
 use crate::clock;
 use crate::commands::eval::{Further, measure_trained};
 use crate::commands::train::{Trained, resolved, store_url, train};
-use crate::eval_report::text;
+use crate::eval_report::{Evaluated, text};
 use crate::failure::{Failure, cannot};
 use crate::output::Output;
 use crate::planning::plan_of;
@@ -195,12 +195,38 @@ fn train_and_measure(
     record.scene.clone_from(&run.scene);
     record.set_quality(&evaluated.record);
     let depth = evaluated.depth.as_ref().map(|report| report.groups.held_out.all);
+    let [aerial, street] = by_kind(&evaluated);
     let line = ResultLine {
         depth_absrel: depth.and_then(|of| of.absrel),
         depth_delta1: depth.and_then(|of| of.delta1),
+        aerial,
+        street,
         ..line_of(&run.label, &record, curve)
     };
     Ok((line, text(&evaluated)))
+}
+
+/// Figures of the held-out aerial and street views, where both kinds are there.
+fn by_kind(evaluated: &Evaluated) -> [Option<KindFigures>; 2] {
+    let held_out = &evaluated.by_kind;
+    let depth = evaluated.depth.as_ref().map(|report| &report.groups.held_out);
+    let found = evaluated.detections.as_ref().map(|found| &found.groups.held_out);
+    let of = |figures: Option<Summary>, depth: Option<DepthSummary>, kept: Option<f64>| {
+        let figures = figures?;
+        Some(KindFigures {
+            psnr: figures.psnr?,
+            ssim: figures.ssim,
+            perceptual: figures.ssimulacra2,
+            worst_cc_gap: figures.worst_cc_gap,
+            depth_absrel: depth.and_then(|of| of.absrel),
+            depth_delta1: depth.and_then(|of| of.delta1),
+            detections_kept: kept,
+        })
+    };
+    [
+        of(held_out.aerial, depth.and_then(|of| of.aerial), found.and_then(|of| of.aerial?.share_kept)),
+        of(held_out.street, depth.and_then(|of| of.street), found.and_then(|of| of.street?.share_kept)),
+    ]
 }
 
 /// A result line as text.
