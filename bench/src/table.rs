@@ -7,15 +7,15 @@ use crate::{Averaged, ResultLine, averaged, scenes};
 const BEGIN: &str = "<!-- bench:begin -->";
 const END: &str = "<!-- bench:end -->";
 /// Maximum number of rows of [`short_table`].
-const SHORT_ROWS: usize = 8;
+const SHORT_ROWS: usize = 12;
 
 /// The latest runs of each scene and label, references (lines with a source) first; of several seeds the mean, with the
 /// range of PSNR. The column of times has the CPU seconds to the reference's best PSNR, and the speed-up over the reference.
 pub fn table(lines: &[ResultLine]) -> String {
     let runs = averaged(lines);
     let mut text = String::from(
-        "| scene | run | backend | PSNR, dB | SSIM | SSIMULACRA2 | CPU s | estimate over outcome | to the reference's best, CPU s | splats | peak MB |\n\
-         |---|---|---|---:|---:|---:|---:|---:|---:|---:|---:|\n",
+        "| scene | run | backend | PSNR, dB | street, aerial, dB | SSIM | SSIMULACRA2 | CPU s | estimate over outcome | to the reference's best, CPU s | splats | peak MB |\n\
+         |---|---|---|---:|---|---:|---:|---:|---:|---:|---:|---:|\n",
     );
     for scene in scenes(runs.iter().map(|run| &run.line)) {
         let of_scene = |referred: bool| {
@@ -27,11 +27,12 @@ pub fn table(lines: &[ResultLine]) -> String {
             // Writing to a String cannot fail.
             let _ = writeln!(
                 text,
-                "| {} | {} | {} | {} | {} | {} | {} | {} | {} | {} | {} |",
+                "| {} | {} | {} | {} | {} | {} | {} | {} | {} | {} | {} | {} |",
                 scene_cell(line),
                 cell(&name(run)),
                 cell(&line.backend),
                 psnr(run),
+                apart(line),
                 number(line.ssim, 3),
                 number(line.perceptual, 1),
                 seconds(line.cpu_seconds),
@@ -50,8 +51,8 @@ pub fn table(lines: &[ResultLine]) -> String {
 pub fn short_table(lines: &[ResultLine]) -> String {
     let runs = averaged(lines);
     let mut text = String::from(
-        "| scene | best run | PSNR, dB | CPU s | splats | peak MB | reference, dB | its CPU s | run to its PSNR, CPU s |\n\
-         |---|---|---:|---:|---:|---:|---:|---:|---:|\n",
+        "| scene | best run | PSNR, dB | street, aerial, dB | CPU s | splats | peak MB | reference, dB | its CPU s | run to its PSNR, CPU s |\n\
+         |---|---|---:|---|---:|---:|---:|---:|---:|---:|\n",
     );
     let of_scene = |scene: &str, referred: bool| {
         let scene = scene.to_owned();
@@ -76,10 +77,11 @@ pub fn short_table(lines: &[ResultLine]) -> String {
         });
         let _ = writeln!(
             text,
-            "| {} | {} | {:.2} | {} | {} | {} | {} |",
+            "| {} | {} | {:.2} | {} | {} | {} | {} | {} |",
             scene_cell(line),
             cell(&name(best)),
             line.psnr,
+            apart(line),
             seconds(line.cpu_seconds),
             line.splats.map_or("–".into(), thousands),
             number(line.peak_memory_bytes.map(|bytes| bytes as f64 / 1e6), 0),
@@ -114,6 +116,14 @@ fn psnr(run: &Averaged) -> String {
         format!("{mean:.2} ({} seeds, {:.2} apart)", run.seeds, run.spread)
     } else {
         format!("{mean:.2}")
+    }
+}
+
+/// PSNR of street and aerial views.
+fn apart(line: &ResultLine) -> String {
+    match (line.street, line.aerial) {
+        (Some(street), Some(aerial)) => format!("{:.2}, {:.2}", street.psnr, aerial.psnr),
+        _ => "–".into(),
     }
 }
 
@@ -176,13 +186,13 @@ mod tests {
         reference.source = Some("measured".into());
         let good = line("plat tree", "fox", &[(10.0, 26.0), (30.0, 30.0)]);
         let worse = line("plat flat", "fox", &[(10.0, 26.0)]);
-        let others = (0..9).map(|n| line("plat tree", &format!("scene {n}"), &[(10.0, 26.0)]));
+        let others = (0..SHORT_ROWS).map(|n| line("plat tree", &format!("scene {n}"), &[(10.0, 26.0)]));
         let city = line("plat tree", "city, 0.3 km²", &[(10.0, 26.0)]);
         let lines: Vec<ResultLine> = others.chain([city, worse, good, reference]).collect();
         let text = short_table(&lines);
         let rows: Vec<&str> = text.lines().skip(2).collect();
         assert_eq!(rows.len(), SHORT_ROWS);
-        assert!(rows[0].starts_with("| fox | plat tree | 30.00 |"), "{}", rows[0]);
+        assert!(rows[0].starts_with("| fox | plat tree | 30.00 | – |"), "{}", rows[0]);
         assert!(rows[0].ends_with("| 28.00 | 1000 | 20.0 |"), "{}", rows[0]);
         assert!(rows[1].starts_with("| city, 0.3 km² |") && rows[1].ends_with("| – | – | – |"), "{}", rows[1]);
     }
