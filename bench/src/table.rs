@@ -51,7 +51,7 @@ pub fn table(lines: &[ResultLine]) -> String {
 pub fn short_table(lines: &[ResultLine]) -> String {
     let runs = averaged(lines);
     let mut text = String::from(
-        "| scene | best run | PSNR, dB | street, aerial, dB | CPU s | splats | peak MB | reference, dB | its CPU s | run to its PSNR, CPU s |\n\
+        "| scene | run | PSNR, dB | street, air | CPU s | splats | peak MB | reference, dB | its CPU s | run to its PSNR, CPU s |\n\
          |---|---|---:|---|---:|---:|---:|---:|---:|---:|\n",
     );
     let of_scene = |scene: &str, referred: bool| {
