@@ -2,14 +2,15 @@
 # The streets' lines of bench/results: what eye-level photos of generated cities and of a drive gain with time; one thread, nothing pruned.
 # Takes the names of those to train (all where none is named). SEED has the seeds (0,1,2) and STEPS the steps, both as lists, LIDAR "without",
 # "with" or both (both), DETECTOR the ONNX file of a detector, CAPTURES the folder of drive_kitti_odom_1. Photos are kept in out/streets.
-# A core takes a quarter of an hour for the thin city and hours for all.
+# All of it takes hours on one core; SEED=0 a third.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 plat=${PLAT:-target/release/plat}
 captures=${CAPTURES:-../shared/data}
 detector=(${DETECTOR:+--detector "$(realpath --relative-to=. "$DETECTOR")"})
 common=(--seed "${SEED:-0,1,2}" --threads 1 --tolerance-db 0 --eval-every 0 "${detector[@]}" --fresh)
-wanted() { local name=$1; shift; [[ $# == 0 || " $* " == *" $name "* ]]; }
+ran=
+wanted() { local name=$1; shift; [[ $# == 0 || " $* " == *" $name "* ]] && ran=1; }
 
 # Name, steps, splats, every how many views one is held out, options of synth.
 while read -r name steps budget every options; do
@@ -36,3 +37,4 @@ if wanted drive_kitti_odom_1 "$@"; then
     "$plat" --quiet bench pareto "$captures/drive_kitti_odom_1" --label "plat whole, by steps" --steps "${STEPS:-300,1200,4800,19200}" \
         --budget 30000 --blocks whole --downscale 2 "${common[@]}" --out out/streets/kitti
 fi
+[[ $ran ]] || { echo "bench/streets.sh: no street has one of the names $*: see the list in this file" >&2; exit 2; }

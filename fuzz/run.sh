@@ -41,6 +41,7 @@ fuzz_one() {
 export -f fuzz_one
 export seconds logs host
 # libFuzzer takes one core; targets run side by side.
+# The inner bash expands $0, so the quotes are single.
 # shellcheck disable=SC2016
 printf '%s\0' "${targets[@]}" | xargs -0 -n 1 -P "$(nproc)" bash -c 'fuzz_one "$0"'
 echo "${#targets[@]} targets ran for $seconds s each without a crash"
