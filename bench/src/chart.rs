@@ -77,6 +77,7 @@ pub fn chart(lines: &[ResultLine], reference: &[ResultLine]) -> String {
 /// The panels that have points. PSNR of all views is left out where street and aerial views say more of the same runs.
 fn shown(panels: Vec<(Measure, Vec<Series>)>) -> Vec<(Measure, Vec<Series>)> {
     let count = |of: Measure| panels.iter().find(|(measure, _)| *measure == of).map_or(0, |(_, series)| series.len());
+    // Each run has a PSNR of all views, so as many series are the same runs.
     let apart = count(Measure::Street) == count(Measure::PsnrOverTime);
     let is_said_apart = |measure: Measure| apart && measure == Measure::PsnrOverTime;
     panels.into_iter().filter(|(measure, series)| !series.is_empty() && !is_said_apart(*measure)).collect()
