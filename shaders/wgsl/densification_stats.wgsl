@@ -1,5 +1,5 @@
-// Stage `densification_stats`: accumulates the screen-space gradients and weights of the splats that the step's views
-// see; one thread per splat.
+// Stage `densification_stats`: accumulates the screen-space gradients of the splats that the step's views see; one thread
+// per splat.
 
 @group(0) @binding(0) var<uniform> adam: AdamConstants;
 @group(0) @binding(1) var<storage, read> status: Status;
@@ -8,9 +8,8 @@
 // For each visible trainable entry: norm of the mean's gradient in pixels, the same with absolute values summed, sum of
 // alpha T, pixels of the view. The last undoes the loss's mean over pixels.
 @group(0) @binding(4) var<storage, read> statistics: array<vec4<f32>>;
-// Columns: sum of the absolute screen-space gradient, largest sum of alpha T.
+// Sum of the absolute screen-space gradient.
 @group(0) @binding(5) var<storage, read_write> accumulated: array<f32>;
-@group(0) @binding(6) var<storage, read_write> views: array<u32>;
 
 @compute @workgroup_size(256)
 fn densification_stats(
@@ -26,10 +25,7 @@ fn densification_stats(
     if first > 0u && visible[first - 1u] / adam.views == i {
         return; // the thread of the splat's first visible entry handles it
     }
-    let n = adam.stride;
     for (var entry = first; entry < status.visible_trainable && visible[entry] / adam.views == i; entry++) {
         accumulated[i] += statistics[entry].y * statistics[entry].w;
-        accumulated[n + i] = max(accumulated[n + i], statistics[entry].z);
-        views[i]++;
     }
 }

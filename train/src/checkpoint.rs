@@ -13,11 +13,11 @@ use crate::pose::PoseTraining;
 
 /// A checkpoint. The header is [`Header`]. The bulk holds, little endian:
 /// - all columns of the splats, of the first and of the second Adam moments (f32);
-/// - densification statistics per splat: error, weight (f32), views (u32);
+/// - the densification error of each splat (f32);
 /// - per trained exposure: view, steps (u32), then value, first and second moment (twelve f32 each);
 /// - per trained pose: view, steps (u32), then displacement, first and second moment (six f32 each);
 /// - all attributes of the splats (u32).
-const CHECKPOINT: Kind = Kind(*b"ckpt", 5);
+const CHECKPOINT: Kind = Kind(*b"ckpt", 6);
 
 /// Everything that a training step depends on besides its job.
 #[derive(Debug, Clone)]
@@ -72,7 +72,6 @@ impl State {
 
     /// Encodes a checkpoint.
     pub fn to_frame(&self) -> Vec<u8> {
-        let DensificationStats { error, weight, views } = &self.densification;
         let (adam_step, first, second) = self.adam.parts();
         let header = Header {
             step: self.step,
@@ -82,14 +81,14 @@ impl State {
             adam_step,
             sh_degree: self.splats.sh_degree(),
             count: self.splats.len() as u64,
-            stats_count: views.len() as u64,
+            stats_count: self.densification.error.len() as u64,
             exposure_count: self.exposures.as_ref().map(|exposures| exposures.views.len() as u64),
             pose_count: self.poses.as_ref().map(|poses| poses.views.len() as u64),
             attributes: self.splats.attribute_names(),
         };
         let columns = self.splats.columns().iter().chain(first).chain(second);
-        let floats = columns.chain([error, weight]).flatten().flat_map(|value| value.to_le_bytes());
-        let mut bulk: Vec<u8> = floats.chain(views.iter().flat_map(|value| value.to_le_bytes())).collect();
+        let floats = columns.chain([&self.densification.error]).flatten();
+        let mut bulk: Vec<u8> = floats.flat_map(|value| value.to_le_bytes()).collect();
         if let Some(ExposureTraining { views, steps, values }) = &self.exposures {
             write_rows(&mut bulk, views, steps, values);
         }
@@ -114,7 +113,7 @@ impl State {
         let columns = Splats::new(header.sh_degree).columns().len();
         // Check the announced sizes against the length before allocating.
         let words = u64::try_from(3 * columns).ok().and_then(|columns| columns.checked_mul(header.count));
-        let words = words.and_then(|words| words.checked_add(header.stats_count.checked_mul(3)?));
+        let words = words.and_then(|words| words.checked_add(header.stats_count));
         let exposed = header.exposure_count.unwrap_or(0);
         let words = words.and_then(|words| words.checked_add(exposed.checked_mul(EXPOSURE_WORDS as u64)?));
         let posed = header.pose_count.unwrap_or(0);
@@ -129,7 +128,7 @@ impl State {
         }
         let (count, stats_count) = (header.count as usize, header.stats_count as usize);
         let (columns_bytes, rest) = bulk.split_at(4 * count * 3 * columns);
-        let (stats_bytes, rest) = rest.split_at(4 * stats_count * 3);
+        let (stats_bytes, rest) = rest.split_at(4 * stats_count);
         let (exposure_bytes, rest) = rest.split_at(4 * EXPOSURE_WORDS * exposed as usize);
         let (pose_bytes, attribute_bytes) = rest.split_at(4 * POSE_WORDS * posed as usize);
         let mut all = columns_bytes.chunks_exact(4 * count).map(floats);
@@ -137,7 +136,6 @@ impl State {
         let splats = frame::with_attributes(splats, &header.attributes, attribute_bytes)?;
         let first = all.by_ref().take(columns).collect();
         let second = all.collect();
-        let part = |n: usize| &stats_bytes[4 * stats_count * n..4 * stats_count * (n + 1)];
         let exposures = || {
             let (views, steps, values) = read_rows(exposure_bytes, exposed as usize);
             ExposureTraining { views, steps, values }
@@ -153,11 +151,7 @@ impl State {
             coarse_to_fine: header.coarse_to_fine,
             splats,
             adam: Adam::from_parts(Isa::detect(), header.adam_step, first, second),
-            densification: DensificationStats {
-                error: floats(part(0)),
-                weight: floats(part(1)),
-                views: integers(part(2)),
-            },
+            densification: DensificationStats { error: floats(stats_bytes) },
             exposures: header.exposure_count.map(|_| exposures()),
             poses: header.pose_count.map(|_| poses()),
             loss: f64::NAN,
@@ -210,7 +204,7 @@ mod tests {
             let column = |(c, column): (usize, &Vec<f32>)| column.iter().map(|v| v * add + c as f32).collect();
             splats.columns().iter().enumerate().map(column).collect()
         };
-        let stats = DensificationStats { error: vec![0.5; 20], weight: vec![0.25; 20], views: (0..20).collect() };
+        let stats = DensificationStats { error: (0..20).map(|i| i as f32).collect() };
         let exposures = ExposureTraining {
             views: vec![3, 8],
             steps: vec![7, 0],
@@ -245,12 +239,8 @@ mod tests {
             let read = State::from_frame(&bytes).unwrap();
             assert_eq!((read.step, read.skipped, read.start_count), (40, 1, 7));
             assert!(read.splats == state.splats && read.adam.parts() == state.adam.parts());
-            assert_eq!(read.densification.views, state.densification.views);
             assert_eq!((&read.exposures, &read.poses), (&state.exposures, &state.poses));
-            assert_eq!(
-                (&read.densification.error, &read.densification.weight),
-                (&state.densification.error, &state.densification.weight)
-            );
+            assert_eq!(read.densification.error, state.densification.error);
             assert!(read.to_frame() == bytes);
             assert!(State::from_frame(&bytes[..bytes.len() - 4]).is_err());
             assert!(State::from_frame(&[]).is_err());

@@ -1,4 +1,7 @@
-//! Densification under a budget: removes splats that contribute nothing and splits those with the largest error.
+//! Densification under a budget: removes transparent splats and splits those with the largest error.
+//!
+//! A splat that no view has shown since the last refinement stays. Of a large capture only a few views are drawn between two
+//! refinements, and what stands behind a wall in all of these is in front of it in others (docs/decisions/0063).
 //!
 //! Splats are ranked by the absolute screen-space gradient (AbsGS, Ye et al. 2024), summed over all views since the
 //! last refinement. A split halves a splat along its longest axis, which covers both "clone" and "split" of 3DGS. The
@@ -85,10 +88,6 @@ impl Growth {
 pub struct DensificationStats {
     /// Σ over views of the absolute screen-space gradient.
     pub(crate) error: Vec<f32>,
-    /// Largest sum of blending weights αT over the pixels of a view.
-    pub(crate) weight: Vec<f32>,
-    /// Number of views in which the splat was visible.
-    pub(crate) views: Vec<u32>,
 }
 
 impl DensificationStats {
@@ -96,33 +95,19 @@ impl DensificationStats {
     /// alike.
     pub fn add(&mut self, gradients: &Gradients, pixels: f32) {
         let n = gradients.screen_gradient_abs.len();
-        self.resize(n);
+        self.error.resize(n, 0.0);
         for i in 0..n {
             if gradients.seen[i / 16] >> (i % 16) & 1 == 1 {
                 self.error[i] += gradients.screen_gradient_abs[i] * pixels;
-                self.weight[i] = self.weight[i].max(gradients.weight[i]);
-                self.views[i] += 1;
             }
         }
-    }
-
-    fn resize(&mut self, n: usize) {
-        self.error.resize(n, 0.0);
-        self.weight.resize(n, 0.0);
-        self.views.resize(n, 0);
-    }
-
-    fn clear(&mut self) {
-        self.error.clear();
-        self.weight.clear();
-        self.views.clear();
     }
 }
 
 /// Counts of a refinement.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Refined {
-    /// Splats removed because they were transparent, contributed nothing or left the allowed region.
+    /// Splats removed because they were transparent or left the allowed region.
     pub removed: usize,
     /// Splats removed because a parameter was not finite.
     pub broken: usize,
@@ -130,8 +115,8 @@ pub struct Refined {
     pub added: usize,
 }
 
-/// Densifies: removes splats that contribute nothing or lie where `keeps` is false, and splits the `target - owned`
-/// splats with the largest error, where `owned` are the kept splats for which `counts` is true. The other splats (the
+/// Densifies: removes splats that are transparent or lie where `keeps` is false, and splits the `target - owned` splats
+/// with the largest error, where `owned` are the kept splats for which `counts` is true. The other splats (the
 /// halo) do not count against the target and grow in proportion. The result is in Morton order, for memory locality.
 /// Returns the new splats, the old row of each whose Adam moments it keeps (`None` for both halves of a split), and the
 /// counts.
@@ -144,17 +129,14 @@ pub fn refine(
     keeps: &(dyn Fn(Vec3) -> bool + Sync),
 ) -> (Splats, Vec<Option<u32>>, Refined) {
     let n = splats.len();
-    stats.resize(n);
+    stats.error.resize(n, 0.0);
     let mut refined = Refined::default();
     let min_logit = (growth.min_opacity / (1.0 - growth.min_opacity)).ln();
     let mut kept: Vec<u32> = Vec::with_capacity(n);
     for i in 0..n {
         if !splats.is_finite(i) {
             refined.broken += 1;
-        } else if !keeps(splats.mean(i))
-            || splats.col(column::OPACITY)[i] < min_logit
-            || (stats.views[i] > 2 && stats.weight[i] < 0.02)
-        {
+        } else if !keeps(splats.mean(i)) || splats.col(column::OPACITY)[i] < min_logit {
             refined.removed += 1;
         } else {
             kept.push(i as u32);
@@ -190,7 +172,7 @@ pub fn refine(
         grown.push_like(new_row[i as usize] as usize, &other);
         rows.push(None);
     }
-    stats.clear();
+    stats.error.clear();
     let order = morton::order([0, 1, 2].map(|axis| grown.col(column::MEAN + axis)));
     let rows = order.iter().map(|&i| rows[i as usize]).collect();
     (grown.select(&order), rows, refined)
@@ -229,9 +211,7 @@ mod tests {
         for i in 0..n {
             splats.push(&Splat::round(Vec3::new(i as f32, 0.0, 0.0), -1.0, Vec3::splat(0.5), 0.5));
         }
-        let stats =
-            DensificationStats { error: (0..n).map(|i| i as f32).collect(), weight: vec![1.0; n], views: vec![5; n] };
-        (splats, stats)
+        (splats, DensificationStats { error: (0..n).map(|i| i as f32).collect() })
     }
 
     #[test]
@@ -244,13 +224,14 @@ mod tests {
     }
 
     #[test]
-    fn broken_transparent_and_unused_splats_are_removed() {
+    fn broken_and_transparent_splats_are_removed_and_hidden_ones_stay() {
         let (mut splats, mut stats) = row_of(10);
         splats.columns_mut()[column::MEAN][3] = f32::NAN;
         splats.columns_mut()[column::OPACITY][4] = -9.0;
-        stats.weight[5] = 0.0;
+        // No view has shown the first one.
+        assert_eq!(stats.error[0], 0.0);
         let (grown, _, refined) = refine(&splats, &mut stats, &Growth::default(), 1, &|_| true, &|_| true);
-        assert_eq!((refined.broken, refined.removed, refined.added, grown.len()), (1, 2, 0, 7));
+        assert_eq!((refined.broken, refined.removed, refined.added, grown.len()), (1, 1, 0, 8));
     }
 
     #[test]

@@ -55,10 +55,8 @@ pub(crate) struct GpuDevice {
     context: Option<GpuSplats>,
     /// First and second moments, with the splats' stride.
     moments: [Columns; 2],
-    /// Densification statistics: error and weight of each splat, with the splats' stride.
+    /// Densification error of each splat.
     stats: GrowableBuffer,
-    /// Densification statistics: number of views of each splat.
-    views: GrowableBuffer,
     /// One [`OptimiserState`].
     optimiser: Buffer,
     /// Photos with their masks, one byte per value, then pixel weights and target depths, one float per pixel.
@@ -112,7 +110,6 @@ impl GpuDevice {
             context: context.map(|context| GpuSplats::upload(gpu, context, context.len())).transpose()?,
             moments: [moments()?, moments()?],
             stats: GrowableBuffer::new(g, "densification statistics")?,
-            views: GrowableBuffer::new(g, "views of splats")?,
             optimiser: g.buffer("optimiser state", size_of::<OptimiserState>() as u64)?,
             photo: GrowableBuffer::new(g, "photo")?,
             partials: GrowableBuffer::new(g, "derivatives of SSIM")?,
@@ -143,17 +140,11 @@ impl GpuDevice {
         }
         self.exposures.upload(gpu, state.exposures.as_ref())?;
         self.poses.upload(gpu, state.poses.as_ref())?;
-        self.stats.reserve(gpu, 8 * stride as u64)?;
-        self.views.reserve(gpu, 4 * stride as u64)?;
-        let n = state.splats.len();
-        let DensificationStats { error, weight, views } = &state.densification;
+        self.stats.reserve(gpu, 4 * stride as u64)?;
         // The host has statistics of all splats, or of none since the last refinement.
-        let padded =
-            |values: &[f32]| -> Vec<f32> { values.iter().copied().chain(iter::repeat(0.0)).take(stride).collect() };
-        gpu.upload(&self.stats, 0, &padded(error))?;
-        gpu.upload(&self.stats, 4 * stride as u64, &padded(weight))?;
-        let views: Vec<u32> = views.iter().copied().chain(iter::repeat(0)).take(n).collect();
-        gpu.upload(&self.views, 0, &views)?;
+        let error = state.densification.error.iter().copied();
+        let error: Vec<f32> = error.chain(iter::repeat(0.0)).take(stride).collect();
+        gpu.upload(&self.stats, 0, &error)?;
         let Tally { sum, count } = state.coarse_to_fine.tally;
         let optimiser = OptimiserState {
             adam_steps: adam_steps as u32,
@@ -297,7 +288,7 @@ impl GpuDevice {
         let (status, visible, args) = (renderer.status_buffer(), renderer.visible(), renderer.args());
         let first_rates = rates(0);
         let common = [(0, &first_rates), (1, status), (2, &self.optimiser), (3, visible)];
-        let bindings = [(4, renderer.statistics()), (5, &*self.stats), (6, &*self.views)];
+        let bindings = [(4, renderer.statistics()), (5, &*self.stats)];
         kernels.stats.run_indirect(gpu, pass, &[&common[..], &bindings].concat(), args, args::VISIBLE_TRAINABLE);
         let values = self.splats.columns().banks();
         let [first, second] = self.moments.each_ref().map(Columns::banks);
@@ -357,15 +348,11 @@ impl TrainDevice for GpuDevice {
             state.poses = self.poses.download(&self.gpu)?;
         }
         if part >= StatePart::All {
-            let (gpu, n, stride) = (&*self.gpu, self.splats.len(), self.splats.columns().stride());
+            let (gpu, n) = (&*self.gpu, self.splats.len());
             let [first, second] = &self.moments;
             let (first, second) = (first.read(gpu, n)?, second.read(gpu, n)?);
             state.adam = Adam::from_parts(Isa::detect(), optimiser.adam_steps as i32, first, second);
-            state.densification = DensificationStats {
-                error: gpu.read(&self.stats, 0, n)?,
-                weight: gpu.read(&self.stats, stride, n)?,
-                views: gpu.read(&self.views, 0, n)?,
-            };
+            state.densification = DensificationStats { error: gpu.read(&self.stats, 0, n)? };
         }
         Ok(())
     }
