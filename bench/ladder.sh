@@ -47,18 +47,19 @@ for bed in "${@:-dense_5m}"; do
     photos=out/streets/$bed
     masked "$photos" "out/ladder/$bed-sky" sky
     masked "$photos" "out/ladder/$bed-aerial" aerial
-    for rung in ${RUNGS:-usual splats2 splats4 sky aerial points points4 depth both sparse levels2 levels3 whole}; do
+    for rung in ${RUNGS:-usual splats2 splats4 sky aerial points points4 depth both sparse lidar levels2 levels3 whole}; do
         case $rung in
             usual) run "as usual" "$photos" --budget "$splats" --no-lidar ;;
-            splats2) run "2 times the splats" "$photos" --budget $((2 * splats)) --no-lidar ;;
-            splats4) run "4 times the splats" "$photos" --budget $((4 * splats)) --no-lidar ;;
+            splats2) run "2 times the splats" "$photos" --budget $((2 * splats)) --no-lidar --levels 0 ;;
+            splats4) run "4 times the splats" "$photos" --budget $((4 * splats)) --no-lidar --levels 0 ;;
             sky) run "sky masked" "out/ladder/$bed-sky" --budget "$splats" --no-lidar ;;
             aerial) run "no aerial photos" "out/ladder/$bed-aerial" --budget "$splats" --no-lidar ;;
             points) run "lidar starts splats" "$photos" --budget "$splats" ;;
-            points4) run "lidar starts splats, 4 times the splats" "$photos" --budget $((4 * splats)) ;;
+            points4) run "lidar starts splats, 4 times the splats" "$photos" --budget $((4 * splats)) --levels 0 ;;
             depth) run "true depth as a loss" "$photos" --budget "$splats" --no-lidar --depths "$photos/depth" --depth-weight 0.8 ;;
             both) run "lidar starts splats, true depth as a loss" "$photos" --budget "$splats" --depths "$photos/depth" --depth-weight 0.8 ;;
             sparse) run "depths of sparse points as a loss" "$photos" --budget "$splats" --no-lidar --depth-weight 0.8 ;;
+            lidar) run "lidar starts splats, its depths as a loss" "$photos" --budget "$splats" --depth-weight 0.8 ;;
             levels2) run "two levels" "$photos" --budget "$splats" --no-lidar --levels 1 --residual 0 ;;
             levels3) run "three levels" "$photos" --budget "$splats" --no-lidar --levels 2 --residual 0 ;;
             whole) run "one block without a tree" "$photos" --budget "$splats" --no-lidar --blocks whole ;;
