@@ -255,7 +255,7 @@ fn several_samples_agree_with_the_cpu(depth_weight: f32) {
     assert_eq!((tally.count, cpu_tally.count), (4, 4));
     let seen = |state: &State| -> Vec<bool> { state.densification.error.iter().map(|&error| error > 0.0).collect() };
     assert_eq!(seen(&on_gpu), seen(&cpu));
-    assert!([true, false].iter().all(|is_seen| seen(&cpu).contains(is_seen)));
+    assert!(seen(&cpu).contains(&true));
     assert!(loss_off < 1e-5 && l1_off < 1e-5 && stats_off < 1e-4 && off_by < 1e-4);
     // Every sample contributes to the splats and to the loss.
     for n in 0..samples.len() {
