@@ -11,9 +11,10 @@ fn main() {
         println!("cargo::rustc-env=PLAT_COMMIT={commit}{dirty}");
     }
     println!("cargo::rerun-if-changed=build.rs");
-    // The log of HEAD grows with every commit; a checkout may come without one. A missing file would make every build a
-    // new one.
-    if let Some(sign) = ["../.git/logs/HEAD", "../.git/index"].into_iter().find(|sign| Path::new(sign).exists()) {
+    // The log of HEAD grows with every commit; a checkout may come without one, and a worktree has its own elsewhere. A
+    // missing file would make every build a new one.
+    let mut signs = ["logs/HEAD", "index"].into_iter().filter_map(|file| git(&["rev-parse", "--git-path", file]));
+    if let Some(sign) = signs.find(|sign| Path::new(sign).exists()) {
         println!("cargo::rerun-if-changed={sign}");
     }
 }
