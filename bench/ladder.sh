@@ -45,6 +45,7 @@ for bed in "${@:-dense_5m}"; do
         *) echo "bench/ladder.sh: no bed has the name $bed: dense_5m and city_0.3 do" >&2; exit 2 ;;
     esac
     photos=out/streets/$bed
+    [[ -d $photos ]] || { echo "bench/ladder.sh: $photos does not exist: run bench/streets.sh $bed first, which makes it" >&2; exit 2; }
     masked "$photos" "out/ladder/$bed-sky" sky
     masked "$photos" "out/ladder/$bed-aerial" aerial
     for rung in ${RUNGS:-usual splats2 splats4 sky aerial points points4 depth both sparse lidar levels2 levels3 whole}; do

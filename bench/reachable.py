@@ -95,7 +95,11 @@ def measure(capture):
     return len(rows), *np.mean(rows, 0)
 
 
+if len(sys.argv) == 1:
+    sys.exit("bench/reachable.py: give folders of plat synth --truth")
 for path in sys.argv[1:]:
+    if not os.path.isdir(f"{path}/depth"):
+        sys.exit(f"bench/reachable.py: {path}/depth does not exist: give a folder of plat synth --truth")
     photos, psnr_seen, psnr, share = measure(path)
     line = {"scene": os.path.basename(os.path.normpath(path)), "photos": photos, "psnr_seen": psnr_seen, "psnr": psnr}
     print(json.dumps({**line, "surface_seen": share}), flush=True)
