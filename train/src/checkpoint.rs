@@ -168,7 +168,7 @@ fn write_rows<const N: usize>(bulk: &mut Vec<u8>, views: &[u32], steps: &[u32], 
 /// Views, their Adam steps, and rows of values and moments.
 type Rows<const N: usize> = (Vec<u32>, Vec<u32>, [Vec<[f32; N]>; 3]);
 
-/// The inverse of [`write_rows`], for so many views.
+/// The inverse of [`write_rows`], for so many views. `chunks_exact` gives rows of N numbers only.
 fn read_rows<const N: usize>(bytes: &[u8], count: usize) -> Rows<N> {
     let (views, rest) = bytes.split_at(4 * count);
     let (steps, rest) = rest.split_at(4 * count);
@@ -177,6 +177,7 @@ fn read_rows<const N: usize>(bytes: &[u8], count: usize) -> Rows<N> {
     (integers(views), integers(steps), [part(0), part(1), part(2)])
 }
 
+/// Words of four bytes; `chunks_exact` gives no others.
 fn words(bytes: &[u8]) -> impl Iterator<Item = [u8; 4]> {
     bytes.chunks_exact(4).map(|bytes| bytes.try_into().expect("four bytes"))
 }
