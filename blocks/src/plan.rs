@@ -3,7 +3,7 @@
 //! A plan is stored as positional bincode in a frame, and as JSON. The order of fields and the serde names are part of
 //! both formats.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 
 use glam::DVec3;
 use scene::frame::{self, Kind};
@@ -164,6 +164,15 @@ impl Task {
     /// The total number of pixels of all training windows.
     pub fn window_pixels(&self) -> u64 {
         self.views.iter().map(|v| v.window.area()).sum()
+    }
+
+    /// The share of the pixels of the training windows that are finer than the parent's of the same view, 0 to 1: what
+    /// the parent has not been trained on.
+    pub fn finer_share(&self, parent: &Task) -> f64 {
+        let mips: BTreeMap<u32, u8> = parent.views.iter().map(|used| (used.view, used.mip)).collect();
+        let is_finer = |used: &&ViewUse| mips.get(&used.view).is_none_or(|mip| used.mip < *mip);
+        let finer: u64 = self.views.iter().filter(is_finer).map(|used| used.window.area()).sum();
+        finer as f64 / self.window_pixels().max(1) as f64
     }
 
     /// The donor of a place (world metres): the finished neighbour whose splats initialise that part of this block's

@@ -103,7 +103,7 @@ impl<'a> Pruner<'a> {
             Some((_, out)) => Some(read_tree(out)?.plan.settings),
             None => None,
         };
-        let recipe = Recipe::refinement();
+        let recipe = Recipe::refinement(1.0);
         let all: &(dyn Fn(Vec3) -> bool + Sync) = &|_| true;
         let job = Job {
             initial: model.splats.clone(),

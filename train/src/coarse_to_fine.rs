@@ -1,14 +1,15 @@
 //! Measures what decides when to go to a finer mip and when to end growth. The trainer compares the measurements with the
 //! recipe.
 //!
-//! The mean absolute error of an epoch (every view once) is a by-product of training. Two rules use it:
+//! The mean absolute error of an epoch (every view once), or of a part of it, is a by-product of training. Two rules use it:
 //!
 //! - **Coarse to fine.** While the error at a coarse mip exceeds the detail that the mip lacks, the finer photos add
 //!   little information for four times the pixels. Training goes to the next finer mip once the error is down to a
 //!   multiple of that detail ([`Recipe::detail_factor`](crate::Recipe::detail_factor)), or when the recipe's share of
 //!   the steps is used.
 //! - **End of growth.** Growth ends early when its last epochs gained less than
-//!   [`Growth::worth_db`](crate::growth::Growth::worth_db) for each five percent of splats.
+//!   [`Growth::worth_db`](crate::growth::Growth::worth_db) for each five percent of splats. Parts of an epoch do not count: their
+//!   errors differ more by which views they have.
 
 use scene::{Camera, Rect};
 use serde::{Deserialize, Serialize};
@@ -23,7 +24,7 @@ const DETAIL_VIEWS: usize = 16;
 const MIN_MEASURED_GROWTH: f64 = 1.3;
 
 /// Mean absolute difference, 0 to 1, between the photos `coarser` mips up and those one mip finer. Infinite where no
-/// window has such a coarse mip, so that the stage ends after its first epoch.
+/// window has such a coarse mip, so that the stage ends after its first period.
 ///
 /// # Errors
 /// A window that cannot be read.
@@ -63,7 +64,7 @@ pub fn missing_detail(views: &[TrainView], source: &dyn WindowSource, coarser: u
     Ok(if count > 0.0 { sum / count } else { f64::INFINITY })
 }
 
-/// Sum of the errors of an epoch's steps.
+/// Sum of the errors of the steps of a period.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Tally {
     pub(crate) sum: f64,
@@ -78,41 +79,42 @@ impl Tally {
     }
 }
 
-/// Coarse-to-fine stage and the errors of its epochs.
+/// Coarse-to-fine stage and the errors of its periods.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub(crate) struct CoarseToFine {
     /// Number of completed coarse stages.
     pub(crate) stage: u8,
     /// Step at which the current stage started.
     pub(crate) stage_start: u32,
-    /// Errors of the current epoch.
+    /// Errors of the current period.
     pub(crate) tally: Tally,
-    /// For each epoch of this stage: number of splats at its end, and -20 log10 of the mean absolute error (higher is better).
-    epochs: Vec<(u32, f32)>,
+    /// For each period of this stage: number of splats at its end, and -20 log10 of the mean absolute error (higher is better).
+    #[serde(rename = "epochs")]
+    periods: Vec<(u32, f32)>,
 }
 
 impl CoarseToFine {
-    /// Ends an epoch of `steps` steps with `splats` splats. Returns its mean error, or `None` if a step was skipped.
-    pub(crate) fn end_epoch(&mut self, splats: usize, steps: u32) -> Option<f64> {
+    /// Ends a period of `steps` steps with `splats` splats. Returns its mean error, or `None` if a step was skipped.
+    pub(crate) fn end_period(&mut self, splats: usize, steps: u32) -> Option<f64> {
         let Tally { sum, count } = std::mem::take(&mut self.tally);
         let (mean, full) = (sum / f64::from(count.max(1)), count == steps);
         if full {
-            self.epochs.push((splats as u32, (-20.0 * mean.max(1e-9).log10()) as f32));
+            self.periods.push((splats as u32, (-20.0 * mean.max(1e-9).log10()) as f32));
         }
         full.then_some(mean)
     }
 
-    /// Starts the next stage. Errors of different mips are not comparable, so the epochs are cleared.
+    /// Starts the next stage. Errors of different mips are not comparable, so the periods are cleared.
     pub(crate) fn advance(&mut self, step: u32) {
         (self.stage, self.stage_start) = (self.stage + 1, step);
         self.tally = Tally::default();
-        self.epochs.clear();
+        self.periods.clear();
     }
 
     /// True if the last growth by at least [`MIN_MEASURED_GROWTH`] gained less than `worth_db` for each five percent of splats.
     pub(crate) fn growth_gains_less_than(&self, worth_db: f64) -> bool {
-        let Some(&(splats, now)) = self.epochs.last() else { return false };
-        let before = self.epochs.iter().rev().find(|(n, _)| f64::from(*n) * MIN_MEASURED_GROWTH <= f64::from(splats));
+        let Some(&(splats, now)) = self.periods.last() else { return false };
+        let before = self.periods.iter().rev().find(|(n, _)| f64::from(*n) * MIN_MEASURED_GROWTH <= f64::from(splats));
         before.is_some_and(|&(n, then)| {
             let five_percents = (f64::from(splats) / f64::from(n.max(1))).ln() / 1.05f64.ln();
             f64::from(now - then) < worth_db * five_percents
@@ -160,7 +162,7 @@ mod tests {
         let mut stages = CoarseToFine::default();
         let epoch = |stages: &mut CoarseToFine, error: f64, splats: usize| -> Option<f64> {
             (0..4).for_each(|_| stages.tally.add(error));
-            stages.end_epoch(splats, 4)
+            stages.end_period(splats, 4)
         };
         assert_eq!(epoch(&mut stages, 0.1, 1000), Some(0.1));
         assert_eq!(epoch(&mut stages, 0.0999, 1100), Some(0.0999));
@@ -173,6 +175,6 @@ mod tests {
         assert!(epoch(&mut stages, 0.2, 2000).is_some() && !stages.growth_gains_less_than(0.02));
         // An epoch with a skipped step has no mean error.
         stages.tally.add(1.0);
-        assert_eq!(stages.end_epoch(9, 4), None);
+        assert_eq!(stages.end_period(9, 4), None);
     }
 }

@@ -94,11 +94,15 @@ impl Default for Recipe {
 }
 
 impl Recipe {
-    /// For splats that already fit one mip coarser: full SH degree from the start and higher first learning rates, as
-    /// there are fewer steps. Splats that do not fit the coarser mip yet are trained there first.
-    pub fn refinement() -> Self {
+    /// For splats that a parent has trained already, where `finer_share` of the pixels, 0 to 1, are finer than the
+    /// parent's: full SH degree from the start. The first learning rates are 1.5 times those of a start from points where
+    /// all pixels are finer, as there are fewer steps, and 0.2 times where none is: there the splats have converged, and
+    /// each window is drawn once or twice (docs/decisions/0064). Splats that do not fit the coarser mip yet are trained
+    /// there first.
+    pub fn refinement(finer_share: f32) -> Self {
         let recipe = Self::default();
-        let longer = |[first, last]: [f32; 2]| [1.5 * first, last];
+        let first = 0.2 + 1.3 * finer_share.clamp(0.0, 1.0);
+        let longer = |[from, last]: [f32; 2]| [first * from, last];
         Self {
             mean: longer(recipe.mean),
             log_scale: longer(recipe.log_scale),

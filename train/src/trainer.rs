@@ -26,6 +26,10 @@ use crate::recipe::Recipe;
 use crate::source::AHEAD;
 use crate::view::TrainView;
 
+/// Smallest number of periods that the error of a job is measured over, see [`Trainer::period`]. A job of three epochs that waits for the end of one stays coarse for as long
+/// as its recipe allows (docs/decisions/0064).
+const MIN_PERIODS: u32 = 16;
+
 /// The progress of training. Methods download their values from the device, which takes time and does not change the
 /// result. They return `None` where the download fails; training then ends with that error.
 pub struct Progress<'a> {
@@ -199,8 +203,9 @@ impl<'a> Trainer<'a> {
             return Err(TrainError::Empty(step));
         }
         let progress = step as f32 / steps as f32;
-        // An epoch draws every view once, and a step does not cross its end.
-        let left = (views.len() as u32 - step % views.len() as u32).min(steps - step);
+        // An epoch draws every view once, and a step does not cross its end or that of a period.
+        let left = |every: u32| every - step % every;
+        let left = left(views.len() as u32).min(left(self.period())).min(steps - step);
         let count = recipe.views_per_step.clamp(1, MAX_VIEWS_PER_STEP).min(left);
         let coarser = (recipe.coarse.len() as u8).saturating_sub(self.state.coarse_to_fine.stage);
         let samples = self.samples(count, coarser)?;
@@ -230,7 +235,7 @@ impl<'a> Trainer<'a> {
         self.device.step(&mut self.state, inputs)?;
 
         self.state.step = step + count;
-        let error = self.end_epoch()?;
+        let error = self.end_period()?;
         if coarser > 0 {
             self.advance_mip(error)?;
         }
@@ -264,14 +269,20 @@ impl<'a> Trainer<'a> {
         Ok(samples)
     }
 
-    /// At the end of an epoch: its mean absolute error, unless a step was skipped.
-    fn end_epoch(&mut self) -> Result<Option<f64>, TrainError> {
-        let epoch = self.job.views.len() as u32;
-        if !self.state.step.is_multiple_of(epoch) {
+    /// Number of steps that the error is measured over: an epoch, or part of it where there are few epochs.
+    fn period(&self) -> u32 {
+        let part = (self.job.steps / MIN_PERIODS).max(MAX_VIEWS_PER_STEP);
+        part.min(self.job.views.len() as u32)
+    }
+
+    /// At the end of a period: its mean absolute error, unless a step was skipped.
+    fn end_period(&mut self) -> Result<Option<f64>, TrainError> {
+        let period = self.period();
+        if !self.state.step.is_multiple_of(period) {
             return Ok(None);
         }
         self.device.download(&mut self.state, StatePart::Tally)?;
-        let error = self.state.coarse_to_fine.end_epoch(self.state.splats.len(), epoch);
+        let error = self.state.coarse_to_fine.end_period(self.state.splats.len(), period);
         self.device.upload(&self.state, StatePart::Tally)?;
         Ok(error)
     }
@@ -295,12 +306,15 @@ impl<'a> Trainer<'a> {
     /// Adds and removes splats where that is due after a step of `count` views. Skips the steps up to the end of growth
     /// where it no longer improves the error.
     fn densify(&mut self, count: u32, progress: f32, error: Option<f64>) -> Result<(), TrainError> {
+        // The errors of parts of an epoch differ by which views they have.
+        let is_epoch = self.period() as usize == self.job.views.len();
         let Job { counts, keeps, free_space, budget, steps, recipe, .. } = self.job;
         let (growth, state) = (&recipe.growth, &mut self.state);
         let until = (growth.until * steps as f32) as u32;
         let worth_db = f64::from(growth.worth_db);
         if worth_db > 0.0
             && error.is_some()
+            && is_epoch
             && state.step < until
             && state.coarse_to_fine.growth_gains_less_than(worth_db)
         {

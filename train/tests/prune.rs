@@ -100,7 +100,7 @@ fn with_job<R>(
     counts: Predicate,
     work: impl FnOnce(Job) -> R,
 ) -> R {
-    let (views, recipe) = (views(), Recipe::refinement());
+    let (views, recipe) = (views(), Recipe::refinement(1.0));
     work(Job {
         initial: initial.clone(),
         context,

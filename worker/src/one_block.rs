@@ -107,7 +107,7 @@ impl OneBlockTraining<'_> {
             given_poses: None,
             given_residual: None,
         };
-        let recipe = change(recipe_of(&plan.settings, task));
+        let recipe = change(recipe_of(plan, task));
         let views = block.windows(&task.views)?;
         let InitialSplats { trained: initial, context } = block.initial_splats(BTreeMap::new(), &views, &recipe)?;
         let mut evaluations: Vec<Evaluation> = Vec::new();

@@ -50,7 +50,7 @@ impl Block<'_> {
     ) -> Result<TrainedBlock, ExecuteError> {
         let (plan, task, options) = (self.plan, self.task, &self.context.options);
         let finished = &self.context.shared.finished;
-        let recipe = recipe_of(&plan.settings, task).at_rate(self.order.rate_permille as f32 / FULL_RATE as f32);
+        let recipe = recipe_of(plan, task).at_rate(self.order.rate_permille as f32 / FULL_RATE as f32);
         let counts = |p: Vec3| self.owns(task, p.as_dvec3());
         let budget = self.budget(&results);
         let evaluator = MergedEvaluator::new(plan, self.reader, &self.context.store);
