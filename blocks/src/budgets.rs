@@ -14,9 +14,8 @@ use crate::ground::Ground;
 use crate::plan::{Plan, PlanSettings, Task};
 use crate::visibility::Observations;
 
-/// Splats of an inner block per splat of its children. At 0.4 aerial_caliterra had 32.70 dB in three levels, at 0.6 33.02,
-/// at 1 32.69 (docs/decisions/0064).
-const INNER_BUDGET_RATIO: f64 = 0.6;
+/// Splats of an inner block per splat of its children.
+const INNER_BUDGET_RATIO: f64 = 1.0 / 2.5;
 /// Minimum number of splats of a task, where the whole budget allows it.
 const MIN_BUDGET: u32 = 500;
 /// Splats that one block can hold, in about 1.6 GB. With automatic levels a scene of more is divided.
@@ -143,10 +142,7 @@ fn set_budgets(tasks: &mut [Task], positions: &[TreePosition], settings: &PlanSe
     for of in groups {
         let rows: Vec<usize> = (0..tasks.len()).filter(|&i| group(&tasks[i]) == of).collect();
         let shares: Vec<f64> = rows.iter().map(|&i| positions[i].splats).collect();
-        let pool = match of {
-            Some(_) => (total * shares.iter().sum::<f64>()).min(f64::from(BLOCK_SPLATS) * rows.len() as f64),
-            None => total * (1.0 - kept),
-        };
+        let pool = if of.is_some() { total * shares.iter().sum::<f64>() } else { total * (1.0 - kept) };
         for (row, budget) in rows.into_iter().zip(split(pool.round(), &shares, MIN_BUDGET)) {
             tasks[row].budget = budget;
         }

@@ -28,7 +28,7 @@ const RENDER_COST: f64 = 0.6;
 /// Cost of a splat in a step or a rendering of pruning, relative to that before: there are fewer, but larger ones.
 const PRUNING_COST: f64 = 1.1;
 /// Splats that a child inherits from its parent, relative to its splats at the end.
-const INHERITED_SHARE: f64 = 0.6;
+const INHERITED_SHARE: f64 = 0.4;
 /// Splats of a child's core and halo at the end, relative to [`blocks::trained_splats`]: neighbours own parts of the halo, and growth
 /// may end early.
 const CHILD_SPLATS: f64 = 0.2;
