@@ -89,6 +89,7 @@ pub(crate) struct CoarseToFine {
     /// Errors of the current period.
     pub(crate) tally: Tally,
     /// For each period of this stage: number of splats at its end, and -20 log10 of the mean absolute error (higher is better).
+    // Their name in checkpoints of before periods were parts of an epoch.
     #[serde(rename = "epochs")]
     periods: Vec<(u32, f32)>,
 }

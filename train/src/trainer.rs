@@ -26,8 +26,8 @@ use crate::recipe::Recipe;
 use crate::source::AHEAD;
 use crate::view::TrainView;
 
-/// Smallest number of periods that the error of a job is measured over, see [`Trainer::period`]. A job of three epochs that waits for the end of one stays coarse for as long
-/// as its recipe allows (docs/decisions/0064).
+/// Smallest number of periods that the error of a job is measured over, see [`Trainer::period`]. A job of three epochs
+/// that waits for the end of one stays coarse for as long as its recipe allows (docs/decisions/0064).
 const MIN_PERIODS: u32 = 16;
 
 /// The progress of training. Methods download their values from the device, which takes time and does not change the
