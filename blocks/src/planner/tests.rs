@@ -131,6 +131,26 @@ fn leaves_of_a_street_are_trained_though_their_parents_saw_their_pixels() {
     }
 }
 
+/// From the air each level sees everything more finely than the one above, along a street a part of it.
+#[test]
+fn finer_pixels_of_a_child_are_those_at_a_finer_mip_than_its_parents() {
+    let shares = |capture: &Capture| -> Vec<f64> {
+        let plan = plan_of(capture, Mode::Tree, Some(1));
+        let children = plan.tasks.iter().filter(|task| task.parent.is_some());
+        children.map(|task| task.finer_share(&plan.tasks[0])).collect()
+    };
+    let (above, along) = (shares(&aerial(12, 300.0, 20_000)), shares(&street(120, 20_000)));
+    println!("aerial {above:.2?}, street {along:.2?}");
+    assert!(above.len() == 4 && above.iter().all(|share| *share > 0.9 && *share <= 1.0), "{above:?}");
+    assert!(along.len() == 4 && along.iter().all(|share| (0.0..0.6).contains(share)), "{along:?}");
+    assert!(along.contains(&0.0), "{along:?}");
+    let plan = plan_of(&aerial(8, 300.0, 8000), Mode::Tree, Some(1));
+    let [root, child] = [&plan.tasks[0], &plan.tasks[1]];
+    assert_eq!(root.finer_share(root), 0.0);
+    // A view that the parent lacks counts as finer.
+    assert_eq!(child.finer_share(&Task { views: Vec::new(), ..root.clone() }), 1.0);
+}
+
 #[test]
 fn budgets_add_up_to_the_merged_model() {
     for (levels, mode) in [(0, Mode::Whole), (0, Mode::Tree), (1, Mode::Tree), (2, Mode::Tree), (2, Mode::Flat)] {
