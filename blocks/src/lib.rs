@@ -46,7 +46,7 @@ pub use ground::{Ground, Square};
 pub use lint::{Finding, Severity, lint};
 pub use lod::{Cut, context_of, sweep_of};
 pub use plan::{EvalTask, MAX_VIEWS_PER_STEP, Mode, Plan, PlanError, PlanSettings, PlannedTask, Task, ViewUse};
-pub use planner::plan;
+pub use planner::{plan, plan_at_most};
 pub use seams::{Face, Seams};
 pub use split::{Part, Split};
 pub use view_cut::ViewTree;

@@ -381,6 +381,20 @@ impl Plan {
         found.ok().map(|index| index as u32)
     }
 
+    /// How often these tasks of the plan draw each of their windows, on average.
+    pub fn visits<'a>(&self, tasks: impl IntoIterator<Item = &'a Task>) -> f64 {
+        let (draws, windows) = (tasks.into_iter()).fold((0.0, 0.0), |(draws, windows), task| {
+            (draws + f64::from(task.steps), windows + task.views.len() as f64)
+        });
+        draws * f64::from(self.settings.views_per_step) / f64::max(windows, 1.0)
+    }
+
+    /// [`Plan::visits`] of the blocks without children.
+    pub fn leaf_visits(&self) -> f64 {
+        let parents: BTreeSet<BlockId> = self.tasks.iter().filter_map(|task| task.parent).collect();
+        self.visits(self.tasks.iter().filter(|task| !parents.contains(&task.block)))
+    }
+
     /// The finest cut: the owner of every place in the merged model. Every place has exactly one.
     ///
     /// In a tree the owner is the deepest task whose core contains the place, so the area of a block without a task

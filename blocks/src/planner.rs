@@ -2,7 +2,7 @@
 
 use scene::{ArtefactId, Capture};
 
-use crate::budgets::{self, DetailShares};
+use crate::budgets::{self, BLOCK_SPLATS, DetailShares};
 use crate::evaluation::eval_tasks;
 use crate::ground::{Ground, quantile};
 use crate::layout::{Layout, level_rho_metres};
@@ -13,6 +13,33 @@ use crate::visibility::{Observations, is_usable};
 /// The finest resolution is this quantile of depth / focal length over all observations. With the median, half of the
 /// views of a street would use mip 1.
 const FINE_QUANTILE: f64 = 0.25;
+
+/// Plans as [`plan`] does, with `settings.budget` as the most splats that the model may have. Where levels are automatic and
+/// the steps are too few to draw each window of the finest blocks once, the plan has a level less and the splats that its blocks
+/// hold: more would cost time and memory, and hardly be trained (docs/decisions/0065).
+///
+/// # Errors
+/// As [`plan`].
+pub fn plan_at_most(
+    capture: &Capture,
+    capture_id: ArtefactId,
+    settings: &PlanSettings,
+    backend: &str,
+) -> Result<Plan, PlanError> {
+    let mut best = plan(capture, capture_id, settings, backend)?;
+    while settings.levels.is_none() && best.leaf_visits() < 1.0 && best.levels > 0 {
+        let above = best.tasks.iter().filter(|task| task.block.level + 1 == best.levels).count();
+        let held = BLOCK_SPLATS.saturating_mul(u32::try_from(above).unwrap_or(u32::MAX));
+        let fewer = PlanSettings { budget: best.settings.budget.min(held), ..settings.clone() };
+        let coarser = plan(capture, capture_id, &fewer, backend)?;
+        if coarser.levels >= best.levels {
+            break;
+        }
+        best = coarser;
+    }
+    Ok(best)
+}
+
 /// Plans the training of a capture on a backend. Held-out views ([`Split`]) are never trained on. Equal
 /// inputs give equal plans.
 ///

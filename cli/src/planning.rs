@@ -21,7 +21,8 @@ pub(crate) fn plan_of(source: &Source, options: &PlanOptions) -> Result<(Capture
                        points: there are no target depths";
         return Err(BadInput::new("--depth-weight", problem, "leave it").into());
     }
-    let plan = blocks::plan(&capture, id, &settings, &train::Backend::Cpu.name())?;
+    let planned = if options.budget.0.is_some() { blocks::plan } else { blocks::plan_at_most };
+    let plan = planned(&capture, id, &settings, &train::Backend::Cpu.name())?;
     Ok((capture, plan))
 }
 

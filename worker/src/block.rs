@@ -14,6 +14,9 @@ use crate::result_cache::ResultCache;
 use crate::task::{ExecuteError, TaskOrder};
 use crate::trainer_context::TrainerContext;
 
+/// Draws of each window that a block needs to train all splats that the plan gives it (docs/decisions/0065).
+const FULL_VISITS: f64 = 2.0;
+
 /// A block to be trained.
 pub(crate) struct Block<'a> {
     pub(crate) context: &'a TrainerContext,
@@ -63,7 +66,7 @@ impl Block<'_> {
 
     /// Number of splats to end with in the core. The plan divides a level's budget before training; the parent's densification has
     /// since put splats where the error was. So the siblings' total is divided by the number of the parent's splats in each core. The
-    /// root's background splats, which no child replaces, are subtracted first.
+    /// root's background splats, which no child replaces, are subtracted first. What the steps cannot train is left out.
     pub(crate) fn budget(&self, results: &BTreeMap<BlockId, Splats>) -> usize {
         let (plan, task) = (self.plan, self.task);
         let Some(splats) = task.parent.and_then(|parent| results.get(&parent)) else { return task.budget as usize };
@@ -83,7 +86,8 @@ impl Block<'_> {
             |root: &Splats| (0..root.len()).filter(|&i| plan.ground.is_background(root.mean(i).as_dvec3())).count();
         let background = results.get(&BlockId::ROOT).map_or(0, background) as u64;
         let total = total * (of_level - background.min(of_level / 2)) / of_level;
-        (total * own / counts.iter().sum::<u64>().max(1)).max(1) as usize
+        let asked = (total * own / counts.iter().sum::<u64>().max(1)).max(1);
+        trainable(own, asked, plan.visits([task]))
     }
 
     /// How the block is pruned. Only leaves are: they replace the blocks above them.
@@ -144,5 +148,30 @@ impl Block<'_> {
             train::low_pass::to_full_resolution(&mut splats, views);
         }
         splats
+    }
+}
+
+/// Number of splats to end with, of `asked`, in a block that starts with `own` splats of its parent and draws each of its windows
+/// `visits` times. A splat that is split has to be trained anew, so that splats which are added late do harm.
+fn trainable(own: u64, asked: u64, visits: f64) -> usize {
+    if own == 0 || asked <= own {
+        return asked as usize;
+    }
+    let (own, asked) = (own as f64, asked as f64);
+    // Geometric, as [`train::growth::Growth::target`].
+    (own * (asked / own).powf((visits / FULL_VISITS).clamp(0.0, 1.0))).round() as usize
+}
+
+#[cfg(test)]
+mod tests {
+    use super::trainable;
+
+    #[test]
+    fn few_visits_train_few_new_splats() {
+        let rows = [(0.0, 100), (0.5, 141), (1.0, 200), (2.0, 400), (30.0, 400)];
+        for (visits, expected) in rows {
+            assert_eq!(trainable(100, 400, visits), expected, "{visits} visits");
+        }
+        assert_eq!([trainable(0, 400, 0.1), trainable(400, 100, 0.1)], [400, 100]);
     }
 }

@@ -97,6 +97,24 @@ fn automatic_levels_divide_only_what_no_block_can_hold() {
     }
 }
 
+#[test]
+fn splats_that_the_steps_cannot_train_are_left_out() {
+    let capture = aerial(12, 300.0, 20_000);
+    let with = |steps: u32, levels: Option<u8>| {
+        let settings = PlanSettings { budget: 2_000_000, steps, ..settings(Mode::Tree, levels) };
+        plan_at_most(&capture, ArtefactId::of(b"capture"), &settings, "cpu").unwrap()
+    };
+    let enough = with(4000, None);
+    assert!(enough.levels == 1 && enough.leaf_visits() > 1.0, "{}", enough.leaf_visits());
+    assert_eq!(enough.settings.budget, 2_000_000);
+    let few = with(20, None);
+    assert_eq!((few.levels, few.settings.budget, few.settings.steps), (0, BLOCK_SPLATS, 20));
+    let asked = with(20, Some(1));
+    assert_eq!((asked.levels, asked.settings.budget), (1, 2_000_000));
+    let warned = |plan: &Plan| lint(plan, &capture).iter().any(|finding| finding.message.contains("draw each photo"));
+    assert_eq!([&enough, &few, &asked].map(warned), [false, false, true]);
+}
+
 /// In an aerial capture every level trains on the photos about as often as a single block would.
 #[test]
 fn heights_get_work_for_what_they_are_the_first_to_see() {

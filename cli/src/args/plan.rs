@@ -55,7 +55,8 @@ pub(crate) struct PlanOptions {
     /// This fills a large GPU with small photos; on a CPU it saves nothing
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = views_per_step())]
     pub(crate) views_per_step: u32,
-    /// Splats of the merged model before pruning; auto takes three for each sparse point and for two of lidar, from 5,000 to 2,000,000
+    /// Splats of the merged model before pruning; auto takes three for each sparse point and for two of lidar, from 5,000 to 2,000,000,
+    /// and fewer where --levels is auto and the steps cannot train them
     #[arg(long, value_name = "N|auto", default_value_t)]
     pub(crate) budget: Auto<u32>,
     /// Prune the finest blocks within this loss of PSNR on their training views, dB; 0 prunes nothing
