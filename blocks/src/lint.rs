@@ -59,8 +59,9 @@ pub fn lint(plan: &Plan, capture: &Capture) -> Vec<Finding> {
     }
     let visits = plan.leaf_visits();
     if plan.levels > 0 && visits < FEW_VISITS {
-        let message =
-            format!("the finest blocks draw each photo {visits:.1} times; give more --steps or fewer --levels");
+        let message = format!(
+            "the finest blocks draw each photo {visits:.1} times; give more --steps, fewer --levels or a lower --budget"
+        );
         findings.warning(None, message);
     }
     check_ownership(plan, capture, &mut findings);
