@@ -24,6 +24,9 @@ const COLOURS: [(&str, &str); 6] = [
     ("#5b4bc4", "#a99cff"),
 ];
 
+/// Strokes that tell a colour's labels apart.
+const STROKES: [&str; 3] = ["", " dotted", " dash-dot"];
+
 /// A scene and its panels.
 type Row<'a> = (&'a str, Vec<(Measure, Vec<Series>)>);
 
@@ -111,7 +114,7 @@ fn series_of(runs: &[Averaged], scene: &str, measure: Measure, coloured: Option<
         // By cost: time of a curve, cost of a sweep's points.
         points.sort_by(|a, b| a.x.total_cmp(&b.x));
         let colour = coloured.and_then(|labels| labels.iter().position(|of| of == label));
-        let class = colour.map_or("reference".to_owned(), |n| format!("c{}", n % COLOURS.len()));
+        let class = colour.map_or("reference".to_owned(), class);
         if !points.is_empty() {
             series.push(Series { label: label.clone(), class, points });
         }
@@ -119,12 +122,16 @@ fn series_of(runs: &[Averaged], scene: &str, measure: Measure, coloured: Option<
     series
 }
 
+/// The classes of the n-th label's line and points: each colour with one stroke, then each with the next.
+fn class(n: usize) -> String {
+    format!("c{}{}", n % COLOURS.len(), STROKES[n / COLOURS.len() % STROKES.len()])
+}
+
 /// The legend in rows below the title, references last; and the y coordinate at which the panels begin.
 fn legend(runs: &[&str], references: &[&str], right: f64) -> (String, f64) {
     const LETTER: f64 = 6.6;
     const LINE: f64 = 18.0;
-    let mut names: Vec<(&str, String)> =
-        runs.iter().enumerate().map(|(i, label)| (*label, format!("c{}", i % COLOURS.len()))).collect();
+    let mut names: Vec<(&str, String)> = runs.iter().enumerate().map(|(i, label)| (*label, class(i))).collect();
     for label in references {
         if !names.iter().any(|(name, _)| name == label) {
             names.push((label, "reference".into()));
@@ -151,6 +158,7 @@ fn style() -> String {
          .panel{font-size:12px}\n.tick{font-size:11px}\n.label{font-size:11.5px}\n.value{font-size:11px;font-weight:600;paint-order:stroke;stroke:#fff;stroke-width:3px}\n\
          .grid{stroke:#d8dee4;stroke-width:1}\n.axis{stroke:#6e7781;fill:none}\n\
          .line{fill:none;stroke-width:2;stroke-linejoin:round}\n\
+         .line.dotted{stroke-dasharray:2 3}\n.line.dash-dot{stroke-dasharray:9 3 2 3}\n\
          .line.reference{stroke:#6e7781;stroke-dasharray:6 4}\n.dot.reference,.value.reference{fill:#6e7781}\n",
     );
     let colours = |css: &mut String, pick: fn(&(&'static str, &'static str)) -> &'static str| {
@@ -241,6 +249,17 @@ mod tests {
         assert_eq!(over_time.matches("<circle").count(), 3);
         let ends: Vec<usize> = ["200 steps", "400 steps", "800 steps"].map(|s| over_time.find(s).expect(s)).into();
         assert!(ends.is_sorted(), "{over_time}");
+    }
+
+    #[test]
+    fn labels_of_one_colour_differ_in_their_stroke() {
+        let runs: Vec<ResultLine> =
+            (0..8).map(|n| line(&format!("run {n}"), "fox", &[(1.0, 15.0), (5.0, 22.0)])).collect();
+        let svg = chart(&runs, &[]);
+        for class in ["line c1\"", "line c1 dotted\""] {
+            // In the legend, and in the panels over time and over splats.
+            assert!(svg.matches(class).count() >= 2, "{class}");
+        }
     }
 
     #[test]

@@ -18,18 +18,27 @@ pub struct Averaged {
     pub spread: f64,
 }
 
-/// The mean over seeds for each scene and label, in order of first appearance, and each configuration that the last line's commit ran. Of
-/// several lines with the same seed the last one counts. Lines without a seed (references) are not averaged.
+/// The mean over seeds for each scene and label, in order of first appearance, and each configuration that the last line's commit ran, or that
+/// differs from the last line in its steps alone. A configuration's lines are those of the last commit that ran it: a longer run added
+/// later extends a curve, and does not replace it. Of several lines with the same seed the last one counts. Lines without a seed
+/// (references) are not averaged.
 pub fn averaged(lines: &[ResultLine]) -> Vec<Averaged> {
     let same = |a: &ResultLine, b: &ResultLine| a.scene == b.scene && a.label == b.label;
     let firsts = lines.iter().enumerate().filter(|(i, line)| !lines[..*i].iter().any(|before| same(before, line)));
     let runs = |(_, first): (usize, &ResultLine)| -> Vec<Averaged> {
-        let last = lines.iter().rfind(|line| same(line, first)).expect("the first line matches");
+        let all: Vec<&ResultLine> = lines.iter().filter(|line| same(line, first)).collect();
+        let last = *all.last().expect("the first line matches");
         if last.seed.is_none() {
             return vec![mean(last, &[last], String::new())];
         }
-        let of_run = |line: &&ResultLine| same(line, last) && line.commit == last.commit && line.seed.is_some();
-        let all: Vec<&ResultLine> = lines.iter().filter(of_run).collect();
+        let newest = |line: &ResultLine| {
+            let commit = all.iter().rfind(|other| settings(other) == settings(line)).map(|other| &other.commit);
+            commit == Some(&line.commit)
+        };
+        let by_steps = |line: &ResultLine| line.steps.is_some() && settings(line)[1..] == settings(last)[1..];
+        let of_run =
+            |line: &&&ResultLine| line.seed.is_some() && newest(line) && (line.commit == last.commit || by_steps(line));
+        let all: Vec<&ResultLine> = all.iter().filter(of_run).copied().collect();
         let new = |(i, line): (usize, &&ResultLine)| !all[..i].iter().any(|before| settings(before) == settings(line));
         let distinct: Vec<&ResultLine> =
             all.iter().enumerate().filter(|&(i, line)| new((i, line))).map(|(_, line)| *line).collect();
@@ -152,14 +161,15 @@ mod tests {
     }
 
     #[test]
-    fn configurations_of_a_commit_are_kept_apart() {
+    fn configurations_are_kept_apart() {
         let with = |commit: &str, steps: u32, budget: u32, seed: u64, psnr: f64| ResultLine {
             steps: Some(steps),
             budget: Some(budget),
             ..of_seed(commit, seed, psnr)
         };
         let lines = [
-            with("old", 900, 12, 0, 50.0),
+            with("old", 900, 13, 0, 60.0),
+            with("old", 400, 12, 0, 60.0),
             with("new", 400, 12, 0, 20.0),
             with("new", 800, 12, 0, 30.0),
             with("new", 400, 12, 1, 22.0),
@@ -168,8 +178,12 @@ mod tests {
         let found = averaged(&lines);
         let found: Vec<_> = found.iter().map(|run| (&*run.variant, run.seeds, run.line.psnr)).collect();
         assert_eq!(found, [("400 steps", 2, 21.0), ("800 steps", 1, 31.0)]);
-        let one = averaged(&lines[..2]);
+        let one = averaged(&lines[..1]);
         assert_eq!((one.len(), &*one[0].variant), (1, ""));
+        let longer = [&lines[..], &[with("newer", 1600, 12, 0, 33.0)]].concat();
+        let found = averaged(&longer);
+        let found: Vec<_> = found.iter().map(|run| (&*run.variant, run.seeds, run.line.psnr)).collect();
+        assert_eq!(found, [("400 steps", 2, 21.0), ("800 steps", 1, 31.0), ("1600 steps", 1, 33.0)]);
     }
 
     #[test]

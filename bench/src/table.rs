@@ -7,7 +7,7 @@ use crate::{Averaged, ResultLine, averaged, scenes};
 const BEGIN: &str = "<!-- bench:begin -->";
 const END: &str = "<!-- bench:end -->";
 /// Maximum number of rows of [`short_table`].
-const SHORT_ROWS: usize = 13;
+const SHORT_ROWS: usize = 15;
 
 /// The latest runs of each scene and label, references (lines with a source) first; of several seeds the mean, with the
 /// range of PSNR. The column of times has the CPU seconds to the reference's best PSNR, and the speed-up over the reference.
