@@ -26,6 +26,7 @@ pub mod parquet;
 pub mod ply;
 pub mod poses;
 pub mod random;
+pub mod sog;
 pub mod splats;
 pub mod spz;
 pub mod transforms;
