@@ -97,6 +97,21 @@ impl Ground {
         Self { ground_from_world, min: centre - 0.5 * edge_metres, edge_metres, height_metres: mid_height, near_metres }
     }
 
+    /// The ground under places whose up is z, without background: its root is the square around the 1st to 99th percentiles.
+    pub fn around(places: &[DVec3]) -> Self {
+        let near: Vec<DVec3> = places.iter().copied().filter(|p| p.abs().max_element() < FAR_METRES).collect();
+        let (min, max) = robust_box(&near, |p| p).unwrap_or((DVec3::ZERO, DVec3::ONE));
+        let (centre, extent) = (0.5 * (min + max).truncate(), (max - min).truncate().max_element());
+        let edge_metres = if extent > 1e-6 * (1.0 + centre.abs().max_element()) { extent } else { 1.0 };
+        Self {
+            ground_from_world: DQuat::IDENTITY,
+            min: centre - 0.5 * edge_metres,
+            edge_metres,
+            height_metres: 0.5 * (min.z + max.z),
+            near_metres: f64::MAX,
+        }
+    }
+
     /// Transforms world coordinates to ground coordinates, metres.
     pub fn from_world(&self, world: DVec3) -> DVec3 {
         self.ground_from_world * world

@@ -12,6 +12,7 @@
 
 mod block_box;
 mod budgets;
+pub mod cells;
 mod cost;
 mod coverage;
 pub mod cut;
@@ -36,6 +37,7 @@ mod view_selection;
 mod visibility;
 
 pub use budgets::initial_splats;
+pub use cells::Cells;
 pub use cost::{StepCost, trained_splats};
 pub use cut::{cut, keep_core, merge, merge_cut};
 pub use density::{Density, densities};

@@ -133,6 +133,11 @@ fn a_city_is_trained_measured_and_exported_reproducibly() {
     assert_eq!(again["psnr"], measured["psnr"], "merged.ply differs from the model");
     done(at, &["export", "one", "--to", "ply", "--out", "deep/er/city.ply"]);
     assert!(bytes("deep/er/city.ply") == bytes("one/merged.ply"));
+    let streamed = done(at, &["export", "one", "--to", "sog", "--out", "streamed"]);
+    let merged = scene::ply::read(&bytes("one/merged.ply")).unwrap().len();
+    assert_eq!((&streamed["splats"], &streamed["levels"]), (&merged.into(), &2.into()));
+    assert!(text("streamed/lod-meta.json").contains("\"lodLevels\": 2"));
+    refused(at, &["export", "one", "--to", "sog", "--out", "streamed"], "streamed");
 
     // Rendering needs cameras, but no photos.
     std::fs::remove_dir_all(at.join("city/images")).unwrap();

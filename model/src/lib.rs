@@ -18,6 +18,7 @@ mod files;
 mod manifest;
 mod read;
 mod rewrite;
+mod streamed_sog;
 mod write;
 
 use std::path::{Path, PathBuf};
@@ -30,6 +31,7 @@ pub use files::save_json;
 pub use manifest::{BlockEntry, Manifest};
 pub use read::{Tree, read, read_tree};
 pub use rewrite::{check_out, rewrite};
+pub use streamed_sog::{Exported, write_streamed_sog};
 pub use write::{Written, write};
 
 /// Comment in a model's PLY that says: draw it with opacity compensation.

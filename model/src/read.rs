@@ -1,11 +1,13 @@
 //! Reads a model as one set of splats, or block by block.
 
+use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::convert::Infallible;
 use std::path::{Path, PathBuf};
 
-use blocks::{Cut, Plan};
-use scene::{BLOCK_ATTRIBUTE, BadInput, BlockId, CodecError, Exposures, Poses, Splats, frame, ply, spz};
+use blocks::{Cut, Ground, Mode, Plan};
+use glam::DVec3;
+use scene::{BLOCK_ATTRIBUTE, BadInput, BlockId, CodecError, Exposures, GeoOrigin, Poses, Splats, frame, ply, spz};
 
 use crate::files::{EXPOSURES_FILE, MANIFEST_FILE, PLAN_FILE, POSES_FILE, block_file, damaged, load};
 use crate::manifest::{Manifest, VERSION};
@@ -59,6 +61,81 @@ fn read_trained(folder: &Path) -> Result<Model, BadInput> {
     };
     let antialiased = manifest.antialiased;
     Ok(Model { splats, antialiased, exposures, poses, trained: Some((manifest, out.to_path_buf())) })
+}
+
+/// A model whose blocks are read one at a time. A file is one block.
+pub(crate) enum Opened {
+    Trained { folder: PathBuf, manifest: Box<Manifest>, plan: Box<Plan> },
+    File { model: Box<Model>, ground: Ground },
+}
+
+/// Opens a model as [`read`] does.
+///
+/// # Errors
+/// As [`read`].
+pub(crate) fn open(path: &Path) -> Result<Opened, BadInput> {
+    if let Some(folder) = trained_folder(path) {
+        let (manifest, plan) = read_plan(&folder)?;
+        return Ok(Opened::Trained { folder, manifest: Box::new(manifest), plan: Box::new(plan) });
+    }
+    let model = read(path)?;
+    let places: Vec<DVec3> = (0..model.splats.len()).map(|i| model.splats.mean(i).as_dvec3()).collect();
+    let ground = Ground::around(&places);
+    Ok(Opened::File { model: Box::new(model), ground })
+}
+
+impl Opened {
+    /// Ids of the blocks, parents before children.
+    pub(crate) fn blocks(&self) -> Vec<BlockId> {
+        match self {
+            Self::Trained { plan, .. } => plan.tasks.iter().map(|task| task.block).collect(),
+            Self::File { .. } => vec![BlockId::ROOT],
+        }
+    }
+
+    /// The splats of a block, halo included.
+    pub(crate) fn splats(&self, block: BlockId) -> Result<Cow<'_, Splats>, BadInput> {
+        match self {
+            Self::Trained { folder, .. } => read_block(folder, block).map(Cow::Owned),
+            Self::File { model, .. } => Ok(Cow::Borrowed(&model.splats)),
+        }
+    }
+
+    /// The finest cut.
+    pub(crate) fn leaves(&self) -> Cut {
+        match self {
+            Self::Trained { plan, .. } => plan.leaves(),
+            Self::File { .. } => [BlockId::ROOT].into_iter().collect(),
+        }
+    }
+
+    pub(crate) fn ground(&self) -> Ground {
+        match self {
+            Self::Trained { plan, .. } => plan.ground,
+            Self::File { ground, .. } => *ground,
+        }
+    }
+
+    pub(crate) fn mode(&self) -> Mode {
+        match self {
+            Self::Trained { plan, .. } => plan.settings.mode,
+            Self::File { .. } => Mode::Whole,
+        }
+    }
+
+    pub(crate) fn antialiased(&self) -> bool {
+        match self {
+            Self::Trained { manifest, .. } => manifest.antialiased,
+            Self::File { model, .. } => model.antialiased,
+        }
+    }
+
+    pub(crate) fn geo_origin(&self) -> Option<GeoOrigin> {
+        match self {
+            Self::Trained { manifest, .. } => manifest.geo_origin,
+            Self::File { .. } => None,
+        }
+    }
 }
 
 /// A trained model block by block.

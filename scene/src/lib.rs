@@ -19,6 +19,7 @@ pub mod kitti;
 pub mod kitti360;
 pub mod kitti_raw;
 pub mod lidar;
+pub mod morton;
 pub mod npy;
 pub mod nuscenes;
 pub mod opensfm;

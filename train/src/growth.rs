@@ -13,7 +13,7 @@ use render::Gradients;
 use scene::{Splats, column};
 use serde::{Deserialize, Serialize};
 
-use crate::morton;
+use scene::morton;
 
 /// The densification schedule.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]

@@ -18,7 +18,6 @@ mod job;
 pub mod loss;
 pub mod low_pass;
 pub mod metrics;
-mod morton;
 pub mod optimiser;
 mod pose;
 pub mod prune;

@@ -167,6 +167,8 @@ pub(crate) enum Format {
     Ply,
     /// Niantic's SPZ, version 3: a tenth of the size, quantised
     Spz,
+    /// A folder of streamed SOG, which PlayCanvas, SuperSplat and Babylon load piece by piece, with the model's levels of detail
+    Sog,
 }
 
 #[derive(Debug, Clone, Args)]
@@ -176,7 +178,7 @@ pub(crate) struct ExportArgs {
     /// Format
     #[arg(long, value_enum)]
     pub(crate) to: Format,
-    /// File to write
+    /// File to write; for sog a new folder
     #[arg(long, value_name = "PATH")]
     pub(crate) out: PathBuf,
 }

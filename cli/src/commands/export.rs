@@ -13,27 +13,55 @@ use crate::output::Output;
 struct Exported<'a> {
     command: &'static str,
     out: &'a Path,
-    splats: usize,
+    splats: u64,
     bytes: u64,
-    antialiased: bool,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    antialiased: Option<bool>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    levels: Option<u8>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    files: Option<usize>,
 }
 
 pub(crate) fn run(args: &ExportArgs, output: &Output) -> Result<(), Failure> {
-    let model = model::read(&args.model)?;
-    let bytes = match args.to {
-        Format::Ply => model.to_ply(),
-        Format::Spz => model.to_spz()?,
+    let exported = match args.to {
+        Format::Ply | Format::Spz => file(args)?,
+        Format::Sog => folder(args, output)?,
     };
+    let text = format!("{} splats, {} bytes\n{}", exported.splats, exported.bytes, args.out.display());
+    output.result(&exported, &text)
+}
+
+fn file(args: &ExportArgs) -> Result<Exported<'_>, Failure> {
+    let model = model::read(&args.model)?;
+    let bytes = if args.to == Format::Spz { model.to_spz()? } else { model.to_ply() };
     if let Some(folder) = args.out.parent().filter(|folder| !folder.as_os_str().is_empty()) {
         make_folder(folder)?;
     }
     save(&args.out, &bytes)?;
-    let exported = Exported {
+    Ok(Exported {
         command: "export",
         out: &args.out,
-        splats: model.splats.len(),
+        splats: model.splats.len() as u64,
         bytes: bytes.len() as u64,
-        antialiased: model.antialiased,
-    };
-    output.result(&exported, &format!("{} splats, {} bytes\n{}", exported.splats, bytes.len(), args.out.display()))
+        antialiased: Some(model.antialiased),
+        levels: None,
+        files: None,
+    })
+}
+
+fn folder<'a>(args: &'a ExportArgs, output: &Output) -> Result<Exported<'a>, Failure> {
+    let mut progress = None;
+    let written = model::write_streamed_sog(&args.model, &args.out, &mut |done, all| {
+        progress.get_or_insert_with(|| output.progress("blocks", all as u64)).at(done as u64, "");
+    })?;
+    Ok(Exported {
+        command: "export",
+        out: &args.out,
+        splats: written.splats,
+        bytes: written.bytes,
+        antialiased: None,
+        levels: Some(written.levels),
+        files: Some(written.files),
+    })
 }

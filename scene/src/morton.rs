@@ -1,7 +1,7 @@
 //! Sorts points along a Morton curve, so that neighbours in space are near each other in memory.
 
 /// Row indices of three coordinate columns, sorted along a Morton curve with 10 bits per axis.
-pub(crate) fn order(columns: [&[f32]; 3]) -> Vec<u32> {
+pub fn order(columns: [&[f32]; 3]) -> Vec<u32> {
     let n = columns[0].len();
     let spread = |v: u32| {
         // Two zero bits between the bits of a ten-bit number.
