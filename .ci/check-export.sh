@@ -1,0 +1,39 @@
+#!/usr/bin/env bash
+# Whether others read what `plat export` writes: a small tree as streamed SOG, opened by PlayCanvas' splat-transform, which counts its levels
+# and writes each back as PLY; the finest must look as the model does. Fetches it, and the Node that it wants, into a folder of its own. PLAT
+# names the program; without it, it is built.
+set -euo pipefail
+cd "$(dirname "${BASH_SOURCE[0]}")/.."
+
+scratch=$(mktemp -d)
+trap 'rm -rf "$scratch"' EXIT
+plat() { if [[ -n "${PLAT:-}" ]]; then "$PLAT" --quiet "$@"; else cargo run --release --locked --quiet -- --quiet "$@"; fi; }
+plat synth --out "$scratch/city" --area-km2 0.05 --views 48 --size 160x90
+plat train "$scratch/city" --out "$scratch/model" --levels 1 --residual 0 --steps 600
+plat export "$scratch/model" --to sog --out "$scratch/sog"
+
+npm install --silent --no-audit --no-fund --prefix "$scratch/npm" node@22 @playcanvas/splat-transform@3.7.0
+transform() { "$scratch/npm/node_modules/node/bin/node" "$scratch/npm/node_modules/@playcanvas/splat-transform/bin/cli.mjs" --gpu cpu "$@" 2>"$scratch/log" || { cat "$scratch/log" >&2; return 1; }; }
+transform "$scratch/sog/lod-meta.json" --info json null >"$scratch/info"
+python3 - "$scratch/sog/lod-meta.json" "$scratch/info" <<'PYTHON'
+import json, sys
+
+ours, text = json.load(open(sys.argv[1])), open(sys.argv[2]).read()
+theirs = json.loads(text[text.index("{") : text.rindex("}") + 1])
+print("splat-transform:", theirs)
+assert theirs["lodCounts"] == ours["counts"] and theirs["numLods"] == ours["lodLevels"] == 2, ours["counts"]
+assert theirs["shBands"] == 3 and ours["counts"][0] > ours["counts"][1] > 0, ours["counts"]
+PYTHON
+# The environment is not part of a level: the model is compared with all of both.
+for level in 0 1; do
+    transform "$scratch/sog/lod-meta.json" --select-lod "$level" "$scratch/$level.ply"
+    transform "$scratch/$level.ply" "$scratch/sog/env/meta.json" "$scratch/whole-$level.ply"
+done
+psnr() { plat eval "$1" "$scratch/city" --json | tail -1 | python3 -c 'import json, sys; print(json.load(sys.stdin)["psnr"])'; }
+python3 - "$(psnr "$scratch/model")" "$(psnr "$scratch/whole-0.ply")" "$(psnr "$scratch/whole-1.ply")" <<'PYTHON'
+import sys
+
+model, finest, coarsest = map(float, sys.argv[1:])
+print(f"PSNR of the model {model:.2f} dB, of the finest level {finest:.2f} dB, of the coarsest {coarsest:.2f} dB")
+assert model - 0.3 < finest < model + 0.3 and coarsest < finest
+PYTHON
