@@ -30,7 +30,7 @@ const STROKES: [&str; 3] = ["", " dotted", " dash-dot"];
 /// A scene and its panels.
 type Row<'a> = (&'a str, Vec<(Measure, Vec<Series>)>);
 
-/// Draws the latest run of each scene and label (of several seeds the mean), and the references dashed. A label with one configuration
+/// Draws the runs of each scene and label that [`averaged`] keeps (of several seeds the mean), and the references dashed. A label with one configuration
 /// is drawn as its curve over time; with several, as one point each, joined by a line. Measures without values have no panel, scenes
 /// without runs and references no row.
 pub fn chart(lines: &[ResultLine], reference: &[ResultLine]) -> String {

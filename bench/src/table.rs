@@ -9,7 +9,7 @@ const END: &str = "<!-- bench:end -->";
 /// Maximum number of rows of [`short_table`].
 const SHORT_ROWS: usize = 15;
 
-/// The latest runs of each scene and label, references (lines with a source) first; of several seeds the mean, with the
+/// The runs of each scene and label that [`averaged`] keeps, references (lines with a source) first; of several seeds the mean, with the
 /// range of PSNR. The column of times has the CPU seconds to the reference's best PSNR, and the speed-up over the reference.
 pub fn table(lines: &[ResultLine]) -> String {
     let runs = averaged(lines);

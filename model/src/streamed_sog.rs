@@ -1,4 +1,4 @@
-//! Writes a model as streamed SOG, which PlayCanvas, SuperSplat and Babylon load piece by piece.
+//! Writes a model as streamed SOG, the format of PlayCanvas and SuperSplat that is loaded piece by piece.
 //!
 //! ```text
 //! OUT/lod-meta.json       the tree; written last, so that a folder without it is incomplete

@@ -167,7 +167,7 @@ pub(crate) enum Format {
     Ply,
     /// Niantic's SPZ, version 3: a tenth of the size, quantised
     Spz,
-    /// A folder of streamed SOG, which PlayCanvas, SuperSplat and Babylon load piece by piece, with the model's levels of detail
+    /// A folder of streamed SOG, the format of PlayCanvas and SuperSplat, with the model's levels of detail
     Sog,
 }
 
