@@ -10,10 +10,8 @@
 
 use glam::{Mat3, Quat, Vec3};
 use render::Gradients;
-use scene::{Splats, column};
+use scene::{Splats, column, morton};
 use serde::{Deserialize, Serialize};
-
-use scene::morton;
 
 /// The densification schedule.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]

@@ -2,11 +2,10 @@
 
 use glam::{DMat3, DQuat, DVec3, Vec3};
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
-use scene::{SparsePoints, Splat, Splats};
+use scene::{SparsePoints, Splat, Splats, morton};
 
 use crate::source::{self, WindowSource};
 use crate::view::TrainView;
-use scene::morton;
 
 /// Number of neighbours whose mean distance sizes a splat, as in 3DGS.
 const NEIGHBOURS: usize = 3;
