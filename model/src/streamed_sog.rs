@@ -111,7 +111,7 @@ struct Leaf {
 /// that are done and that of all.
 ///
 /// # Errors
-/// A path that holds no model, a folder that is not empty, a file that cannot be written.
+/// A path that holds no model, a splat that is not finite, a folder that is not empty, a file that cannot be written.
 pub fn write_streamed_sog(
     path: &Path,
     out: &Path,
@@ -128,6 +128,10 @@ pub fn write_streamed_sog(
     let mut writer = Writer::new(out, opened.ground(), &opened.leaves(), deepest, opened.antialiased());
     for (done, &block) in blocks.iter().rev().enumerate() {
         let splats = opened.splats(block)?;
+        if let Some(row) = (0..splats.len()).find(|&row| !splats.is_finite(row)) {
+            let problem = format!("has numbers that are not finite, in splat {row} of block {block}");
+            return Err(BadInput::new(path.display().to_string(), problem, "repair the model or train it again").into());
+        }
         writer.add(block, &splats)?;
         report(done + 1, blocks.len());
     }
@@ -162,12 +166,11 @@ impl<'a> Writer<'a> {
         }
     }
 
-    /// Adds the splats of a block, halo included. Blocks come from the deepest level up.
+    /// Adds the splats of a block, halo included; all are finite. Blocks come from the deepest level up.
     fn add(&mut self, block: BlockId, splats: &Splats) -> Result<(), ModelError> {
         let place = |i: u32| splats.mean(i as usize).as_dvec3();
-        let (background, near): (Vec<u32>, Vec<u32>) = (0..splats.len() as u32)
-            .filter(|&i| place(i).is_finite())
-            .partition(|&i| self.ground.is_background(place(i)));
+        let (background, near): (Vec<u32>, Vec<u32>) =
+            (0..splats.len() as u32).partition(|&i| self.ground.is_background(place(i)));
         if block == BlockId::ROOT && !background.is_empty() {
             let rows = in_z_order(splats, &background);
             let files = sog::write(&splats.select(&rows), self.antialiased).map_err(|error| bad(block, &error))?;

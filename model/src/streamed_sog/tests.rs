@@ -164,4 +164,10 @@ fn what_cannot_be_exported_is_named() {
     assert!(exported.splats == 105 && out.join(META).is_file());
     let again = write_streamed_sog(&model, &out, &mut |_, _| ()).unwrap_err().to_string();
     assert!(again.contains("is not empty"), "{again}");
+    let mut broken = splats_of(0, 8.0);
+    broken.columns_mut()[column::OPACITY][7] = f32::NAN;
+    std::fs::write(&model, scene::ply::write(&broken, &[])).unwrap();
+    let out = folder.path().join("broken");
+    let refused = write_streamed_sog(&model, &out, &mut |_, _| ()).unwrap_err().to_string();
+    assert!(refused.contains("a.ply") && refused.contains("splat 7") && !out.exists(), "{refused}");
 }
