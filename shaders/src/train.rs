@@ -30,11 +30,14 @@ pub const DENSIFICATION_STATS: Stage = Stage::new(
     &[VIEW, TRAIN, include_str!("../wgsl/densification_stats.wgsl")],
     &["densification_stats"],
 );
+/// `rearrange.wgsl`
+pub const REARRANGE: Stage =
+    Stage::new("rearrange", &[VIEW, TRAIN, include_str!("../wgsl/rearrange.wgsl")], &["rearrange"]);
 /// `pose.wgsl`
 pub const POSE: Stage =
     Stage::new("pose", &[VIEW, TRAIN, SUM, POWER, include_str!("../wgsl/pose.wgsl")], &["pose_step"]);
 /// Every stage of training.
-pub const STAGES: &[Stage] = &[LOSS, ADAM, EXPOSURE, POSE, DENSIFICATION_STATS];
+pub const STAGES: &[Stage] = &[LOSS, ADAM, EXPOSURE, POSE, DENSIFICATION_STATS, REARRANGE];
 
 /// Counters and losses that stay on the device between steps.
 ///
@@ -114,6 +117,23 @@ pub struct Photos {
     pub padding: [u32; 2],
     /// The photos; only the first `count` are defined.
     pub photo: [Photo; MAX_VIEWS],
+}
+
+/// Old row of a row that continues none, see `rearrange.wgsl`.
+pub const NO_ROW: u32 = u32::MAX;
+
+/// Constants of a rearrangement of rows. Uniform.
+#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
+#[repr(C)]
+pub struct RearrangeConstants {
+    /// Number of rows after it.
+    pub rows: u32,
+    /// Number of columns of the bank.
+    pub columns: u32,
+    /// Elements from one column to the next.
+    pub stride: u32,
+    /// Padding.
+    pub padding: u32,
 }
 
 /// Constants of a step of the exposures. Uniform.

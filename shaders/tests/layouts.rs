@@ -5,7 +5,9 @@ use std::mem::offset_of;
 
 use naga::valid::{Capabilities, ValidationFlags, Validator};
 use naga::{Module, TypeInner};
-use shaders::train::{self, AdamConstants, ExposureConstants, GivenPose, OptimiserState, Photo, Photos, PoseConstants};
+use shaders::train::{
+    self, AdamConstants, ExposureConstants, GivenPose, OptimiserState, Photo, Photos, PoseConstants, RearrangeConstants,
+};
 use shaders::{
     HALF, PassConstants, RASTERIZE_BACKWARD_ATOMICS, STAGES, SUBGROUPS, SplatSet, Stage, Status, UpstreamPlanes, View,
     Views,
@@ -35,6 +37,7 @@ fn rust_layouts() -> BTreeMap<&'static str, Layout> {
         layout!(Photo: width, height, tiles_x, tiles_y, first_tile, first_pixel, first_byte, masked,
             first_weight, first_depth, exposure, padding),
         layout!(Photos: count, tiles, lambda, share_weighted, extras, depth_weight, padding, photo),
+        layout!(RearrangeConstants: rows, columns, stride, padding),
         layout!(ExposureConstants: rows, rate, padding),
         layout!(GivenPose: rows, translation_rate, padding),
         layout!(PoseConstants: rate, decay, spread, cameras, views, is_anchored, padding, row),

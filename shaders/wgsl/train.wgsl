@@ -81,6 +81,17 @@ struct AdamConstants {
     padding: vec2<u32>,
 }
 
+// Constants of a rearrangement of rows.
+struct RearrangeConstants {
+    // Rows after it.
+    rows: u32,
+    // Columns of the bank.
+    columns: u32,
+    // Elements from one column to the next.
+    stride: u32,
+    padding: u32,
+}
+
 // Constants of a step of the exposures.
 struct ExposureConstants {
     // Number of exposures.

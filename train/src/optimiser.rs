@@ -114,9 +114,11 @@ impl Adam {
     /// Reorders the moments after densification: new row `i` takes the moments of old row `rows[i]`, or zeros for
     /// `None`.
     pub fn rearrange(&mut self, rows: &[Option<u32>]) {
-        let pick = |column: &Vec<f32>| rows.iter().map(|row| row.map_or(0.0, |i| column[i as usize])).collect();
-        self.first = self.first.iter().map(pick).collect();
-        self.second = self.second.iter().map(pick).collect();
+        for columns in [&mut self.first, &mut self.second] {
+            columns.par_iter_mut().for_each(|column| {
+                *column = rows.iter().map(|row| row.map_or(0.0, |i| column[i as usize])).collect();
+            });
+        }
     }
 }
 

@@ -327,7 +327,7 @@ impl<'a> Trainer<'a> {
             && state.step < steps
         {
             let target = growth.target(state.step, steps, state.start_count, budget);
-            self.device.download(state, StatePart::All)?;
+            self.device.download(state, StatePart::Densification)?;
             let keeps = |place| keeps(place) && free_space.is_none_or(|free| !free.contains(place));
             let (mut grown, rows, _) =
                 growth::refine(&state.splats, &mut state.densification, growth, target, counts, &keeps);
@@ -335,8 +335,7 @@ impl<'a> Trainer<'a> {
                 free.clip(&mut grown);
             }
             state.splats = grown;
-            state.adam.rearrange(&rows);
-            self.device.upload(state, StatePart::All)?;
+            self.device.rearrange(state, &rows)?;
         }
         Ok(())
     }

@@ -199,6 +199,11 @@ impl GpuRenderer {
         &self.gradients
     }
 
+    /// The same columns, to exchange them for others of their stride and degree: the next backward pass overwrites them.
+    pub fn gradients_mut(&mut self) -> &mut Columns {
+        &mut self.gradients
+    }
+
     /// For each visible entry of a trainable splat four floats: `screen_gradient`, `screen_gradient_abs` and `weight`
     /// of [`Gradients`](crate::Gradients) in that view, and the view's number of pixels.
     pub fn statistics(&self) -> &wgpu::Buffer {

@@ -121,6 +121,11 @@ impl TrainDevice for CpuDevice<'_> {
     fn upload(&mut self, _: &State, _: StatePart) -> Result<(), TrainError> {
         Ok(())
     }
+
+    fn rearrange(&mut self, state: &mut State, rows: &[Option<u32>]) -> Result<(), TrainError> {
+        state.adam.rearrange(rows);
+        Ok(())
+    }
 }
 
 /// Number of visible splats.

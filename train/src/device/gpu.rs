@@ -20,8 +20,11 @@ use bytemuck::Zeroable;
 use render::cpu::Isa;
 use render::gpu::{Buffer, Columns, Gpu, GpuError, GpuRenderer, GpuSplats, GrowableBuffer, Kernel, UpstreamPlanes};
 use scene::{Camera, Splats, column};
-use shaders::train::{ADAM, AdamConstants, DENSIFICATION_STATS, LOSS, OptimiserState, Photo, Photos};
-use shaders::{MAX_VIEWS, TILE, args};
+use shaders::train::{
+    ADAM, AdamConstants, DENSIFICATION_STATS, LOSS, NO_ROW, OptimiserState, Photo, Photos, REARRANGE,
+    RearrangeConstants,
+};
+use shaders::{MAX_VIEWS, TILE, WORKGROUP_SIZE, args};
 
 use self::exposures::{GpuExposures, LossBuffers};
 use self::poses::GpuPoses;
@@ -81,6 +84,7 @@ struct Kernels {
     stats: Kernel,
     adam_shape: Kernel,
     adam_colour: Kernel,
+    rearrange: Kernel,
 }
 
 impl GpuDevice {
@@ -100,6 +104,7 @@ impl GpuDevice {
             stats: g.kernel(&DENSIFICATION_STATS, "densification_stats")?,
             adam_shape: g.kernel(&ADAM, "adam_shape")?,
             adam_colour: g.kernel(&ADAM, "adam_colour")?,
+            rearrange: g.kernel(&REARRANGE, "rearrange")?,
         };
         let moments = || Columns::new(g, "moments", 0, 0);
         let mut device = Self {
@@ -305,6 +310,43 @@ impl GpuDevice {
         }
     }
 
+    /// Copies Adam's state to the host.
+    fn download_adam(&self, optimiser: &OptimiserState) -> Result<Adam, GpuError> {
+        let [first, second] = self.moments.each_ref().map(|moments| moments.read(&self.gpu, self.splats.len()));
+        Ok(Adam::from_parts(Isa::detect(), optimiser.adam_steps as i32, first?, second?))
+    }
+
+    /// Moves the rows of both moments as [`TrainDevice::rearrange`] says. The gradients' columns are free between steps:
+    /// each moment is written there, and its old columns take their place.
+    fn rearrange_moments(&mut self, rows: &[Option<u32>]) -> Result<(), GpuError> {
+        let gpu = &*self.gpu;
+        let old_rows: Vec<u32> = rows.iter().map(|row| row.unwrap_or(NO_ROW)).collect();
+        let row_buffer = gpu.buffer("old rows", 4 * rows.len().max(1) as u64)?;
+        gpu.upload(&row_buffer, 0, &old_rows)?;
+        for moments in &mut self.moments {
+            let columns = column::SH + 3 * scene::splats::sh_coefficients(moments.sh_degree());
+            let mut encoder = gpu.encoder();
+            {
+                let pass = &mut encoder.begin_compute_pass(&wgpu::ComputePassDescriptor::default());
+                let (before, after) = (moments.banks(), self.renderer.gradients().banks());
+                for bank in (0..4).filter(|&bank| columns > BANKS[bank]) {
+                    let constants = gpu.uniform(&RearrangeConstants {
+                        rows: rows.len() as u32,
+                        columns: (columns.min(BANKS[bank + 1]) - BANKS[bank]) as u32,
+                        stride: moments.stride() as u32,
+                        padding: 0,
+                    });
+                    let bindings = [(0, &constants), (1, &*row_buffer), (2, before[bank]), (3, after[bank])];
+                    let groups = (rows.len() as u32).div_ceil(WORKGROUP_SIZE);
+                    self.kernels.rearrange.run(gpu, pass, &bindings, groups);
+                }
+            }
+            gpu.submit(encoder)?;
+            std::mem::swap(moments, self.renderer.gradients_mut());
+        }
+        Ok(())
+    }
+
     /// Waits until all submitted steps are finished, resubmitting those that did not fit the pair buffer.
     fn synchronise(&mut self) -> Result<OptimiserState, GpuError> {
         loop {
@@ -347,12 +389,11 @@ impl TrainDevice for GpuDevice {
             state.exposures = self.exposures.download(&self.gpu)?;
             state.poses = self.poses.download(&self.gpu)?;
         }
+        if part >= StatePart::Densification {
+            state.densification = DensificationStats { error: self.gpu.read(&self.stats, 0, self.splats.len())? };
+        }
         if part >= StatePart::All {
-            let (gpu, n) = (&*self.gpu, self.splats.len());
-            let [first, second] = &self.moments;
-            let (first, second) = (first.read(gpu, n)?, second.read(gpu, n)?);
-            state.adam = Adam::from_parts(Isa::detect(), optimiser.adam_steps as i32, first, second);
-            state.densification = DensificationStats { error: gpu.read(&self.stats, 0, n)? };
+            state.adam = self.download_adam(&optimiser)?;
         }
         Ok(())
     }
@@ -367,6 +408,25 @@ impl TrainDevice for GpuDevice {
             self.splats.replace(&state.splats)?;
             self.upload_training_state(state)?;
         }
+        Ok(())
+    }
+
+    fn rearrange(&mut self, state: &mut State, rows: &[Option<u32>]) -> Result<(), TrainError> {
+        let optimiser = self.synchronise()?;
+        let (moments, gradients) = (&self.moments[0], self.renderer.gradients());
+        let has_room = state.splats.len() <= moments.stride()
+            && (gradients.stride(), gradients.sh_degree()) == (moments.stride(), moments.sh_degree());
+        if !has_room {
+            // Columns must be allocated anew: by way of the host, where there is room for both.
+            state.adam = self.download_adam(&optimiser)?;
+            state.adam.rearrange(rows);
+            return self.upload(state, StatePart::All);
+        }
+        self.splats.replace(&state.splats)?;
+        self.rearrange_moments(rows)?;
+        let stride = self.splats.columns().stride();
+        let error = state.densification.error.iter().copied().chain(iter::repeat(0.0));
+        self.gpu.upload(&self.stats, 0, &error.take(stride).collect::<Vec<f32>>())?;
         Ok(())
     }
 }

@@ -53,6 +53,8 @@ pub(crate) enum StatePart {
     Tally,
     /// The splats, and the exposures and poses in training.
     Splats,
+    /// The densification statistics.
+    Densification,
     /// Everything that the next step depends on.
     All,
 }
@@ -69,4 +71,9 @@ pub(crate) trait TrainDevice {
     /// Copies a part of the state to the device. The host has downloaded the same part before, with no step in between, and then
     /// changed it.
     fn upload(&mut self, state: &State, part: StatePart) -> Result<(), TrainError>;
+
+    /// Takes over the state's splats and densification statistics, which the host has refined since it downloaded
+    /// [`StatePart::Densification`], with no step in between. Row `i` of the splats keeps the Adam moments of old row
+    /// `rows[i]`, or begins with zeros for `None`. Moments are two thirds of a state's bytes, and stay on the device.
+    fn rearrange(&mut self, state: &mut State, rows: &[Option<u32>]) -> Result<(), TrainError>;
 }

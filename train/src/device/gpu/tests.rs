@@ -448,3 +448,42 @@ fn pair_buffer_size_changes_no_byte() {
     };
     assert!(run(true) == run(false), "resubmitted steps give other bytes");
 }
+
+#[test]
+fn rows_are_rearranged_as_on_the_host() {
+    let Some(gpu) = gpu() else { return };
+    // 300 splats have room for 320: fewer, a few more, and more than there is room for.
+    for (sh_degree, count) in [(0, 250), (3, 250), (3, 315), (3, 700)] {
+        let begin = new_state(cloud(3, 300, sh_degree));
+        let mut device = GpuDevice::new(&gpu, &begin, 0.2, None, &none()).unwrap();
+        let run = |device: &mut GpuDevice, state: &mut State, key: u64| {
+            (key..key + 3).for_each(|key| device.step(state, step(false, false, key)).unwrap());
+            device.download(state, StatePart::All).unwrap();
+        };
+        let mut expected = begin.clone();
+        run(&mut device, &mut expected, 0);
+        // What the trainer has: the moments of the beginning, and all else that refinement needs.
+        let mut state = begin.clone();
+        device.download(&mut state, StatePart::Densification).unwrap();
+        assert_eq!(state.densification.error, expected.densification.error);
+        assert_ne!(words(&state), words(&expected), "the moments stayed on the device");
+
+        let rows: Vec<u32> = (0..count).map(|i| (bits(11, i) % 300) as u32).collect();
+        let old: Vec<Option<u32>> = rows.iter().map(|&row| (row % 5 > 0).then_some(row)).collect();
+        for state in [&mut expected, &mut state] {
+            state.splats = state.splats.select(&rows);
+            state.densification.error.clear();
+        }
+        expected.adam.rearrange(&old);
+        let mut fresh = GpuDevice::new(&gpu, &expected, 0.2, None, &none()).unwrap();
+        device.rearrange(&mut state, &old).unwrap();
+        device.download(&mut state, StatePart::All).unwrap();
+        expected.densification.error.resize(rows.len(), 0.0);
+        assert!(words(&state) == words(&expected), "degree {sh_degree}, {count} rows");
+        // And so do the steps after it.
+        run(&mut device, &mut state, 9);
+        run(&mut fresh, &mut expected, 9);
+        assert!(words(&state) == words(&expected), "degree {sh_degree}, {count} rows, three steps on");
+        assert_eq!(state.coarse_to_fine.tally.count, 6);
+    }
+}
