@@ -14,11 +14,13 @@
 //! as a model, and [`ModelError`] where writing fails.
 
 mod error;
+mod export;
 mod files;
 mod manifest;
 mod read;
 mod rewrite;
 mod streamed_sog;
+mod tiles;
 mod write;
 
 use std::path::{Path, PathBuf};
@@ -27,11 +29,13 @@ use blocks::{Ground, Split};
 use scene::{BadInput, Capture, Exposures, Poses, Splats, ply, spz};
 
 pub use error::ModelError;
+pub use export::Exported;
 pub use files::save_json;
 pub use manifest::{BlockEntry, Manifest};
 pub use read::{Tree, read, read_tree};
 pub use rewrite::{check_out, rewrite};
-pub use streamed_sog::{Exported, write_streamed_sog};
+pub use streamed_sog::write_streamed_sog;
+pub use tiles::write_tiles;
 pub use write::{Written, write};
 
 /// Comment in a model's PLY that says: draw it with opacity compensation.

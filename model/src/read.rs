@@ -123,6 +123,16 @@ impl Opened {
         }
     }
 
+    /// Metres per pixel that a block was trained for; 0 of a file.
+    pub(crate) fn rho_metres(&self, block: BlockId) -> f64 {
+        match self {
+            Self::Trained { plan, .. } => {
+                plan.tasks.iter().find(|task| task.block == block).map_or(0.0, |task| task.rho_metres)
+            }
+            Self::File { .. } => 0.0,
+        }
+    }
+
     pub(crate) fn antialiased(&self) -> bool {
         match self {
             Self::Trained { manifest, .. } => manifest.antialiased,

@@ -16,13 +16,13 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 use blocks::{Cells, Cut, Ground, Mode};
-use glam::{Mat3, Quat, Vec3};
 use rayon::prelude::*;
-use scene::{BadInput, BlockId, GeoOrigin, Splats, column, morton, sog};
+use scene::{BadInput, BlockId, GeoOrigin, Splats, sog};
 use serde::Serialize;
 use store::file::save;
 
 use crate::error::{ModelError, cannot};
+use crate::export::{Bound, Exported, bad, check_new, extent, finite_splats, in_z_order};
 use crate::files::save_json;
 use crate::read;
 
@@ -32,19 +32,6 @@ const ENVIRONMENT: &str = "env";
 const FILE_SPLATS: usize = 1 << 16;
 /// Times at most that a cell is quartered to hold no more: splats may coincide.
 const MAX_QUARTERS: u8 = 8;
-
-/// What was written.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct Exported {
-    /// Splats of the finest level, and of the backdrop.
-    pub splats: u64,
-    /// Levels of detail.
-    pub levels: u8,
-    /// Files.
-    pub files: usize,
-    /// Bytes of all files.
-    pub bytes: u64,
-}
 
 #[derive(Serialize)]
 #[serde(rename_all = "camelCase")]
@@ -78,20 +65,6 @@ struct Node {
     lods: Option<BTreeMap<u8, Run>>,
 }
 
-#[derive(Debug, Clone, Copy, Serialize)]
-struct Bound {
-    min: Vec3,
-    max: Vec3,
-}
-
-impl Bound {
-    const NOTHING: Self = Self { min: Vec3::INFINITY, max: Vec3::NEG_INFINITY };
-
-    fn with(self, other: Self) -> Self {
-        Self { min: self.min.min(other.min), max: self.max.max(other.max) }
-    }
-}
-
 /// Splats that follow each other in a file.
 #[derive(Debug, Clone, Copy, Serialize)]
 struct Run {
@@ -118,20 +91,12 @@ pub fn write_streamed_sog(
     report: &mut dyn FnMut(usize, usize),
 ) -> Result<Exported, ModelError> {
     let opened = read::open(path)?;
-    let is_used = out.exists() && out.read_dir().map_err(cannot("read", out))?.next().is_some();
-    if is_used {
-        let problem = "is not empty";
-        return Err(BadInput::new(out.display().to_string(), problem, "give a new folder with --out").into());
-    }
+    check_new(out)?;
     let blocks = opened.blocks();
     let deepest = blocks.iter().map(|block| block.level).max().filter(|_| opened.mode() == Mode::Tree);
     let mut writer = Writer::new(out, opened.ground(), &opened.leaves(), deepest, opened.antialiased());
     for (done, &block) in blocks.iter().rev().enumerate() {
-        let splats = opened.splats(block)?;
-        if let Some(row) = (0..splats.len()).find(|&row| !splats.is_finite(row)) {
-            let problem = format!("has numbers that are not finite, in splat {row} of block {block}");
-            return Err(BadInput::new(path.display().to_string(), problem, "repair the model or train it again").into());
-        }
+        let splats = finite_splats(&opened, block, path)?;
         writer.add(block, &splats)?;
         report(done + 1, blocks.len());
     }
@@ -291,10 +256,6 @@ impl<'a> Writer<'a> {
     }
 }
 
-fn bad(block: BlockId, error: &scene::CodecError) -> BadInput {
-    BadInput::new(format!("block {block}"), error.to_string(), "train it again")
-}
-
 /// The binary tree over cells, built up from the deepest; `None` without cells.
 fn tree_of(mut nodes: BTreeMap<BlockId, Node>) -> Option<Node> {
     let deepest = nodes.keys().map(|region| region.level).max()?;
@@ -318,25 +279,6 @@ fn joined(mut nodes: Vec<Node>) -> Option<Node> {
     let children: Vec<Node> = [nodes, upper].into_iter().filter_map(joined).collect();
     let bound = children.iter().fold(Bound::NOTHING, |bound, child| bound.with(child.bound));
     Some(Node { bound, children: Some(children), lods: None })
-}
-
-/// The box of a splat's ellipsoid of one standard deviation, as other writers of the format take it.
-fn extent(splats: &Splats, row: usize) -> Bound {
-    let col = |k: usize| splats.col(k)[row];
-    let [w, x, y, z] = [0, 1, 2, 3].map(|k| col(column::QUAT + k));
-    let turn = Mat3::from_quat(Quat::from_xyzw(x, y, z, w).normalize());
-    let size = Vec3::from_array([0, 1, 2].map(|k| col(column::LOG_SCALE + k).exp()));
-    let half = turn.x_axis.abs() * size.x + turn.y_axis.abs() * size.y + turn.z_axis.abs() * size.z;
-    let mean = splats.mean(row);
-    let half = if half.is_finite() { half } else { Vec3::ZERO };
-    Bound { min: mean - half, max: mean + half }
-}
-
-/// These rows along a Morton curve.
-fn in_z_order(splats: &Splats, rows: &[u32]) -> Vec<u32> {
-    let columns = [0, 1, 2].map(|axis| rows.iter().map(|&row| splats.col(axis)[row as usize]).collect::<Vec<f32>>());
-    let order = morton::order([&columns[0], &columns[1], &columns[2]]);
-    order.into_iter().map(|i| rows[i as usize]).collect()
 }
 
 /// The place of a region along a Morton curve.

@@ -1,6 +1,6 @@
 //! An opened capture: posed views, sparse points and their geographic origin.
 
-use glam::DVec3;
+use glam::{DMat4, DVec3, DVec4};
 use serde::{Deserialize, Serialize};
 
 use crate::camera::Camera;
@@ -16,6 +16,27 @@ pub struct GeoOrigin {
     pub longitude_degrees: f64,
     /// Metres above the ellipsoid.
     pub altitude_metres: f64,
+}
+
+impl GeoOrigin {
+    /// Takes the local east-north-up frame to the Earth's (ECEF: x to the equator at Greenwich, z to the north pole), metres.
+    pub fn ecef_from_local(&self) -> DMat4 {
+        // WGS84: the radius at the equator, metres, and the flattening.
+        const RADIUS: f64 = 6_378_137.0;
+        const FLATTENING: f64 = 1.0 / 298.257_223_563;
+        let (sin_lat, cos_lat) = self.latitude_degrees.to_radians().sin_cos();
+        let (sin_lon, cos_lon) = self.longitude_degrees.to_radians().sin_cos();
+        let eccentricity = FLATTENING * (2.0 - FLATTENING);
+        let normal = RADIUS / (1.0 - eccentricity * sin_lat * sin_lat).sqrt();
+        let across = (normal + self.altitude_metres) * cos_lat;
+        let up = ((1.0 - eccentricity) * normal + self.altitude_metres) * sin_lat;
+        DMat4::from_cols(
+            DVec4::new(-sin_lon, cos_lon, 0.0, 0.0),
+            DVec4::new(-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat, 0.0),
+            DVec4::new(cos_lat * cos_lon, cos_lat * sin_lon, sin_lat, 0.0),
+            DVec4::new(across * cos_lon, across * sin_lon, up, 1.0),
+        )
+    }
 }
 
 /// One image with its camera.

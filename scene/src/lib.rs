@@ -28,6 +28,7 @@ pub mod ply;
 pub mod poses;
 pub mod random;
 pub mod sog;
+pub mod splat_glb;
 pub mod splats;
 pub mod spz;
 pub mod transforms;

@@ -169,6 +169,8 @@ pub(crate) enum Format {
     Spz,
     /// A folder of streamed SOG, the format of PlayCanvas and SuperSplat, with the model's levels of detail
     Sog,
+    /// A folder of 3D Tiles with splats in glTF, which CesiumJS streams, with the model's levels of detail
+    Tiles,
 }
 
 #[derive(Debug, Clone, Args)]
@@ -178,7 +180,7 @@ pub(crate) struct ExportArgs {
     /// Format
     #[arg(long, value_enum)]
     pub(crate) to: Format,
-    /// File to write; for sog a new folder
+    /// File to write; for sog and tiles a new folder
     #[arg(long, value_name = "PATH")]
     pub(crate) out: PathBuf,
 }

@@ -26,7 +26,7 @@ struct Exported<'a> {
 pub(crate) fn run(args: &ExportArgs, output: &Output) -> Result<(), Failure> {
     let exported = match args.to {
         Format::Ply | Format::Spz => file(args)?,
-        Format::Sog => folder(args, output)?,
+        Format::Sog | Format::Tiles => folder(args, output)?,
     };
     let text = format!("{} splats, {} bytes\n{}", exported.splats, exported.bytes, args.out.display());
     output.result(&exported, &text)
@@ -52,9 +52,13 @@ fn file(args: &ExportArgs) -> Result<Exported<'_>, Failure> {
 
 fn folder<'a>(args: &'a ExportArgs, output: &Output) -> Result<Exported<'a>, Failure> {
     let mut progress = None;
-    let written = model::write_streamed_sog(&args.model, &args.out, &mut |done, all| {
+    let mut report = |done: usize, all: usize| {
         progress.get_or_insert_with(|| output.progress("blocks", all as u64)).at(done as u64, "");
-    })?;
+    };
+    let written = match args.to {
+        Format::Tiles => model::write_tiles(&args.model, &args.out, &mut report)?,
+        _ => model::write_streamed_sog(&args.model, &args.out, &mut report)?,
+    };
     Ok(Exported {
         command: "export",
         out: &args.out,

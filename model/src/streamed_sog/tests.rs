@@ -1,8 +1,7 @@
 use std::path::PathBuf;
 
-use glam::DQuat;
-use glam::DVec2;
-use scene::{CodecError, Splat};
+use glam::{DQuat, DVec2, Vec3};
+use scene::{CodecError, Splat, column};
 use serde_json::Value;
 
 use super::*;
