@@ -206,4 +206,21 @@ mod tests {
             assert!(bad.check().is_err(), "change {i}");
         }
     }
+
+    #[test]
+    fn places_on_earth_are_those_of_wgs84() {
+        let at = |latitude_degrees, longitude_degrees, altitude_metres| {
+            GeoOrigin { latitude_degrees, longitude_degrees, altitude_metres }.ecef_from_local()
+        };
+        let is_near = |found: DVec3, expected: DVec3| assert!((found - expected).length() < 1e-3, "{found}");
+        let greenwich = at(0.0, 0.0, 10.0);
+        is_near(greenwich.transform_point3(DVec3::ZERO), DVec3::new(6_378_147.0, 0.0, 0.0));
+        is_near(greenwich.transform_vector3(DVec3::X), DVec3::Y);
+        is_near(greenwich.transform_vector3(DVec3::Y), DVec3::Z);
+        is_near(greenwich.transform_vector3(DVec3::Z), DVec3::X);
+        is_near(at(90.0, 0.0, 0.0).transform_point3(DVec3::ZERO), DVec3::new(0.0, 0.0, 6_356_752.314_2));
+        // 45° north, 90° east: the normal has 6,388,838.29 m.
+        let middle = DVec3::new(0.0, 4_517_590.879, 4_487_348.409);
+        is_near(at(45.0, 90.0, 0.0).transform_point3(DVec3::ZERO), middle);
+    }
 }
