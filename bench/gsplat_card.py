@@ -53,10 +53,10 @@ def cuda(array):
     return torch.tensor(np.asarray(array), dtype=torch.float32, device="cuda")
 
 
-def draw(splats, view, k, size, degree, absgrad=False):
+def draw(splats, view, k, size, degree):
     colours = torch.cat([splats["sh0"], splats["shN"]], 1)
     return rasterization(splats["means"], splats["quats"], splats["scales"].exp(), splats["opacities"].sigmoid(), colours, view[None], k[None],
-                         size[0], size[1], sh_degree=degree, packed=False, absgrad=absgrad)
+                         size[0], size[1], sh_degree=degree, packed=False)
 
 
 def train(args):
@@ -118,7 +118,7 @@ def train(args):
         if not waiting:
             waiting = list(np.random.RandomState(args.seed * 100_003 + step).permutation(train_views))
         i = waiting.pop()
-        image, _, info = draw(splats, poses[i], ks[i], size, min(step // scaled(1000), 3), absgrad=False)
+        image, _, info = draw(splats, poses[i], ks[i], size, min(step // scaled(1000), 3))
         if not mcmc:
             strategy.step_pre_backward(splats, optimisers, state, step, info)
         truth = photos[i].float()[None] / 255
