@@ -10,11 +10,13 @@ mod sweep;
 mod synth;
 mod values;
 
+use std::net::SocketAddr;
 use std::path::PathBuf;
 
 use clap::{Args, Parser, Subcommand};
 use serde::Serialize;
 
+use cluster::socket_address;
 use values::{minutes, seconds};
 
 pub(crate) use bench::{
@@ -22,8 +24,8 @@ pub(crate) use bench::{
     KernelsArgs, ParetoArgs, ScaleArgs,
 };
 pub(crate) use cluster::{
-    Connection, CoordinatorArgs, JobArgs, JobsArgs, LogFormat, LogsArgs, RetryArgs, StatusArgs, SubmitArgs, TaskName,
-    TelemetryArgs, WorkerArgs,
+    Connection, CoordinatorArgs, JobArgs, JobsArgs, LogFormat, LogsArgs, RetryArgs, ServeArgs, StatusArgs, SubmitArgs,
+    TaskName, TelemetryArgs, WorkerArgs,
 };
 pub(crate) use model::{EvalArgs, ExportArgs, Format, PruneArgs, PruneCapture, RenderArgs};
 pub(crate) use plan::{Blocks, DepthKind, PlanOptions, RESIDUAL};
@@ -71,6 +73,8 @@ pub(crate) enum Command {
     Prune(PruneArgs),
     /// Write a model in a format that other programs read
     Export(ExportArgs),
+    /// Show jobs and models in a browser, and serve exported files
+    Serve(ServeArgs),
     /// Run the coordinator of a cluster until it is stopped
     Coordinator(CoordinatorArgs),
     /// Run a worker that trains blocks for a coordinator until it is stopped
@@ -108,6 +112,10 @@ pub(crate) struct DemoArgs {
     /// Build a smaller city, trained in under a minute
     #[arg(long)]
     pub(crate) quick: bool,
+    /// Show training and the city in a browser until Ctrl-C, on this port or address of the loopback interface
+    #[arg(long, value_name = "ADDR|PORT", value_parser = socket_address)]
+    #[arg(num_args = 0..=1, require_equals = true, default_missing_value = "7288")]
+    pub(crate) serve: Option<SocketAddr>,
 }
 
 #[derive(Debug, Clone, Args)]
@@ -185,4 +193,9 @@ pub(crate) struct TrainArgs {
     #[arg(long, value_name = "M", value_parser = minutes)]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) minutes: Option<f64>,
+    /// Show training and the model in a browser until Ctrl-C, on this port or address of the loopback interface
+    #[arg(long, value_name = "ADDR|PORT", value_parser = socket_address)]
+    #[arg(num_args = 0..=1, require_equals = true, default_missing_value = "7288")]
+    #[serde(skip)]
+    pub(crate) serve: Option<SocketAddr>,
 }

@@ -2,6 +2,7 @@
 
 use std::fs;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::time::Duration;
 
 use coordinator::{LocalError, Results, of_status};
@@ -39,8 +40,7 @@ impl Remote {
         let access = access(connection)?;
         let runtime = runtime()?;
         let url = connection.coordinator.clone();
-        let named = ["http://", "https://"].iter().any(|scheme| url.starts_with(scheme)) || !url.contains("://");
-        let leases = if named { None } else { Some(Store::open(&url)?) };
+        let leases = if is_address(&url) { None } else { Some(Store::open(&url)?) };
         let (client, address) = runtime.block_on(find(&url, leases.as_ref(), &access))?;
         Ok(Self { runtime, client, access, url, address, leases })
     }
@@ -130,6 +130,39 @@ async fn find(url: &str, leases: Option<&Store>, access: &Access) -> Result<(Cli
         Some(store) => worker::leader_of(store).await.map_err(|status| Failure::Work(status.message().into()))?.address,
     };
     Ok((proto::connect(&address, access)?, address))
+}
+
+/// Finds a coordinator for the dashboard as [`Remote::open`] does.
+///
+/// # Errors
+/// A store that cannot be opened, a URL that does not fit the credentials.
+pub(crate) fn finder(url: &str, access: Access) -> Result<serve::Find, Failure> {
+    if !is_address(url) {
+        return Ok(finder_in(Store::open(url)?, access));
+    }
+    let client = proto::connect(url, &access)?;
+    let url = url.to_owned();
+    Ok(Arc::new(move || {
+        let found = Ok((client.clone(), url.clone()));
+        Box::pin(async { found })
+    }))
+}
+
+/// Finds the leader of the coordinators on a store.
+pub(crate) fn finder_in(store: Store, access: Access) -> serve::Find {
+    let leases = Arc::new((store, access));
+    Arc::new(move || {
+        let leases = leases.clone();
+        Box::pin(async move {
+            let (store, access) = &*leases;
+            find(store.url(), Some(store), access).await.map_err(|failure| failure.to_string())
+        })
+    })
+}
+
+/// Whether a URL names a coordinator, and not the store whose leases name one.
+fn is_address(url: &str) -> bool {
+    ["http://", "https://"].iter().any(|scheme| url.starts_with(scheme)) || !url.contains("://")
 }
 
 /// Why watching ended before the job did.

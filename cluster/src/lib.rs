@@ -35,7 +35,7 @@ pub use durable::Changes;
 pub use events::{Action, Event, Failure, FailureKind, Outcome};
 pub use invariants::{Violation, check, check_step};
 pub use job::Counts;
-pub use scheduler::Scheduler;
+pub use scheduler::{Scheduler, WorkerView};
 pub use snapshot::{JobHeader, JobSnapshot, RestoreError, Snapshot};
 pub use tally::Tally;
 pub use types::{

@@ -57,6 +57,17 @@ pub struct Scheduler {
     pub(crate) tally: Tally,
 }
 
+/// A connected worker.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct WorkerView<'a> {
+    /// What it offers.
+    pub offer: &'a Offer,
+    /// Time since its last message, as of the scheduler's last step.
+    pub silent_millis: u64,
+    /// The attempt that it executes.
+    pub attempt: Option<AttemptId>,
+}
+
 impl Scheduler {
     /// A scheduler without jobs. The epoch must be higher than that of every earlier scheduler of these workers.
     pub fn new(settings: Settings, epoch: u64) -> Self {
@@ -125,6 +136,15 @@ impl Scheduler {
     /// The offer of a worker, if the worker is known.
     pub fn offer(&self, worker: WorkerId) -> Option<&Offer> {
         self.workers.get(&worker).map(|worker| &worker.offer)
+    }
+
+    /// All connected workers, ascending, each with the attempt that it executes.
+    pub fn workers(&self) -> impl Iterator<Item = (WorkerId, WorkerView<'_>)> {
+        self.workers.iter().map(|(id, worker)| {
+            let attempt = self.indices.lease_of.get(id).copied();
+            let silent_millis = self.now_millis.saturating_sub(worker.seen_millis);
+            (*id, WorkerView { offer: &worker.offer, silent_millis, attempt })
+        })
     }
 
     /// The number of workers of each backend that has any.

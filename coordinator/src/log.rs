@@ -3,7 +3,7 @@
 use std::collections::VecDeque;
 
 use cluster::{Action, AttemptId, JobId, Scheduler, TaskIndex, TaskState, WorkerId};
-use proto::LogLine;
+use proto::{LogKind, LogLine};
 
 /// Lines of all jobs that are kept; the oldest are dropped.
 const LINES_LIMIT: usize = 100_000;
@@ -29,7 +29,16 @@ struct Line {
     attempt: u32,
     /// The worker's number.
     worker: Option<u32>,
+    kind: LogKind,
     message: String,
+}
+
+impl Line {
+    /// A line about an attempt.
+    fn of(now: u64, of: AttemptId, kind: LogKind, message: String) -> Self {
+        let AttemptId { job, task, fence } = of;
+        Self { number: 0, now, job, task: Some(task), attempt: fence.number, worker: None, kind, message }
+    }
 }
 
 impl Log {
@@ -37,7 +46,8 @@ impl Log {
     pub(crate) fn job(&mut self, now: u64, job: JobId, message: impl Into<String>) {
         let message = message.into();
         tracing::info!(job = job.0, "{message}");
-        self.keep(Line { number: 0, now, job, task: None, attempt: 0, worker: None, message });
+        let kind = LogKind::Other;
+        self.keep(Line { number: 0, now, job, task: None, attempt: 0, worker: None, kind, message });
     }
 
     /// Adds a line about a failed attempt.
@@ -45,7 +55,7 @@ impl Log {
         let AttemptId { job, task, fence } = of;
         let (attempt, message) = (fence.number, message.into());
         tracing::warn!(job = job.0, task = task.0, attempt, "{message}");
-        self.keep(Line { number: 0, now, job, task: Some(task), attempt, worker: None, message });
+        self.keep(Line::of(now, of, LogKind::Ended, message));
     }
 
     /// Adds the lines about a step. `scheduler` is in the state after the step; `names` are the workers' names by number.
@@ -54,21 +64,29 @@ impl Log {
             match action {
                 Action::Grant { worker, attempt, .. } => {
                     let name = names.get(worker.0 as usize);
-                    self.of_worker(now, *attempt, *worker, name, "granted".into());
+                    self.of_worker(now, *attempt, *worker, name, (LogKind::Granted, "granted"));
                 }
                 Action::Stop { worker, attempt } => {
                     let name = names.get(worker.0 as usize);
-                    self.of_worker(now, *attempt, *worker, name, "stopped: no longer needed".into());
+                    self.of_worker(now, *attempt, *worker, name, (LogKind::Stopped, "stopped: no longer needed"));
                 }
                 Action::Changed { job, task } => {
                     let Some(record) = scheduler.record(*job, *task) else { continue };
-                    let (attempt, message) = match &record.state {
-                        TaskState::Done { fence, artefact } => (fence.number, format!("done: {artefact}")),
-                        TaskState::Failed { fence, message } => (fence.number, format!("failed for good: {message}")),
-                        TaskState::Quarantined { fence, message } => (fence.number, format!("quarantined: {message}")),
-                        TaskState::Delayed { .. } => (record.attempts, "waits before its next attempt".into()),
+                    let (kind, attempt, message) = match &record.state {
+                        TaskState::Done { fence, artefact } => {
+                            (LogKind::Done, fence.number, format!("done: {artefact}"))
+                        }
+                        TaskState::Failed { fence, message } => {
+                            (LogKind::Failed, fence.number, format!("failed for good: {message}"))
+                        }
+                        TaskState::Quarantined { fence, message } => {
+                            (LogKind::Quarantined, fence.number, format!("quarantined: {message}"))
+                        }
+                        TaskState::Delayed { .. } => {
+                            (LogKind::Delayed, record.attempts, "waits before its next attempt".into())
+                        }
                         TaskState::Ready { .. } if record.attempts > 0 => {
-                            (record.attempts, "waits for a worker again".into())
+                            (LogKind::Ready, record.attempts, "waits for a worker again".into())
                         }
                         TaskState::Waiting { .. } | TaskState::Ready { .. } | TaskState::Leased { .. } => continue,
                     };
@@ -78,7 +96,8 @@ impl Log {
                         }
                         _ => tracing::info!(job = job.0, task = task.0, attempt, "{message}"),
                     }
-                    self.keep(Line { number: 0, now, job: *job, task: Some(*task), attempt, worker: None, message });
+                    let (job, task) = (*job, Some(*task));
+                    self.keep(Line { number: 0, now, job, task, attempt, worker: None, kind, message });
                 }
                 Action::JobFinished { job, outcome } => self.job(now, *job, format!("finished: {outcome:?}")),
                 _ => {}
@@ -98,15 +117,22 @@ impl Log {
             attempt: line.attempt,
             worker: worker(line).unwrap_or_default(),
             what: line.message.clone(),
+            kind: line.kind.into(),
         };
         lines.map(to_wire).collect()
     }
 
-    fn of_worker(&mut self, now: u64, of: AttemptId, worker: WorkerId, name: Option<&String>, message: String) {
+    fn of_worker(
+        &mut self,
+        now: u64,
+        of: AttemptId,
+        worker: WorkerId,
+        name: Option<&String>,
+        (kind, message): (LogKind, &str),
+    ) {
         let AttemptId { job, task, fence } = of;
-        let attempt = fence.number;
-        tracing::info!(job = job.0, task = task.0, attempt, worker = name, "{message}");
-        self.keep(Line { number: 0, now, job, task: Some(task), attempt, worker: Some(worker.0), message });
+        tracing::info!(job = job.0, task = task.0, attempt = fence.number, worker = name, "{message}");
+        self.keep(Line { worker: Some(worker.0), ..Line::of(now, of, kind, message.into()) });
     }
 
     fn keep(&mut self, mut line: Line) {

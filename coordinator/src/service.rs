@@ -11,7 +11,7 @@ use proto::{
     AboutReply, AboutRequest, AttemptReply, BlocksReply, BlocksRequest, CancelReply, CancelRequest, CompleteRequest,
     ControlReply, ControlRequest, FailRequest, JobsReply, JobsRequest, LeaseReply, LeaseRequest, LeaveReply,
     LeaveRequest, LogsReply, LogsRequest, ReportReply, ReportRequest, StatusReply, StatusRequest, SubmitReply,
-    SubmitRequest, WatchEvent, WatchRequest,
+    SubmitRequest, WatchEvent, WatchRequest, WorkersReply, WorkersRequest,
 };
 use scene::{ArtefactId, BlockId, CodecError};
 use store::{Store, StoreError};
@@ -61,7 +61,7 @@ impl Service {
         self.wait_for(call, answer).await
     }
 
-    /// As [`call`](Self::call), without waiting: for heartbeats, which change nothing durable.
+    /// As [`call`](Self::call), without waiting: for heartbeats and for what changes nothing durable.
     async fn call_at_once<T: Send + 'static>(
         &self,
         work: impl FnOnce(&mut Jobs, u64) -> Result<T, Status> + Send + 'static,
@@ -301,5 +301,9 @@ impl Coordinator for Service {
     async fn logs(&self, request: Request<LogsRequest>) -> Answer<LogsReply> {
         let LogsRequest { job, after } = request.into_inner();
         Ok(Response::new(self.call(move |jobs, now| jobs.logs(now, job, after)).await?))
+    }
+
+    async fn workers(&self, _: Request<WorkersRequest>) -> Answer<WorkersReply> {
+        Ok(Response::new(self.call_at_once(|jobs, _| Ok(jobs.workers())).await?))
     }
 }

@@ -61,8 +61,8 @@ impl Token {
         value
     }
 
-    /// Compares in constant time: the hashes of both, every byte.
-    fn matches(&self, header: &[u8]) -> bool {
+    /// Whether an authorization header is `Bearer` and this token. Compares in constant time: the hashes of both, every byte.
+    pub fn matches(&self, header: &[u8]) -> bool {
         let [own, other] = [self.header().as_bytes(), header].map(|bytes| ArtefactId::of(bytes).0);
         own.iter().zip(other).fold(0, |differ, (own, other)| differ | (own ^ other)) == 0
     }

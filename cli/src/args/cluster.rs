@@ -36,7 +36,7 @@ pub(crate) struct Connection {
 pub(crate) struct TelemetryArgs {
     /// Serve Prometheus metrics at GET /metrics on this address, or on this port of the loopback interface. There is no
     /// authentication; the metrics contain numbers and the names of backends
-    #[arg(long, value_name = "ADDR|PORT", value_parser = metrics_address)]
+    #[arg(long, value_name = "ADDR|PORT", value_parser = socket_address)]
     pub(crate) metrics: Option<SocketAddr>,
     /// Format of the log on stderr; RUST_LOG filters it
     #[arg(long, value_enum, value_name = "FORMAT", default_value = "text")]
@@ -52,7 +52,7 @@ pub(crate) enum LogFormat {
     Json,
 }
 
-fn metrics_address(text: &str) -> Result<SocketAddr, String> {
+pub(crate) fn socket_address(text: &str) -> Result<SocketAddr, String> {
     let local = text.parse().ok().map(|port: u16| SocketAddr::from((Ipv4Addr::LOCALHOST, port)));
     let address = local.or_else(|| text.parse().ok());
     address.ok_or_else(|| "give a port, such as 9464, or an address with one, such as 0.0.0.0:9464".into())
@@ -84,6 +84,12 @@ pub(crate) struct CoordinatorArgs {
     /// Lease of a task: a worker that sends nothing for this long loses it
     #[arg(long, value_name = "SECONDS", default_value_t = 30.0, value_parser = lease)]
     pub(crate) lease_seconds: f64,
+    /// Serve the dashboard on this address, with this certificate and token; with --tls-cert, --tls-ca has to verify it
+    #[arg(long, value_name = "ADDR|PORT", value_parser = socket_address)]
+    pub(crate) dashboard: Option<SocketAddr>,
+    /// CA certificates that verify this server's own certificate, PEM: the dashboard calls the coordinator as others do
+    #[arg(long, value_name = "FILE")]
+    pub(crate) tls_ca: Option<PathBuf>,
     /// Record the scheduler's inputs, for replay in its simulator
     #[arg(long, value_name = "FILE")]
     pub(crate) journal: Option<PathBuf>,
@@ -94,6 +100,38 @@ pub(crate) struct CoordinatorArgs {
 fn lease(text: &str) -> Result<f64, String> {
     let value = text.parse().ok().filter(|seconds: &f64| (0.5..=86_400.0).contains(seconds));
     value.ok_or_else(|| "give seconds from 0.5 to 86400, such as 30".into())
+}
+
+#[derive(Debug, Clone, Args)]
+pub(crate) struct ServeArgs {
+    /// Folder of a model that plat train wrote or writes, of exported files, or the store of a cluster (a folder or its URL)
+    #[arg(value_name = "DIR|STORE", required_unless_present = "coordinator")]
+    pub(crate) path: Option<String>,
+    /// Show the jobs of this coordinator: http://host:port, https://host:port with --tls-ca
+    #[arg(long, value_name = "URL", conflicts_with = "path")]
+    pub(crate) coordinator: Option<String>,
+    /// CA certificates to verify the coordinator with, PEM
+    #[arg(long, value_name = "FILE")]
+    pub(crate) tls_ca: Option<PathBuf>,
+    /// Address to listen on, or a port of the loopback interface. An address that other machines reach needs --tls-cert, --tls-key and
+    /// --token-file
+    #[arg(long, value_name = "ADDR|PORT", value_parser = socket_address, default_value = "7288")]
+    pub(crate) listen: SocketAddr,
+    /// Server certificate, PEM; also the client certificate for a coordinator that requires one
+    #[arg(long, value_name = "FILE", requires = "tls_key")]
+    pub(crate) tls_cert: Option<PathBuf>,
+    /// Private key of the certificate, PEM
+    #[arg(long, value_name = "FILE", requires = "tls_cert")]
+    pub(crate) tls_key: Option<PathBuf>,
+    /// File with the token that browsers must send, as the password of any user; it is also sent to the coordinator
+    #[arg(long, value_name = "FILE")]
+    pub(crate) token_file: Option<PathBuf>,
+    /// Let pages of other sites read, such as viewers that are hosted elsewhere
+    #[arg(long)]
+    pub(crate) cors: bool,
+    /// Folder of result lines for the page "Speed and accuracy"
+    #[arg(long, value_name = "DIR", default_value = "bench/results")]
+    pub(crate) results: PathBuf,
 }
 
 #[derive(Debug, Clone, Args)]

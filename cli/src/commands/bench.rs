@@ -46,7 +46,7 @@ pub(crate) fn demo(args: &BenchDemoArgs, output: &Output) -> Result<(), Failure>
 /// Trains a city of which one half is a bare plain, as a tree of fixed depth and as a tree that refines by residual error; appends a
 /// line for each.
 pub(crate) fn adaptive(args: &AdaptiveArgs, output: &Output) -> Result<(), Failure> {
-    let demo = DemoArgs { out: args.out.clone(), quick: false };
+    let demo = DemoArgs { out: args.out.clone(), quick: false, serve: None };
     let (city, settings) = demo::settings(&demo);
     let city = Settings { city: CitySettings { plain: 0.5, ..city.city }, ..city };
     demo::synthesise(&settings.capture, &city, output)?;

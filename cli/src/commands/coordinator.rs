@@ -5,6 +5,7 @@ use std::net::SocketAddr;
 use std::path::Path;
 
 use coordinator::{Durable, Options, Security, ServeError, serve};
+use proto::Access;
 use scene::BadInput;
 use serde::Serialize;
 use store::Store;
@@ -16,7 +17,7 @@ use tokio_util::sync::CancellationToken;
 use crate::args::CoordinatorArgs;
 use crate::failure::{Failure, cannot};
 use crate::output::Output;
-use crate::remote::{key_pair, pem, runtime, token};
+use crate::remote::{finder_in, key_pair, pem, runtime, token};
 use crate::signals::until_signalled;
 use crate::telemetry_setup::MetricsListener;
 
@@ -63,6 +64,10 @@ pub(crate) fn run(args: &CoordinatorArgs, output: &Output) -> Result<(), Failure
         };
         output.note(format!("listening on {address}, advertised as {advertised}, store {}", store.url()));
         let _served = metrics.serve(output, |registry| options.metrics.register(registry));
+        let _dashboard = match args.dashboard {
+            Some(address) => Some(dashboard(args, address, &options, output).await?),
+            None => None,
+        };
         let stop = CancellationToken::new();
         let signals = tokio::spawn(until_signalled(stop.clone()));
         let served = serve(listener, options, stop.cancelled_owned()).await.map_err(serve_failure);
@@ -77,6 +82,29 @@ pub(crate) fn run(args: &CoordinatorArgs, output: &Output) -> Result<(), Failure
     })?;
     let text = format!("stopped listening on {}", hosted.listen);
     output.result(&hosted, &text)
+}
+
+/// Serves the dashboard. It follows whoever leads, which may be another coordinator, and calls as other clients do.
+async fn dashboard(
+    args: &CoordinatorArgs,
+    address: SocketAddr,
+    options: &Options,
+    output: &Output,
+) -> Result<serve::Serving, Failure> {
+    let authority = args.tls_ca.as_deref().map(|path| pem("--tls-ca", path, "CERTIFICATE")).transpose()?;
+    let Security { identity, token, .. } = options.security.clone();
+    if identity.is_some() && authority.is_none() {
+        let problem = "shows a coordinator with a certificate, which it has to verify";
+        return Err(BadInput::new("--dashboard", problem, "give --tls-ca the CA that signed --tls-cert").into());
+    }
+    let access = Access { authority, identity: identity.clone(), token: token.clone() };
+    let find = finder_in(options.store.clone(), access);
+    let shown = serve::Options { identity, token, ..crate::dashboard::options() };
+    let listener = crate::dashboard::listen("--dashboard", address).await?;
+    let source = serve::Source::Coordinator { find, name: None, kind: serve::Kind::Coordinator };
+    let serving = serve::serve(listener, shown, source).await?;
+    output.note(format!("dashboard at {}", serving.url));
+    Ok(serving)
 }
 
 fn serve_failure(error: ServeError) -> Failure {

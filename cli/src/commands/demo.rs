@@ -16,6 +16,7 @@ use store::Store;
 use crate::args::{Auto, Backend, Blocks, DemoArgs, DepthKind, PlanOptions, TrainArgs};
 use crate::commands::eval::{Further, measure_trained};
 use crate::commands::train::{Report, train};
+use crate::dashboard::Dashboard;
 use crate::failure::Failure;
 use crate::output::Output;
 
@@ -27,6 +28,7 @@ pub(crate) struct Built {
     pub(crate) shown: Shown,
     pub(crate) text: String,
     pub(crate) curve: Vec<CurvePoint>,
+    dashboard: Option<Dashboard>,
 }
 
 #[derive(Serialize)]
@@ -41,7 +43,8 @@ pub(crate) struct Shown {
 
 pub(crate) fn run(args: &DemoArgs, output: &Output) -> Result<(), Failure> {
     let built = build(args, output)?;
-    output.result(&built.shown, &built.text)
+    output.result(&built.shown, &built.text)?;
+    built.dashboard.map_or(Ok(()), |dashboard| dashboard.stay(output))
 }
 
 /// Builds the city, trains it, renders the overviews and measures the model.
@@ -92,7 +95,7 @@ pub(crate) fn build(args: &DemoArgs, output: &Output) -> Result<Built, Failure> 
     );
     let merged = args.out.join("merged.ply");
     let shown = Shown { report, sheet: evaluated.sheet, birdseye, oblique, merged };
-    Ok(Built { shown, text, curve: trained.curve })
+    Ok(Built { shown, text, curve: trained.curve, dashboard: trained.dashboard })
 }
 
 fn render_overviews(model: &Model, capture: &Capture, birdseye: &Path, oblique: &Path) -> Result<(), Failure> {
@@ -156,6 +159,7 @@ pub(crate) fn settings(args: &DemoArgs) -> (Settings, TrainArgs) {
         fresh: true,
         checkpoint_every: 60.0,
         minutes: None,
+        serve: args.serve,
     };
     (city, train)
 }

@@ -15,6 +15,7 @@ pub(crate) mod plan;
 pub(crate) mod prune;
 pub(crate) mod render;
 pub(crate) mod scale;
+pub(crate) mod serve;
 pub(crate) mod submit;
 pub(crate) mod synth;
 pub(crate) mod train;

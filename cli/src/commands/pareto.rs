@@ -183,7 +183,7 @@ fn train_and_measure(
 ) -> Result<(ResultLine, String), Failure> {
     let depth = depth.then(|| TrueDepth::open(&run.train.capture)).transpose()?;
     clock::reset_peak_memory();
-    let Trained { capture, report, curve } = train(&run.train, output)?;
+    let Trained { capture, report, curve, .. } = train(&run.train, output)?;
     let model = model::read(&run.train.out)?;
     let store = Store::open(&store_url(&run.train))?.blocking();
     let out = run.train.out.join("eval");

@@ -27,6 +27,7 @@ use worker::{PlanExecutor, Shared, TrainerOptions};
 use crate::args::TrainArgs;
 use crate::captures::ingest_photos;
 use crate::clock::Stopwatch;
+use crate::dashboard::Dashboard;
 use crate::eval_results;
 use crate::failure::{Failure, make_folder};
 use crate::metrics_log::{MetricsLog, Totals};
@@ -44,6 +45,8 @@ pub(crate) struct Trained {
     pub(crate) report: Report,
     /// Held-out PSNR of the merged model during training.
     pub(crate) curve: Vec<CurvePoint>,
+    /// With `--serve`; it stays until the command's end.
+    pub(crate) dashboard: Option<Dashboard>,
 }
 
 /// `report.json`.
@@ -85,7 +88,8 @@ pub(crate) fn run(args: &TrainArgs, output: &Output) -> Result<(), Failure> {
         record.wall_seconds.unwrap_or_default(),
         args.out.join("merged.ply").display(),
     );
-    output.result(&trained.report, &text)
+    output.result(&trained.report, &text)?;
+    trained.dashboard.map_or(Ok(()), |dashboard| dashboard.stay(output))
 }
 
 /// A capture that is ingested and planned.
@@ -115,9 +119,11 @@ struct Finished {
 
 /// Trains and writes everything under `--out`.
 pub(crate) fn train(args: &TrainArgs, output: &Output) -> Result<Trained, Failure> {
+    let name = captures::name_of(&args.capture);
+    let dashboard = args.serve.map(|address| Dashboard::open(address, name, &args.out, output)).transpose()?;
     let clock = Stopwatch::start();
     let prepared = prepare(args, &clock, output)?;
-    let finished = train_plan(args, &prepared, clock, output)?;
+    let finished = train_plan(args, &prepared, dashboard.as_ref(), clock, output)?;
     // Between the clocks, as it takes half a CPU second.
     let predicted = Estimate::of(&prepared.plan, relative_speed());
 
@@ -176,7 +182,7 @@ pub(crate) fn train(args: &TrainArgs, output: &Output) -> Result<Trained, Failur
     if let Some(failure) = failed {
         return Err(eval_results::model_is_kept(failure, &args.out));
     }
-    Ok(Trained { capture, report, curve: totals.curve })
+    Ok(Trained { capture, report, curve: totals.curve, dashboard })
 }
 
 /// Plans and ingests the capture, and writes the configuration and the plan.
@@ -203,7 +209,13 @@ fn prepare(args: &TrainArgs, clock: &Stopwatch, output: &Output) -> Result<Prepa
 }
 
 /// Trains the plan's blocks on workers in this process; `clock` has run since the command started.
-fn train_plan(args: &TrainArgs, prepared: &Prepared, clock: Stopwatch, output: &Output) -> Result<Finished, Failure> {
+fn train_plan(
+    args: &TrainArgs,
+    prepared: &Prepared,
+    dashboard: Option<&Dashboard>,
+    clock: Stopwatch,
+    output: &Output,
+) -> Result<Finished, Failure> {
     let Prepared { plan, plan_id, backend, store, .. } = prepared;
     if plan.settings.test_every > 0 && !is_evaluated(plan) {
         let by = if plan.settings.evaluate { "tasks of the job measure" } else { "plat eval measures" };
@@ -225,7 +237,7 @@ fn train_plan(args: &TrainArgs, prepared: &Prepared, clock: Stopwatch, output: &
     let trainers =
         (0..args.workers).map(|_| PlanExecutor::new(metered.blocking(), options, shared.clone(), backend.clone()));
     let trainers = trainers.map(|trainer| trainer.map(Arc::new)).collect::<Result<_, _>>().map_err(Failure::Work)?;
-    let outcome = run_job(trainers, plan, store, *plan_id, &mut log, output);
+    let outcome = run_job(trainers, plan, store, *plan_id, dashboard, &mut log, output);
     let totals = log.close()?;
     let (results, evaluation_failed) = outcome?;
     let resumed = shared.resumed.load(Ordering::Relaxed);
@@ -287,13 +299,15 @@ fn run_job(
     plan: &Plan,
     store: &Store,
     plan_id: ArtefactId,
+    dashboard: Option<&Dashboard>,
     log: &mut MetricsLog,
     output: &Output,
 ) -> Result<(Vec<ArtefactId>, Option<Failure>), Failure> {
     let mut seen = Results::new(plan.len() as u32);
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build();
     let runtime = runtime.map_err(|error| Failure::Work(format!("cannot start threads: {error}")))?;
-    let start_worker = |coordinator_url, number: usize, shutdown| {
+    let start_worker = |coordinator_url: String, number: usize, shutdown| {
+        dashboard.iter().for_each(|dashboard| dashboard.follow(&coordinator_url));
         let (worker_id, backend) = (format!("local-{number}"), plan.backend.clone());
         let access = Access::default();
         let options = worker::Options { coordinator_url, access, worker_id, backend, memory_bytes: 0 };

@@ -1,6 +1,6 @@
 //! Read-only requests about jobs: status, list, log, watch.
 
-use cluster::{JobId, TaskState};
+use cluster::{AttemptId, JobId, TaskState, WorkerId, WorkerView};
 use proto::WatchEvent;
 use proto::watch_event::Event as Update;
 use scene::ArtefactId;
@@ -85,5 +85,22 @@ impl Jobs {
             workers: workers as u32,
         };
         self.scheduler.backends().map(count).collect()
+    }
+
+    /// The connected workers.
+    pub(crate) fn workers(&self) -> proto::WorkersReply {
+        let status = |(id, view): (WorkerId, WorkerView<'_>)| proto::WorkerStatus {
+            name: self.names.get(id.0 as usize).cloned().unwrap_or_default(),
+            backend: view.offer.backend.clone(),
+            memory_bytes: view.offer.memory_bytes,
+            silent_millis: view.silent_millis,
+            attempt: view.attempt.map(|AttemptId { job, task, fence }| proto::Attempt {
+                job: job.0,
+                task: task.0,
+                number: fence.number,
+                epoch: fence.epoch,
+            }),
+        };
+        proto::WorkersReply { workers: self.scheduler.workers().map(status).collect() }
     }
 }
