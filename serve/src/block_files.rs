@@ -75,9 +75,16 @@ impl BlockFiles {
         if path.exists() {
             return Ok(Some(path));
         }
-        let (project, to) = (project.clone(), path.clone());
-        let made = tokio::task::spawn_blocking(move || make(&project, wanted, &to));
-        let bytes = made.await.map_err(|error| error.to_string())??;
+        let make = || {
+            let (project, to) = (project.clone(), path.clone());
+            tokio::task::spawn_blocking(move || make(&project, wanted, &to))
+        };
+        let mut made = make().await.map_err(|error| error.to_string())?;
+        // The temporary folder may be smaller than the limit.
+        if made.is_err() && self.drop_down_to(0, 0) {
+            made = make().await.map_err(|error| error.to_string())?;
+        }
+        let bytes = made?;
         Ok(bytes.map(|bytes| {
             self.keep(path.clone(), bytes);
             path
@@ -87,16 +94,25 @@ impl BlockFiles {
     /// Counts a new file, and removes the oldest ones beyond the limit.
     fn keep(&self, path: PathBuf, bytes: u64) {
         let mut kept = self.kept.lock().unwrap_or_else(PoisonError::into_inner);
+        kept.0.push_back((path, bytes));
+        kept.1 += bytes;
+        drop(kept);
+        self.drop_down_to(BYTES_LIMIT, 1);
+    }
+
+    /// Removes the oldest files until the rest has at most `limit` bytes or `least` files; whether any was removed.
+    fn drop_down_to(&self, limit: u64, least: usize) -> bool {
+        let mut kept = self.kept.lock().unwrap_or_else(PoisonError::into_inner);
         let (files, sum) = &mut *kept;
-        files.push_back((path, bytes));
-        *sum += bytes;
-        while *sum > BYTES_LIMIT && files.len() > 1 {
+        let before = files.len();
+        while *sum > limit && files.len() > least {
             if let Some((oldest, bytes)) = files.pop_front() {
                 *sum -= bytes;
                 // It may be open in a request, which then goes on reading it.
                 let _ = fs::remove_file(oldest);
             }
         }
+        files.len() < before
     }
 }
 
