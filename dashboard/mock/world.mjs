@@ -11,7 +11,6 @@ export function random(seed) {
 }
 
 export const TICK_MILLIS = 500;
-const BEGAN = Date.UTC(2026, 0, 5, 8, 0, 0);
 const EDGE = 1638.4;
 
 /** `shape`: { name, blocks, levels, workers, seed, failures, speed } */
@@ -115,7 +114,8 @@ export class Sim {
       l: +(0.03 + 0.02 * level + 0.35 * Math.exp(-5 * share) + 0.01 * this.random()).toFixed(4),
     });
     if (task.curve.length < 512) task.curve.push([task.a, Math.round(task.steps * share), task.l, task.n, this.cpu, (now - this.started) / 1000]);
-    const fails = task.a <= 3 && this.shape.failures > 0 && hash(this.shape.seed, w.task, task.a) < this.shape.failures && p > 400;
+    const fails = task.a <= 3 && this.shape.failures > 0 && p > 400
+      && (hash(this.shape.seed, w.task, task.a) < this.shape.failures || hash(this.shape.seed, w.task, 55) < this.shape.failures / 4);
     if (fails) {
       const poison = hash(this.shape.seed, w.task, 99) < 0.3;
       const reason = poison ? 'loss is not a number at step 1310: view 000231.jpg has an empty mask'
@@ -274,4 +274,3 @@ function makePlan(shape, rnd) {
   };
 }
 
-export { BEGAN };
