@@ -27,7 +27,12 @@ export function workerColour(name: string): string {
   return WORKERS[h % WORKERS.length]!;
 }
 
-/** A colour of the style sheet, for canvases. */
+const read = new Map<string, string>();
+
+/** A colour of the style sheet, for canvases. Remembered: canvases ask for each block. */
 export function css(name: string): string {
-  return getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
+  const key = `${name} ${dark.peek()}`;
+  let value = read.get(key);
+  if (value === undefined) read.set(key, value = getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim());
+  return value;
 }

@@ -1,0 +1,1 @@
+export function Block() { return <div class="empty">Block</div>; }

@@ -1,0 +1,1 @@
+export function Blocks() { return <div class="empty">Blocks</div>; }

@@ -1,0 +1,1 @@
+export function Cluster() { return <div class="empty">Cluster</div>; }

@@ -1,0 +1,1 @@
+export function Downloads() { return <div class="empty">Downloads</div>; }
