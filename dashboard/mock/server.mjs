@@ -34,7 +34,7 @@ let server = {
 let serverChanged = false;
 
 const shapes = {
-  demo: [{ name: 'old-town', blocks: 90, levels: 5, workers: 6, seed, failures: 0.04, speed: 26, points: 9000, ahead: 260 }],
+  demo: [{ name: 'old-town', blocks: 240, levels: 5, workers: 6, seed, failures: 0.02, speed: 40, points: 9000, ahead: 560 }],
   big: [{ name: 'metropolis', blocks: 10000, levels: 8, workers: 64, seed, failures: 0.01, speed: 260, points: 20000, ahead: 500, evaluations: 12, fine: 0.235 }],
   failed: [{ name: 'harbour', blocks: 70, levels: 5, workers: 5, seed, failures: 0.42, speed: 60, points: 6000, ahead: 900 }],
   several: [

@@ -48,7 +48,7 @@ function Numbers() {
         <Kpi title="Blocks done" value={`${blocksDone ?? j.counts.done} / ${j.blocks}`} share={(blocksDone ?? j.counts.done) / Math.max(1, j.blocks)}
           note={`${j.counts.leased} running · ${j.counts.ready} ready${broken ? ` · ${broken} failed` : ''}`} />
         <Kpi title="Splats" value={count(j.splats)} note={`${j.levels} levels`} />
-        <Kpi title="Held-out PSNR" value={j.psnr === null ? DASH : `${fixed(j.psnr, 2)} dB`} note={j.psnr === null ? 'not measured yet' : 'mean over held-out views'} />
+        <Kpi title="Held-out PSNR" value={j.psnr === null ? DASH : `${fixed(j.psnr, 2)} dB`} note={j.psnr === null ? 'not measured yet' : 'mean of the views'} />
         <Kpi title="SSIM" value={fixed(j.ssim, 3)} note="held-out" />
         <Kpi title="SSIMULACRA2" value={fixed(j.perceptual, 1)} note="held-out" />
         <Kpi title="CPU hours" value={fixed(j.cpu_seconds / 3600, j.cpu_seconds < 36000 ? 2 : 1)} note="of all attempts" />
@@ -66,7 +66,7 @@ function Numbers() {
 
 function Kpi({ title, value, note, share, long }: { title: string; value: string; note: string; share?: number; long?: boolean }) {
   return (
-    <div class="kpi"><dt>{title}</dt><dd class={`num${long ? ' long' : ''}`}>{value}</dd>
+    <div class={long ? 'kpi wide' : 'kpi'}><dt>{title}</dt><dd class={`num${long ? ' long' : ''}`}>{value}</dd>
       <dd style={{ font: 'inherit' }}>{share !== undefined && <div class="meter"><i style={{ width: `${100 * share}%` }} /></div>}<small>{note}</small></dd></div>
   );
 }

@@ -1,7 +1,7 @@
 // What the map's colours mean: a glyph or a hatch and a word beside each colour.
 import { GLYPHS, ramp, stateColours, workerColour } from '../colours';
 import { count, fixed } from '../format';
-import { NAMES, type TaskTable } from '../tasks';
+import { NAMES, version, type TaskTable } from '../tasks';
 import { extent, type Look } from './mapdraw';
 
 export function Legend({ table, look }: { table: TaskTable; look: Look }) {
@@ -15,6 +15,7 @@ export function Legend({ table, look }: { table: TaskTable; look: Look }) {
 }
 
 function States({ table }: { table: TaskTable }) {
+  void version.value;
   const colours = stateColours();
   const n = NAMES.map(() => 0);
   for (let i = 0; i < table.blocks; i += 1) n[table.state[i]!]! += 1;
@@ -29,6 +30,7 @@ function States({ table }: { table: TaskTable }) {
 }
 
 function Ramp({ table, look }: { table: TaskTable; look: Look }) {
+  void version.value;
   const [low, high] = extent(table, look);
   const format = look.by === 'psnr' ? (v: number) => `${fixed(v, 1)} dB` : look.by === 'speed' ? (v: number) => `${fixed(v, 1)} steps/s` : count;
   const stops = [0, 0.25, 0.5, 0.75, 1].map(ramp).join(',');
@@ -43,6 +45,7 @@ function Ramp({ table, look }: { table: TaskTable; look: Look }) {
 }
 
 function Names({ table }: { table: TaskTable }) {
+  void version.value;
   const names = [...new Set(table.worker)].filter((w) => w !== '').sort();
   return (
     <>

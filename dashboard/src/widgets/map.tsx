@@ -4,7 +4,7 @@ import { useSignal, type Signal } from '@preact/signals';
 import { css } from '../colours';
 import { fixed, count, metres, DASH } from '../format';
 import { dark } from '../settings';
-import { NAMES, RUNNING, type TaskTable } from '../tasks';
+import { NAMES, RUNNING, version as liveVersion, type TaskTable } from '../tasks';
 import { drawGround, furniture, outline, Places, type Look } from './mapdraw';
 import { Plane } from './plane';
 
@@ -53,6 +53,7 @@ export function CityMap({ table, version, look, selection, onOpen, small }: Prop
 }
 
 function Tip({ table: t, task, x, y }: { table: TaskTable; task: number; x: number; y: number }) {
+  void liveVersion.value;
   const b = t.plan.blocks;
   return (
     <div class="tip" style={{ left: `${x + 14}px`, top: `${y + 14}px` }}>
@@ -158,7 +159,7 @@ class Painter {
     if (this.layer.width !== w || this.layer.height !== h) { this.layer.width = w; this.layer.height = h; }
     const g = this.layer.getContext('2d', { alpha: false })!;
     g.setTransform(this.ratio, 0, 0, this.ratio, 0, 0);
-    drawGround(g, layer, this.table!, this.look);
+    drawGround(g, layer, this.table!, this.look, this.places!);
     this.layerPlane = layer;
   }
 

@@ -27,28 +27,28 @@ export function extent(t: TaskTable, look: Look): [number, number] {
   return low <= high ? [low, high] : [0, 1];
 }
 
-export function drawGround(g: CanvasRenderingContext2D, plane: Plane, t: TaskTable, look: Look): void {
+export function drawGround(g: CanvasRenderingContext2D, plane: Plane, t: TaskTable, look: Look, places: Places): void {
   g.fillStyle = css('map');
   g.fillRect(0, 0, plane.width, plane.height);
   const byLevel = order(t);
   const colour = colours(t, look);
   for (let level = 0; level < byLevel.length; level += 1) {
     if (look.level >= 0 && level !== look.level) continue;
-    drawLevel(g, plane, t, look, byLevel[level]!, t.edge(level), colour);
+    drawLevel(g, plane, t, look, byLevel[level]!, t.edge(level), colour, places);
   }
   if (look.points) dots(g, plane, t.plan.points, css('point'), 1);
   if (look.cameras) cameras(g, plane, t);
 }
 
-function drawLevel(g: CanvasRenderingContext2D, plane: Plane, t: TaskTable, look: Look, tasks: Uint32Array, edge: number, colour: (i: number) => string): void {
+function drawLevel(g: CanvasRenderingContext2D, plane: Plane, t: TaskTable, look: Look, tasks: Uint32Array, edge: number, colour: (i: number) => string, places: Places): void {
   const size = edge * plane.scale;
-  const inset = size > 5 ? 0.5 : 0;
   const { x: rx, y: ry } = t.plan.root;
   const { x: bx, y: by } = t.plan.blocks;
   // One path a colour: a fill of many rectangles costs little more than a fill of one.
   const paths = new Map<string, Path2D>();
   const hatched = new Map<number, Path2D>();
   const visible: number[] = [];
+  const edges = new Path2D();
   for (const i of tasks) {
     const left = plane.px(rx + bx[i]! * edge);
     const top = plane.py(ry + (by[i]! + 1) * edge);
@@ -59,22 +59,24 @@ function drawLevel(g: CanvasRenderingContext2D, plane: Plane, t: TaskTable, look
     let path = paths.get(fill);
     if (!path) paths.set(fill, path = new Path2D());
     const share = look.by === 'state' && state === RUNNING && size > 8 ? t.progress[i]! / 1000 : 1;
-    path.rect(left + inset, top + inset + (1 - share) * (size - 2 * inset), size - 2 * inset, share * (size - 2 * inset));
+    path.rect(left, top + (1 - share) * size, size, share * size);
     if (share < 1) {
       const rest = css('running-rest');
       let back = paths.get(rest);
       if (!back) paths.set(rest, back = new Path2D());
-      back.rect(left + inset, top + inset, size - 2 * inset, (1 - share) * (size - 2 * inset));
+      back.rect(left, top, size, (1 - share) * size);
     }
+    if (size > 5) edges.rect(left, top, size, size);
     if ((state === FAILED || state === QUARANTINED) && size > 3) {
       let path2 = hatched.get(state);
       if (!path2) hatched.set(state, path2 = new Path2D());
-      path2.rect(left + inset, top + inset, size - 2 * inset, size - 2 * inset);
+      path2.rect(left, top, size, size);
     }
-    if (size >= 15) visible.push(i);
+    if (size >= 15 && places.onTop(i, look.level)) visible.push(i);
   }
   for (const [fill, path] of paths) { g.fillStyle = fill; g.fill(path); }
   for (const [state, path] of hatched) { g.fillStyle = hatch(g, state === QUARANTINED); g.fill(path); }
+  if (size > 5) { g.strokeStyle = css('map'); g.lineWidth = size > 30 ? 1.5 : 0.75; g.stroke(edges); }
   if (visible.length < 3000) glyphs(g, plane, t, look, visible, edge);
 }
 
@@ -186,6 +188,15 @@ export class Places {
   private static key(l: number, x: number, y: number): number { return (l * 2 ** 20 + x) * 2 ** 20 + y; }
 
   block(l: number, x: number, y: number): number | null { return this.at.get(Places.key(l, x, y)) ?? null; }
+
+  /** Whether no finer block lies over the middle of this one. */
+  onTop(i: number, level: Level): boolean {
+    if (level >= 0) return true;
+    const { root, blocks: b } = this.t.plan;
+    const e = this.t.edge(b.level[i]!);
+    const at = (u: number, v: number): boolean => this.find(root.x + (b.x[i]! + u) * e, root.y + (b.y[i]! + v) * e, level) === i;
+    return at(0.25, 0.25) && at(0.75, 0.25) && at(0.25, 0.75) && at(0.75, 0.75);
+  }
 
   /** The block that is on top at a place, or null. */
   find(x: number, y: number, level: Level): number | null {
