@@ -60,6 +60,8 @@ export interface Event {
   worker: string;
   level: 'info' | 'warn' | 'error';
   what: string;
+  /** What the event does to its attempt; read from `what` where the server does not say. */
+  kind?: 'began' | 'done' | 'failed' | 'lost' | 'revoked' | '';
 }
 
 export interface Snapshot {

@@ -64,7 +64,7 @@ function Table({ all, middle }: { all: Worker[]; middle: number }) {
     { key: 'memory', title: 'Memory', width: '82px', number: true, by: (i) => all[i]!.memory_bytes, cell: (i) => (all[i]!.memory_bytes === 0 ? 'no limit' : bytes(all[i]!.memory_bytes)) },
     { key: 'done', title: 'Done', width: '56px', number: true, by: (i) => all[i]!.done, cell: (i) => <span class="num">{all[i]!.done}</span> },
     { key: 'failed', title: 'Failed', width: '56px', number: true, by: (i) => all[i]!.failed, cell: (i) => <span class={`num ${all[i]!.failed ? 'bad' : ''}`}>{all[i]!.failed}</span> },
-    { key: 'why', title: 'For / why idle', width: 'minmax(230px, 1fr)', by: (i) => all[i]!.idle_reason, cell: (i) => <><span class="num">{span((now - all[i]!.since_unix_ms) / 1000)}</span> <span class="muted">{all[i]!.idle_reason}</span></> },
+    { key: 'why', title: 'For / why idle', width: 'minmax(230px, 1fr)', by: (i) => all[i]!.idle_reason, cell: (i) => <><span class="num">{span((now - all[i]!.since_unix_ms) / 1000)}</span> <span class="muted">{all[i]!.state === 'idle' ? all[i]!.idle_reason : ''}</span></> },
   ];
   return <Grid label="Workers" rows={all.map((_, i) => i)} columns={columns} sort="state" version={all} height={Math.min(420, all.length * 28 + 2)} />;
 }

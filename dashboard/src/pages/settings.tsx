@@ -10,10 +10,10 @@ export function Settings() {
       <Panel title="This browser" class="w6">
         <div class="body">
           <dl class="facts" style={{ gap: '10px 16px', alignItems: 'center' }}>
-            <dt id="theme">Theme</dt>
-            <dd role="radiogroup" aria-labelledby="theme">
+            <dt>Theme</dt>
+            <dd><span role="radiogroup" aria-label="Theme">
               {(['system', 'light', 'dark'] as Theme[]).map((t) => <label key={t} style={{ marginRight: '14px' }}><input type="radio" name="theme" value={t} checked={theme.value === t} onChange={() => { theme.value = t; }} />{t}</label>)}
-            </dd>
+            </span></dd>
             <dt>Motion</dt>
             <dd><label><input type="checkbox" checked={calm.value} onChange={(e) => { calm.value = e.currentTarget.checked; }} />reduce motion, whatever the system says</label></dd>
           </dl>

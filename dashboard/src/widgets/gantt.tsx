@@ -23,15 +23,13 @@ export function bars(events: Event[], workers: Worker[], now: number): Bar[] {
     let idleFrom: number | null = null;
     for (const e of events) {
       if (e.worker !== w.name) continue;
-      const begins = / began\b|^began\b|\bstarted\b|\bleased\b/.test(e.what);
-      if (begins) {
+      const kind = kindOf(e);
+      if (kind === 'began') {
         if (idleFrom !== null && e.unix_ms - idleFrom > 1000) out.push({ worker: w.name, from: idleFrom, to: e.unix_ms, how: 'idle', text: 'idle' });
         open = e;
         idleFrom = null;
-      } else if (open && (e.task === open.task || /\blost\b/.test(e.what))) {
-        const how = /\blost\b|no heartbeat/.test(e.what) ? 'lost' : e.level === 'error' || /failed/.test(e.what) ? 'failed' : /done|finished/.test(e.what) ? 'done' : null;
-        if (!how) continue;
-        out.push({ worker: w.name, from: open.unix_ms, to: e.unix_ms, how, text: e.what });
+      } else if (open && kind !== '' && (e.task === open.task || kind === 'lost')) {
+        out.push({ worker: w.name, from: open.unix_ms, to: e.unix_ms, how: kind === 'revoked' ? 'lost' : kind, text: e.what });
         open = null;
         idleFrom = e.unix_ms;
       }
@@ -41,6 +39,15 @@ export function bars(events: Event[], workers: Worker[], now: number): Bar[] {
     else if (w.state === 'lost') out.push({ worker: w.name, from: w.heard_unix_ms, to: now, how: 'lost', text: 'no heartbeat' });
   }
   return out;
+}
+
+function kindOf(e: Event): NonNullable<Event['kind']> {
+  if (e.kind !== undefined) return e.kind;
+  if (/\b(began|started|leased)\b/.test(e.what)) return 'began';
+  if (/\blost\b|no heartbeat/.test(e.what)) return 'lost';
+  if (/\brevoked\b/.test(e.what)) return 'revoked';
+  if (e.level === 'error' || /\bfailed\b/.test(e.what)) return 'failed';
+  return /\b(done|finished)\b/.test(e.what) ? 'done' : '';
 }
 
 const ROW = 20;

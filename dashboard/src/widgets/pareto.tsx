@@ -78,7 +78,7 @@ function Mark({ run, cx, cy, onFront, comparable, beaten, pinned, right, y, onHo
       <circle cx={cx} cy={cy} r="13" fill="transparent" />
       {pinned && <circle cx={cx} cy={cy} r={size + 4} fill="none" stroke-width="2" style={{ stroke: 'var(--select)' }} />}
       {shape}
-      {(onFront || published || pinned) && <text x={right ? cx + size + 5 : cx - size - 5} y={cy + (published ? 4 : 14)} text-anchor={right ? 'start' : 'end'} font-size="11" fill="#666">{run.r.label}</text>}
+      {(onFront || published || pinned || !comparable) && <text x={right ? cx + size + 5 : cx - size - 5} y={cy + (published ? 4 : 14)} text-anchor={right ? 'start' : 'end'} font-size="11" fill="#666">{run.r.label}{!comparable && !published ? ' (other views)' : ''}</text>}
     </g>
   );
 }
