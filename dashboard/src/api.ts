@@ -198,6 +198,8 @@ export interface ModelView {
   before_prune: boolean;
   sh_degree: number;
   antialiased: boolean;
+  /** Which formats of blocks there are; tried out where the server does not say. */
+  formats?: ('rad' | 'spz')[];
   up: [number, number, number];
 }
 

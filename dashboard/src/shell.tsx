@@ -8,9 +8,9 @@ import { problems } from './problems';
 import { href, route, setQuery } from './route';
 import { table, version } from './tasks';
 import { Boundary, Command, Empty } from './widgets/boundary';
+import { lazy } from './widgets/lazy';
 import { Overview } from './pages/overview';
 import { Blocks } from './pages/blocks';
-import { Block } from './pages/block';
 import { Compare } from './pages/compare';
 import { Cluster } from './pages/cluster';
 import { Events } from './pages/events';
@@ -21,7 +21,7 @@ import { View } from './pages/view';
 const PAGES: { path: string; title: string; component: ComponentType; anyJob?: boolean }[] = [
   { path: '', title: 'Overview', component: Overview },
   { path: 'blocks', title: 'Blocks', component: Blocks },
-  { path: 'block', title: 'Block', component: Block },
+  { path: 'block', title: 'Block', component: lazy(() => import('./pages/block').then((m) => m.Block)) },
   { path: 'compare', title: 'Speed and accuracy', component: Compare, anyJob: true },
   { path: 'cluster', title: 'Cluster', component: Cluster, anyJob: true },
   { path: 'view', title: 'Viewer', component: View },

@@ -22,6 +22,7 @@ export class Blocks {
   readonly shown = new Set<Node>();
   tint = false;
   private format: 'rad' | 'spz' | null;
+  private probe: Promise<'rad' | 'spz'> | null = null;
   private readonly held = new Map<string, Held>();
   private cut: Cut = { masks: new Map(), splats: 0, held: 0 };
   private loading = 0;
@@ -30,7 +31,8 @@ export class Blocks {
   private queue: Node[] = [];
 
   constructor(private readonly job: number, private readonly model: ModelView, format: 'rad' | 'spz' | null, private readonly changed: () => void) {
-    this.format = format;
+    const told = model.formats;
+    this.format = format ?? (told ? (told.includes('rad') ? 'rad' : 'spz') : null);
   }
 
   get pending(): number { return this.queue.length + this.loading; }
@@ -78,7 +80,7 @@ export class Blocks {
   private async load(n: Node, held: Held): Promise<void> {
     const url = `/api/jobs/${this.job}/blocks/${n.block.artefact}`;
     // The server says once whether it has the paged format; SPZ holds the same splats in one piece.
-    if (this.format === null) this.format = (await fetch(`${url}.rad`, { headers: { range: 'bytes=0-15' } })).ok ? 'rad' : 'spz';
+    this.format ??= await (this.probe ??= hasRad(`${url}.rad`));
     const objectModifier = this.quarters(n, held.mask);
     let mesh: SplatMesh;
     if (this.format === 'rad') {
@@ -167,6 +169,10 @@ export class Blocks {
       this.held.delete(key);
     }
   }
+}
+
+async function hasRad(url: string): Promise<'rad' | 'spz'> {
+  return (await fetch(url, { headers: { range: 'bytes=0-15' } })).ok ? 'rad' : 'spz';
 }
 
 function top(n: Node): Node {

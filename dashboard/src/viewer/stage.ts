@@ -130,13 +130,27 @@ export class Stage {
       this.choose();
     }
     if (this.moved) this.dirty = true;
-    if (!this.dirty) { this.tell(time); return; }
+    if (!this.dirty || !this.finished()) { this.tell(time); return; }
     this.dirty = false;
     this.renderer.render(this.scene, this.mover.camera);
+    const gl = this.renderer.getContext() as WebGL2RenderingContext;
+    this.fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    gl.flush();
     this.frameTimes.push(time);
     this.tell(time, true);
   }
 
+  /** Whether the GPU has finished the frame before. On a slow one, frames must not pile up in its queue. */
+  private finished(): boolean {
+    if (!this.fence) return true;
+    const gl = this.renderer.getContext() as WebGL2RenderingContext;
+    if (gl.clientWaitSync(this.fence, 0, 0) === gl.TIMEOUT_EXPIRED) return false;
+    gl.deleteSync(this.fence);
+    this.fence = null;
+    return true;
+  }
+
+  private fence: WebGLSync | null = null;
   private toldAt = 0;
   private tell(time: number, force = false): void {
     if (time - this.toldAt < (force ? 200 : 500)) return;

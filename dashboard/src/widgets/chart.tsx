@@ -34,10 +34,11 @@ export function Chart(props: Props) {
   const shape = `${lines.map((l) => l.label).join()} ${log} ${dark.value} ${asTable.value}`;
 
   useEffect(() => {
-    if (!box.current || asTable.value) return undefined;
+    const here = box.current;
+    if (!here || asTable.value) return undefined;
     const axis = { stroke: css('muted'), grid: { stroke: css('line'), width: 1 }, ticks: { stroke: css('line'), width: 1 }, font: '11px system-ui, sans-serif' };
     const made = new uPlot({
-      width: box.current.clientWidth || 300, height,
+      width: here.clientWidth || 300, height,
       scales: { x: { time: false }, y: log ? { distr: 3 } : {} },
       legend: { live: true },
       cursor: { points: { size: 6 } },
@@ -50,10 +51,10 @@ export function Chart(props: Props) {
       ],
       bands: band ? [{ series: [band[0] + 1, band[1] + 1], fill: css('band') }] : [],
       axes: [{ ...axis, size: 30 }, { ...axis, size: 54, values: (_: uPlot, ticks: (number | null)[]) => ticks.map((v) => (v == null ? '' : format(v))) }],
-    }, data(props), box.current);
+    }, data(props), here);
     chart.current = made;
-    const sizes = new ResizeObserver(() => made.setSize({ width: box.current!.clientWidth, height }));
-    sizes.observe(box.current);
+    const sizes = new ResizeObserver(() => made.setSize({ width: here.clientWidth, height }));
+    sizes.observe(here);
     return () => { sizes.disconnect(); made.destroy(); chart.current = null; };
   }, [shape, height]);
   useEffect(() => { chart.current?.setData(data(props)); }, [x, lines]);

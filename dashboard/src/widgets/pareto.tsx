@@ -72,7 +72,7 @@ function Mark({ run, cx, cy, onFront, comparable, beaten, pinned, right, y, onHo
       : <circle cx={cx} cy={cy} r={size} stroke-width="1.75" style={look} />;
   const name = `${run.r.label}: ${fixed(run.y, DIGITS[y])} after ${span(run.x)}${published ? ', published figure' : comparable ? '' : ', another split'}${pinned ? ', pinned' : ''}`;
   return (
-    <g class="mark" tabIndex={0} role="button" aria-label={name} aria-pressed={pinned}
+    <g class="mark" tabindex={0} role="button" aria-label={name} aria-pressed={pinned}
       onMouseEnter={() => onHover(run.id)} onMouseLeave={() => onHover(null)} onFocus={() => onHover(run.id)} onBlur={() => onHover(null)}
       onClick={() => onPin(run.id)} onKeyDown={(e) => { if (e.key === 'Enter' || e.key === ' ') { e.preventDefault(); onPin(run.id); } }}>
       <circle cx={cx} cy={cy} r="13" fill="transparent" />
