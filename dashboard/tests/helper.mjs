@@ -24,12 +24,16 @@ export async function mock(scenario, port = 0) {
     child.stdout.on('data', (text) => { const m = /(http:\S+)\//.exec(String(text)); if (m) resolve(m[1]); });
     child.on('exit', (code) => reject(new Error(`the mock ended with ${code}`)));
   });
+  // A test that fails must not leave a server that keeps the run alive.
+  child.unref();
+  child.stdout.unref();
+  process.on('exit', () => child.kill('SIGKILL'));
   return {
     url,
     port: Number(new URL(url).port),
     post: (path) => fetch(url + path, { method: 'POST' }).then((r) => r.json()),
     get: (path) => fetch(url + path).then((r) => r.json()),
-    stop: () => new Promise((done) => { child.on('exit', done); child.kill('SIGKILL'); }),
+    stop: () => new Promise((done) => { child.ref(); child.on('exit', done); child.kill('SIGKILL'); }),
   };
 }
 
