@@ -7,6 +7,7 @@ import { dark } from '../settings';
 import { NAMES, RUNNING, version as liveVersion, type TaskTable } from '../tasks';
 import { drawGround, furniture, outline, Places, type Look } from './mapdraw';
 import { Plane } from './plane';
+import { Raster } from './raster';
 
 interface Props {
   table: TaskTable;
@@ -74,6 +75,7 @@ class Painter {
   private readonly layer = document.createElement('canvas');
   private readonly plane = new Plane();
   private layerPlane: Plane | null = null;
+  private raster: Raster | null = null;
   private table: TaskTable | null = null;
   private places: Places | null = null;
   private look: Look = { by: 'state', level: -1, cameras: true, points: true };
@@ -87,7 +89,8 @@ class Painter {
   private readonly sizes: ResizeObserver;
 
   constructor(private readonly canvas: HTMLCanvasElement, private readonly selection: Signal<Set<number>>) {
-    this.g = canvas.getContext('2d', { alpha: false })!;
+    // Drawn by the CPU: thousands of small rectangles stall a software GPU and gain nothing on a real one.
+    this.g = canvas.getContext('2d', { alpha: false, willReadFrequently: true })!;
     this.sizes = new ResizeObserver(() => this.resize());
     this.sizes.observe(canvas);
     this.listen();
@@ -157,9 +160,13 @@ class Painter {
     layer.height = Math.ceil(this.plane.height * (1 + 2 * MARGIN));
     const [w, h] = [Math.round(layer.width * this.ratio), Math.round(layer.height * this.ratio)];
     if (this.layer.width !== w || this.layer.height !== h) { this.layer.width = w; this.layer.height = h; }
-    const g = this.layer.getContext('2d', { alpha: false })!;
-    g.setTransform(this.ratio, 0, 0, this.ratio, 0, 0);
-    drawGround(g, layer, this.table!, this.look, this.places!);
+    if (this.raster?.width !== w || this.raster.height !== h) this.raster = new Raster(w, h);
+    const g = this.layer.getContext('2d', { alpha: false, willReadFrequently: true })!;
+    const pixels = layer.copy();
+    pixels.scale *= this.ratio;
+    pixels.width = w;
+    pixels.height = h;
+    drawGround(g, this.raster, pixels, this.ratio, this.table!, this.look, this.places!);
     this.layerPlane = layer;
   }
 

@@ -2,6 +2,7 @@
 import { css, GLYPHS, ramp, stateColours, workerColour } from '../colours';
 import { FAILED, QUARANTINED, RUNNING, type TaskTable } from '../tasks';
 import type { Plane } from './plane';
+import { packed, parsed, type Raster } from './raster';
 
 export type ColourBy = 'state' | 'psnr' | 'splats' | 'speed' | 'worker';
 /** A level, or -1: the finest block at each place. */
@@ -27,67 +28,65 @@ export function extent(t: TaskTable, look: Look): [number, number] {
   return low <= high ? [low, high] : [0, 1];
 }
 
-export function drawGround(g: CanvasRenderingContext2D, plane: Plane, t: TaskTable, look: Look, places: Places): void {
-  g.fillStyle = css('map');
-  g.fillRect(0, 0, plane.width, plane.height);
+/** Draws into `g`, whose size is the raster's. `plane` is in its pixels; `ratio` of them make a CSS pixel. */
+export function drawGround(g: CanvasRenderingContext2D, raster: Raster, plane: Plane, ratio: number, t: TaskTable, look: Look, places: Places): void {
+  raster.clear(css('map'));
   const byLevel = order(t);
   const colour = colours(t, look);
+  const marked: { tasks: number[]; edge: number }[] = [];
   for (let level = 0; level < byLevel.length; level += 1) {
     if (look.level >= 0 && level !== look.level) continue;
-    drawLevel(g, plane, t, look, byLevel[level]!, t.edge(level), colour, places);
+    const edge = t.edge(level);
+    marked.push({ edge, tasks: drawLevel(raster, plane, t, look, byLevel[level]!, edge, colour, places) });
   }
-  if (look.points) dots(g, plane, t.plan.points, css('point'), 1);
-  if (look.cameras) cameras(g, plane, t);
+  if (look.points) dots(raster, plane, t.plan.points, css('point'), Math.round(ratio));
+  if (look.cameras) {
+    const { x, y, test } = t.plan.cameras;
+    dots(raster, plane, { x, y }, css('camera'), Math.round(2 * ratio), (i) => !test[i]);
+    dots(raster, plane, { x, y }, css('camera-test'), Math.round(2 * ratio), (i) => !!test[i]);
+  }
+  raster.put(g);
+  for (const { tasks, edge } of marked) if (tasks.length < 1500) glyphs(g, plane, ratio, t, look, tasks, edge);
 }
 
-function drawLevel(g: CanvasRenderingContext2D, plane: Plane, t: TaskTable, look: Look, tasks: Uint32Array, edge: number, colour: (i: number) => string, places: Places): void {
+/** Fills the cells of one level; returns those that have room for a glyph and are not covered. */
+function drawLevel(raster: Raster, plane: Plane, t: TaskTable, look: Look, tasks: Uint32Array, edge: number, colour: (i: number) => string, places: Places): number[] {
   const size = edge * plane.scale;
   const { x: rx, y: ry } = t.plan.root;
   const { x: bx, y: by } = t.plan.blocks;
-  // One path a colour: a fill of many rectangles costs little more than a fill of one.
-  const paths = new Map<string, Path2D>();
-  const hatched = new Map<number, Path2D>();
+  const gap = size > 5 ? 1 : 0;
+  const [gaps, rests] = [packed(css('map')), packed(css('running-rest'))];
   const visible: number[] = [];
-  const edges = new Path2D();
   for (const i of tasks) {
-    const left = plane.px(rx + bx[i]! * edge);
-    const top = plane.py(ry + (by[i]! + 1) * edge);
+    const left = Math.round(plane.px(rx + bx[i]! * edge));
+    const top = Math.round(plane.py(ry + (by[i]! + 1) * edge));
     if (left > plane.width || top > plane.height || left + size < 0 || top + size < 0) continue;
     const fill = colour(i);
     if (fill === '') continue;
     const state = t.state[i]!;
-    let path = paths.get(fill);
-    if (!path) paths.set(fill, path = new Path2D());
+    // From rounded edge to rounded edge, so that neighbours neither part nor overlap.
+    const w = Math.round(plane.px(rx + (bx[i]! + 1) * edge)) - left;
+    const h = Math.round(plane.py(ry + by[i]! * edge)) - top;
+    if (gap) raster.rect(left, top, w, h, gaps);
     const share = look.by === 'state' && state === RUNNING && size > 8 ? t.progress[i]! / 1000 : 1;
-    path.rect(left, top + (1 - share) * size, size, share * size);
-    if (share < 1) {
-      const rest = css('running-rest');
-      let back = paths.get(rest);
-      if (!back) paths.set(rest, back = new Path2D());
-      back.rect(left, top, size, (1 - share) * size);
-    }
-    if (size > 5) edges.rect(left, top, size, size);
-    if ((state === FAILED || state === QUARANTINED) && size > 3) {
-      let path2 = hatched.get(state);
-      if (!path2) hatched.set(state, path2 = new Path2D());
-      path2.rect(left, top, size, size);
-    }
+    const rest = Math.round((1 - share) * (h - gap));
+    raster.rect(left, top + rest, w - gap, h - gap - rest, packed(fill));
+    if (rest > 0) raster.rect(left, top, w - gap, rest, rests);
+    if ((state === FAILED || state === QUARANTINED) && size > 3) raster.hatch(left, top, w - gap, h - gap, state === QUARANTINED);
     if (size >= 15 && places.onTop(i, look.level)) visible.push(i);
   }
-  for (const [fill, path] of paths) { g.fillStyle = fill; g.fill(path); }
-  for (const [state, path] of hatched) { g.fillStyle = hatch(g, state === QUARANTINED); g.fill(path); }
-  if (size > 5) { g.strokeStyle = css('map'); g.lineWidth = size > 30 ? 1.5 : 0.75; g.stroke(edges); }
-  if (visible.length < 3000) glyphs(g, plane, t, look, visible, edge);
+  return visible;
 }
 
-function glyphs(g: CanvasRenderingContext2D, plane: Plane, t: TaskTable, look: Look, tasks: number[], edge: number): void {
-  const size = edge * plane.scale;
+function glyphs(g: CanvasRenderingContext2D, plane: Plane, ratio: number, t: TaskTable, look: Look, tasks: number[], edge: number): void {
+  const size = (edge * plane.scale) / ratio;
+  g.setTransform(ratio, 0, 0, ratio, 0, 0);
   g.textAlign = 'center';
   g.textBaseline = 'middle';
   for (const i of tasks) {
     const state = t.state[i]!;
-    const x = plane.px(t.plan.root.x + (t.plan.blocks.x[i]! + 0.5) * edge);
-    const y = plane.py(t.plan.root.y + (t.plan.blocks.y[i]! + 0.5) * edge);
+    const x = plane.px(t.plan.root.x + (t.plan.blocks.x[i]! + 0.5) * edge) / ratio;
+    const y = plane.py(t.plan.root.y + (t.plan.blocks.y[i]! + 0.5) * edge) / ratio;
     const light = look.by === 'state' && (state === 0 || state === 1);
     g.fillStyle = light ? css('on-light') : '#fff';
     g.font = `${Math.min(15, Math.max(9, size * 0.36))}px system-ui, sans-serif`;
@@ -141,40 +140,11 @@ function order(t: TaskTable): Uint32Array[] {
   return known;
 }
 
-const hatches = new Map<boolean, CanvasPattern>();
-function hatch(g: CanvasRenderingContext2D, cross: boolean): CanvasPattern | string {
-  let pattern = hatches.get(cross) ?? null;
-  if (!pattern) {
-    const tile = new OffscreenCanvas(6, 6);
-    const p = tile.getContext('2d')!;
-    p.strokeStyle = 'rgba(255,255,255,.55)';
-    p.lineWidth = 1.2;
-    p.beginPath();
-    for (const k of [-6, 0, 6]) { p.moveTo(k, 6); p.lineTo(k + 6, 0); if (cross) { p.moveTo(k, 0); p.lineTo(k + 6, 6); } }
-    p.stroke();
-    pattern = g.createPattern(tile, 'repeat');
-    if (pattern) hatches.set(cross, pattern);
-  }
-  return pattern ?? 'transparent';
-}
-
-function dots(g: CanvasRenderingContext2D, plane: Plane, at: { x: number[]; y: number[] }, fill: string, size: number): void {
-  g.fillStyle = fill;
-  g.beginPath();
+function dots(raster: Raster, plane: Plane, at: { x: number[]; y: number[] }, fill: string, size: number, pick?: (i: number) => boolean): void {
+  const { colour, alpha } = parsed(fill);
   for (let i = 0; i < at.x.length; i += 1) {
-    const x = plane.px(at.x[i]!);
-    const y = plane.py(at.y[i]!);
-    if (x >= 0 && y >= 0 && x <= plane.width && y <= plane.height) g.rect(x, y, size, size);
-  }
-  g.fill();
-}
-
-function cameras(g: CanvasRenderingContext2D, plane: Plane, t: TaskTable): void {
-  const { x, y, test } = t.plan.cameras;
-  for (const held of [0, 1]) {
-    const pick = x.map((_, i) => i).filter((i) => (test[i] ? 1 : 0) === held);
-    const size = plane.scale > 2 ? 3 : 2;
-    dots(g, plane, { x: pick.map((i) => x[i]!), y: pick.map((i) => y[i]!) }, css(held ? 'camera-test' : 'camera'), size);
+    if (pick && !pick(i)) continue;
+    raster.dot(Math.round(plane.px(at.x[i]!)), Math.round(plane.py(at.y[i]!)), size, colour, alpha);
   }
 }
 
