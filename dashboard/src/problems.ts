@@ -63,15 +63,15 @@ function failed(table: TaskTable, events: Event[]): Problem[] {
     const row = rows.get(key);
     if (row) {
       row.tasks.push(t);
-      row.since = Math.min(row.since ?? Infinity, event?.unix_ms ?? Infinity);
+      if (event) row.since = Math.min(row.since ?? event.unix_ms, event.unix_ms);
       continue;
     }
     const verb = state === FAILED ? 'failed' : 'quarantined';
-    rows.set(key, { kind: 'failed', what: verb, note: event?.what ?? 'The reason is in its attempts.', tasks: [t], worker: '', since: event?.unix_ms ?? null });
+    rows.set(key, { kind: 'failed', what: verb, note: event?.what ?? 'The reasons are in their attempts.', tasks: [t], worker: '', since: event?.unix_ms ?? null });
   }
   for (const row of rows.values()) {
     const n = row.tasks.length;
-    row.what = n === 1 ? `${table.name(row.tasks[0]!)} ${row.what}` : `${n} blocks ${row.what}, same cause`;
+    row.what = n === 1 ? `${table.name(row.tasks[0]!)} ${row.what}` : `${n} blocks ${row.what}${row.since === null ? '' : ', same cause'}`;
   }
   return [...rows.values()];
 }

@@ -68,7 +68,7 @@ function Header() {
   const known = workers.value.filter((w) => w.state !== 'left').length;
   const count = useComputed(() => {
     void version.value;
-    return problems(job.value, table.value, workers.value, events.value).reduce((sum, p) => sum + Math.max(1, p.tasks.length), 0);
+    return problems(job.value, table.value, workers.value, events.value).length;
   });
   return (
     <header class="bar">
@@ -117,7 +117,7 @@ function Phases() {
 
 function Badge() {
   const seconds = silentMillis.value / 1000;
-  const text = { connecting: 'Connecting', live: 'Live', stale: `Stale ${fixed(seconds, 0)} s`, disconnected: `Disconnected ${span(seconds)}` }[link.value];
+  const text = { connecting: 'Connecting', live: 'Live', stale: `Stale ${fixed(seconds, 0)} s`, disconnected: seconds < 1 ? 'Disconnected' : `Disconnected ${span(Math.round(seconds))}` }[link.value];
   return <span class={`badge ${link.value}`} data-testid="link"><i />{text}</span>;
 }
 
@@ -131,7 +131,7 @@ function Banners() {
     <div aria-live="polite">
       {state === 'disconnected' && (
         <div class="banner bad" data-testid="browser-lost"><b>This browser has lost the server.</b>
-          The numbers are {span(silentMillis.value / 1000)} old. Training goes on without this page; it connects again by itself.</div>
+          The numbers are {span(Math.max(1, Math.round(silentMillis.value / 1000)))} old. Training goes on without this page; it connects again by itself.</div>
       )}
       {state !== 'disconnected' && coordinator && !coordinator.reachable && (
         <div class="banner bad" data-testid="coordinator-lost"><b>The coordinator is silent</b> for {span(coordinator.silent_millis / 1000)} ({coordinator.url}).

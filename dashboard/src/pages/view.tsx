@@ -76,7 +76,7 @@ function Scene({ model, onLost }: { model: ModelView; onLost: (reason: string) =
       <div class="viewer">
         <canvas ref={canvas} tabIndex={0} role="application" aria-label="The model in 3D. Orbit: drag, wheel. Fly: W A S D, Q and E for height, shift for speed, drag to look." />
         {!ready.value && <div class="hud">Loading the viewer …</div>}
-        {look.value.ghosts && <Labels stats={stats.value} />}
+        {look.value.ghosts && !photo.value && <Labels stats={stats.value} />}
         {photo.value && photo.value.view.photo && <Wipe key={photo.value.view.view} {...photo.value} />}
         {photo.value && !photo.value.view.photo && <div class="hud" style={{ bottom: '48px' }}>The server has no photo of {photo.value.view.name}.</div>}
         {stats.value && <Hud s={stats.value} />}

@@ -54,7 +54,7 @@ function drawLevel(raster: Raster, plane: Plane, t: TaskTable, look: Look, tasks
   const size = edge * plane.scale;
   const { x: rx, y: ry } = t.plan.root;
   const { x: bx, y: by } = t.plan.blocks;
-  const gap = size > 5 ? 1 : 0;
+  const gap = size > 7 ? 1 : 0;
   const [gaps, rests] = [packed(css('map')), packed(css('running-rest'))];
   const visible: number[] = [];
   for (const i of tasks) {

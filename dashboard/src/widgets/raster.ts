@@ -55,15 +55,20 @@ function mixed(under: number, over: number, alpha: number): number {
 
 const known = new Map<string, { colour: number; alpha: number }>();
 
-/** A colour as the style sheet writes it: #rrggbb, rgb() or rgba(). Pixels are stored as bytes red, green, blue, alpha. */
+/** A colour as the style sheet has it: #rgb, #rrggbb, either with alpha, rgb() or rgba(). A pixel is the bytes red, green, blue, alpha. */
 export function parsed(text: string): { colour: number; alpha: number } {
   let found = known.get(text);
   if (!found) {
-    const hex = /^#(..)(..)(..)$/.exec(text)?.slice(1).map((h) => parseInt(h, 16));
-    const [red, green, blue, alpha] = hex ?? (text.match(/[\d.]+/g) ?? ['0', '0', '0']).map(Number) as [number, number, number, number?];
-    known.set(text, found = { colour: (red! | (green! << 8) | (blue! << 16) | 0xff000000) >>> 0, alpha: alpha ?? 1 });
+    const [red, green, blue, alpha] = text.startsWith('#') ? fromHex(text.slice(1)) : (text.match(/[\d.]+/g) ?? []).map(Number);
+    known.set(text, found = { colour: ((red ?? 0) | ((green ?? 0) << 8) | ((blue ?? 0) << 16) | 0xff000000) >>> 0, alpha: alpha ?? 1 });
   }
   return found;
+}
+
+function fromHex(digits: string): number[] {
+  const long = digits.length > 4 ? digits : [...digits].map((d) => d + d).join('');
+  const bytes = (long.match(/../g) ?? []).map((h) => parseInt(h, 16));
+  return bytes.map((v, i) => (i === 3 ? v / 255 : v));
 }
 
 export function packed(text: string): number {
