@@ -2,10 +2,11 @@
 import type { ComponentType } from 'preact';
 import { useEffect } from 'preact/hooks';
 import { useComputed, useSignal } from '@preact/signals';
-import { events, job, jobs, link, loaded, server, serverNow, silentMillis, workers } from './live';
+import { events, job, jobs, link, loaded, nowMillis, server, serverNow, silentMillis, workers } from './live';
 import { fixed, percent, range, span } from './format';
 import { problems } from './problems';
 import { href, route, setQuery } from './route';
+import { still } from './settings';
 import { table, version } from './tasks';
 import { Boundary, Command, Empty } from './widgets/boundary';
 import { lazy } from './widgets/lazy';
@@ -118,7 +119,9 @@ function Phases() {
 function Badge() {
   const seconds = silentMillis.value / 1000;
   const text = { connecting: 'Connecting', live: 'Live', stale: `Stale ${fixed(seconds, 0)} s`, disconnected: seconds < 1 ? 'Disconnected' : `Disconnected ${span(Math.round(seconds))}` }[link.value];
-  return <span class={`badge ${link.value}`} data-testid="link"><i />{text}</span>;
+  // A beat once a second instead of an animation: that would make the browser compose the whole page sixty times a second.
+  const beat = link.value === 'live' && !still.value && Math.floor(nowMillis.value / 1000) % 2 === 1;
+  return <span class={`badge ${link.value}${beat ? ' beat' : ''}`} data-testid="link"><i />{text}</span>;
 }
 
 /** Three things can be lost, and each needs another answer: a worker, the coordinator, this browser's connection. */
