@@ -1,0 +1,182 @@
+// The splats of blocks: loading them a few at a time, hiding the quarters that finer blocks draw, tinting by level.
+import { dyno, SplatFileType, SplatMesh } from '@sparkjsdev/spark';
+import * as THREE from 'three';
+import type { ModelView } from '../api';
+import { square, type Cut, type Node } from './cut';
+
+const LOADS_AT_ONCE = 3;
+/** Blocks that are no longer wanted stay so long, in case the eye turns back. */
+const KEPT = 48;
+const TINTS = ['#ffffff', '#8fd0ff', '#7fe0b0', '#ffe27a', '#ffb07a', '#ff8fb8', '#d6a0ff', '#a0b0ff', '#c0ffc0', '#ffd0d0'];
+
+interface Held {
+  mesh: SplatMesh | null; // null while it loads
+  mask: dyno.DynoInt<string>;
+  bytes: number;
+  error: string;
+  used: number;
+}
+
+export class Blocks {
+  readonly group = new THREE.Group();
+  readonly shown = new Set<Node>();
+  tint = false;
+  private format: 'rad' | 'spz' | null;
+  private probe: Promise<'rad' | 'spz'> | null = null;
+  private readonly held = new Map<string, Held>();
+  private cut: Cut = { masks: new Map(), splats: 0, held: 0 };
+  private loading = 0;
+  private turn = 0;
+  private closed = false;
+  private queue: Node[] = [];
+
+  constructor(private readonly job: number, private readonly model: ModelView, format: 'rad' | 'spz' | null, private readonly changed: () => void) {
+    const told = model.formats;
+    this.format = format ?? (told ? (told.includes('rad') ? 'rad' : 'spz') : null);
+  }
+
+  get pending(): number { return this.queue.length + this.loading; }
+  get errors(): string[] { return [...new Set([...this.held.values()].map((h) => h.error).filter(Boolean))]; }
+  get kind(): string { return this.format ?? ''; }
+
+  /** Draws this cut, as far as it is loaded; `order` says what to load first. */
+  show(cut: Cut, order: (n: Node) => number): void {
+    this.cut = cut;
+    this.turn += 1;
+    const missing = [...cut.masks.keys()].filter((n) => !this.held.has(n.block.artefact!));
+    this.queue = missing.sort((a, b) => order(b) - order(a));
+    // Something coarse at once: the coarsest finished blocks come before all others.
+    const coarse = [...cut.masks.keys()].map(top).filter((n) => !this.held.has(n.block.artefact!));
+    this.queue.unshift(...new Set(coarse));
+    this.arrange();
+    this.next();
+  }
+
+  close(): void {
+    this.closed = true;
+    for (const h of this.held.values()) h.mesh?.dispose();
+  }
+
+  private next(): void {
+    while (this.loading < LOADS_AT_ONCE && this.queue.length > 0) {
+      const n = this.queue.shift()!;
+      const key = n.block.artefact!;
+      if (this.held.has(key)) continue;
+      const held: Held = { mesh: null, mask: new dyno.DynoInt({ value: 0 }), bytes: 0, error: '', used: this.turn };
+      this.held.set(key, held);
+      this.loading += 1;
+      this.load(n, held)
+        .catch((e: Error) => { held.error = `${n.block.block}: ${e.message}`; })
+        .finally(() => {
+          this.loading -= 1;
+          if (this.closed) { held.mesh?.dispose(); return; }
+          this.arrange();
+          this.changed();
+          this.next();
+        });
+    }
+  }
+
+  private async load(n: Node, held: Held): Promise<void> {
+    const url = `/api/jobs/${this.job}/blocks/${n.block.artefact}`;
+    // The server says once whether it has the paged format; SPZ holds the same splats in one piece.
+    this.format ??= await (this.probe ??= hasRad(`${url}.rad`));
+    const objectModifier = this.quarters(n, held.mask);
+    let mesh: SplatMesh;
+    if (this.format === 'rad') {
+      mesh = new SplatMesh({ url: `${url}.rad`, fileType: SplatFileType.RAD, paged: true, objectModifier });
+    } else {
+      const reply = await fetch(`${url}.spz`);
+      if (!reply.ok) throw new Error(`${url}.spz: the server answered ${reply.status}`);
+      const fileBytes = await reply.arrayBuffer();
+      held.bytes = fileBytes.byteLength;
+      mesh = new SplatMesh({ fileBytes, fileType: SplatFileType.SPZ, objectModifier });
+    }
+    await mesh.initialized;
+    held.mesh = mesh;
+    mesh.visible = false;
+    this.group.add(mesh);
+  }
+
+  /** Switches off splats whose centre lies in a quarter that a child draws. */
+  private quarters(n: Node, mask: dyno.DynoInt<string>) {
+    const s = square(n, this.model.root);
+    const middle = new dyno.DynoVec2({ value: new THREE.Vector2(s.x + s.edge / 2 - this.model.centre[0], s.y + s.edge / 2 - this.model.centre[1]) });
+    return dyno.dynoBlock({ gsplat: dyno.Gsplat }, { gsplat: dyno.Gsplat }, ({ gsplat }) => {
+      const hide = new dyno.Dyno({
+        inTypes: { gsplat: dyno.Gsplat, mask: 'int', middle: 'vec2' },
+        outTypes: { gsplat: dyno.Gsplat },
+        inputs: { gsplat: gsplat!, mask, middle },
+        globals: () => [dyno.defineGsplat],
+        statements: ({ inputs, outputs }) => [
+          `${outputs.gsplat} = ${inputs.gsplat};`,
+          `{ int quarter = (${inputs.gsplat}.center.x >= ${inputs.middle}.x ? 1 : 0) + (${inputs.gsplat}.center.y >= ${inputs.middle}.y ? 2 : 0);`,
+          `  if (((${inputs.mask} >> quarter) & 1) == 1) ${outputs.gsplat}.flags = 0u; }`,
+        ],
+      });
+      return { gsplat: hide.outputs.gsplat };
+    });
+  }
+
+  /** Sets what is visible, from the cut and what is loaded. A block hides a quarter only once a loaded child covers it. */
+  private arrange(): void {
+    const wanted = new Set<Node>();
+    for (const n of this.cut.masks.keys()) for (let p: Node | null = n; p && !wanted.has(p); p = p.parent) wanted.add(p);
+    const ready = new Map<Node, boolean>();
+    const loaded = (n: Node): boolean => n.block.artefact !== null && !!this.held.get(n.block.artefact)?.mesh;
+    const covers = (n: Node): boolean => {
+      let known = ready.get(n);
+      if (known === undefined) ready.set(n, known = loaded(n) || n.children.every((c) => c !== null && wanted.has(c) && covers(c)));
+      return known;
+    };
+    this.shown.clear();
+    const visit = (n: Node): void => {
+      let mask = 0;
+      n.children.forEach((c, quarter) => {
+        if (!c || !wanted.has(c) || !covers(c)) return;
+        mask |= 1 << quarter;
+        visit(c);
+      });
+      if (mask === 15 || !loaded(n)) return;
+      const held = this.held.get(n.block.artefact!)!;
+      if (held.mask.value !== mask) { held.mask.value = mask; held.mesh!.updateVersion(); }
+      this.shown.add(n);
+    };
+    for (const n of wanted) if (!n.parent || !wanted.has(n.parent)) visit(n);
+    const visible = new Map([...this.shown].map((n) => [n.block.artefact!, n]));
+    for (const [key, held] of this.held) {
+      if (!held.mesh) continue;
+      const n = visible.get(key);
+      held.mesh.visible = n !== undefined;
+      if (!n) continue;
+      held.used = this.turn;
+      const colour = new THREE.Color(this.tint ? TINTS[n.level % TINTS.length] : '#ffffff');
+      if (!held.mesh.recolor.equals(colour)) { held.mesh.recolor.copy(colour); held.mesh.updateVersion(); }
+    }
+    this.drop();
+  }
+
+  retint(on: boolean): void {
+    this.tint = on;
+    this.arrange();
+  }
+
+  private drop(): void {
+    const idle = [...this.held].filter(([, h]) => h.mesh && !h.mesh.visible).sort((a, b) => a[1].used - b[1].used);
+    for (const [key, h] of idle.slice(0, Math.max(0, idle.length - KEPT))) {
+      this.group.remove(h.mesh!);
+      h.mesh!.dispose();
+      this.held.delete(key);
+    }
+  }
+}
+
+async function hasRad(url: string): Promise<'rad' | 'spz'> {
+  return (await fetch(url, { headers: { range: 'bytes=0-15' } })).ok ? 'rad' : 'spz';
+}
+
+function top(n: Node): Node {
+  let t = n;
+  for (let p = n.parent; p; p = p.parent) if (p.block.artefact !== null) t = p;
+  return t;
+}

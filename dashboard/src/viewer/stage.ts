@@ -1,0 +1,190 @@
+// The 3D scene: the splats of the chosen cut, lines over them, and a loop that draws only when something changed.
+import { SparkRenderer } from '@sparkjsdev/spark';
+import * as THREE from 'three';
+import type { ModelView, View } from '../api';
+import { Blocks } from './blocks';
+import { Boxes } from './boxes';
+import { cut, error, square, tree, type Cut, type Node } from './cut';
+import { Mover, type Frame } from './eye';
+
+export interface Stats {
+  shown: number;
+  total: number;
+  blocks: number;
+  pending: number;
+  held: number;
+  megabytes: number;
+  frames: number;
+  format: string;
+  errors: string[];
+  labels: { text: string; task: number; left: number; top: number }[];
+}
+
+export interface Look { budget: number; tint: boolean; outlines: boolean; seams: boolean; ghosts: boolean }
+
+export class Stage {
+  readonly mover: Mover;
+  onStats: (s: Stats) => void = () => {};
+  private readonly renderer: THREE.WebGLRenderer;
+  private readonly spark: SparkRenderer;
+  private readonly scene = new THREE.Scene();
+  private readonly blocks: Blocks;
+  private readonly boxes: Boxes;
+  private readonly sizes: ResizeObserver;
+  private readonly network: PerformanceObserver;
+  private nodes: Node[];
+  private now: Cut = { masks: new Map(), splats: 0, held: 0 };
+  private dirty = true;
+  private moved = true;
+  private frame = 0;
+  private last = 0;
+  private cutAt = 0;
+  private frameTimes: number[] = [];
+  private bytes = 0;
+
+  constructor(private readonly canvas: HTMLCanvasElement, job: number, private model: ModelView, private look: Look, format: 'rad' | 'spz' | null) {
+    this.renderer = new THREE.WebGLRenderer({ canvas, antialias: false, powerPreference: 'high-performance' });
+    this.renderer.setPixelRatio(Math.min(1.5, devicePixelRatio || 1));
+    this.renderer.setClearColor(0x101418);
+    // Trained with the anti-aliasing filter: compensated blur. Otherwise the plain one, as the trainer draws.
+    const blur = model.antialiased ? { preBlurAmount: 0, blurAmount: 0.3 } : { preBlurAmount: 0.3, blurAmount: 0 };
+    this.spark = new SparkRenderer({ renderer: this.renderer, lodSplatCount: look.budget, ...blur, onDirty: () => { this.dirty = true; } });
+    this.nodes = tree(model.blocks);
+    this.blocks = new Blocks(job, model, format, () => { this.dirty = true; this.lines(); });
+    this.boxes = new Boxes(model);
+    this.scene.add(this.spark, this.blocks.group, this.boxes.group);
+    this.mover = new Mover(canvas, model);
+    this.mover.orbit.addEventListener('change', () => { this.moved = true; });
+    this.sizes = new ResizeObserver(() => this.resize());
+    this.sizes.observe(canvas);
+    this.network = new PerformanceObserver((list) => {
+      for (const e of list.getEntries() as PerformanceResourceTiming[]) if (e.name.includes('/blocks/')) this.bytes += e.encodedBodySize || e.transferSize;
+    });
+    this.network.observe({ type: 'resource' });
+    this.resize();
+    this.frame = requestAnimationFrame((t) => this.loop(t));
+  }
+
+  close(): void {
+    cancelAnimationFrame(this.frame);
+    this.sizes.disconnect();
+    this.network.disconnect();
+    this.mover.close();
+    this.blocks.close();
+    this.spark.dispose();
+    this.renderer.dispose();
+  }
+
+  setLook(look: Look): void {
+    if (look.tint !== this.look.tint) this.blocks.retint(look.tint);
+    this.look = look;
+    this.spark.lodSplatCount = look.budget;
+    this.moved = true;
+    this.choose();
+  }
+
+  /** Blocks have finished since: draws them without moving the eye. */
+  setModel(model: ModelView): void {
+    this.model = { ...model, centre: this.model.centre };
+    this.nodes = tree(model.blocks);
+    this.choose();
+  }
+
+  capture(view: View): Frame {
+    const frame = this.mover.capture(view);
+    this.moved = true;
+    return frame;
+  }
+
+  goTo(block: string): void {
+    const n = this.nodes.find((m) => m.block.block === block);
+    if (!n) return;
+    const s = square(n, this.model.root);
+    this.mover.look(s.x + s.edge / 2 - this.model.centre[0], s.y + s.edge / 2 - this.model.centre[1], s.edge);
+    this.moved = true;
+  }
+
+  redraw(): void { this.moved = true; }
+
+  private choose(): void {
+    const eye = this.mover.eye();
+    this.now = cut(this.nodes, this.model.root, eye, this.look.budget);
+    this.blocks.show(this.now, (n) => error(n.parent ?? n, this.model.root, eye));
+    this.lines();
+    this.dirty = true;
+  }
+
+  private lines(): void {
+    this.boxes.show(this.blocks.shown, this.nodes, this.look);
+    this.dirty = true;
+  }
+
+  private loop(time: number): void {
+    this.frame = requestAnimationFrame((t) => this.loop(t));
+    if (document.hidden) return;
+    if (this.mover.step(Math.min(0.1, (time - this.last) / 1000))) this.moved = true;
+    this.last = time;
+    if (this.moved && time - this.cutAt > 400) {
+      this.moved = false;
+      this.cutAt = time;
+      this.choose();
+    }
+    if (this.moved) this.dirty = true;
+    if (!this.dirty || !this.finished()) { this.tell(time); return; }
+    this.dirty = false;
+    this.renderer.render(this.scene, this.mover.camera);
+    const gl = this.renderer.getContext() as WebGL2RenderingContext;
+    this.fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    gl.flush();
+    this.frameTimes.push(time);
+    this.tell(time, true);
+  }
+
+  /** Whether the GPU has finished the frame before. On a slow one, frames must not pile up in its queue. */
+  private finished(): boolean {
+    if (!this.fence) return true;
+    const gl = this.renderer.getContext() as WebGL2RenderingContext;
+    if (gl.clientWaitSync(this.fence, 0, 0) === gl.TIMEOUT_EXPIRED) return false;
+    gl.deleteSync(this.fence);
+    this.fence = null;
+    return true;
+  }
+
+  private fence: WebGLSync | null = null;
+  private toldAt = 0;
+  private tell(time: number, force = false): void {
+    if (time - this.toldAt < (force ? 200 : 500)) return;
+    this.toldAt = time;
+    this.frameTimes = this.frameTimes.filter((t) => time - t < 2000);
+    this.onStats({
+      shown: this.spark.activeSplats,
+      total: this.nodes.reduce((n, m) => n + (m.block.artefact !== null && m.children.every((c) => !c || c.block.artefact === null) ? m.block.splats : 0), 0),
+      blocks: this.blocks.shown.size, pending: this.blocks.pending, held: this.now.held, megabytes: this.bytes / 1e6,
+      frames: this.frameTimes.length / 2, format: this.blocks.kind, errors: this.blocks.errors, labels: this.labels(),
+    });
+  }
+
+  /** The nearest ghosts' labels in CSS pixels. */
+  private labels(): Stats['labels'] {
+    const { clientWidth: w, clientHeight: h } = this.canvas;
+    const eye = this.mover.camera.position;
+    const near = [...this.boxes.labels].sort((a, b) => a.at.distanceToSquared(eye) - b.at.distanceToSquared(eye));
+    const out: Stats['labels'] = [];
+    for (const { node, at } of near) {
+      const p = at.clone().project(this.mover.camera);
+      const [left, top] = [((p.x + 1) / 2) * w, ((1 - p.y) / 2) * h];
+      if (p.z > 1 || left < 0 || top < 0 || left > w || top > h || out.some((o) => Math.abs(o.left - left) < 90 && Math.abs(o.top - top) < 18)) continue;
+      out.push({ text: node.block.block, task: node.block.task, left, top });
+      if (out.length === 30) break;
+    }
+    return out;
+  }
+
+  private resize(): void {
+    const { clientWidth: w, clientHeight: h } = this.canvas;
+    if (w === 0 || h === 0) return;
+    this.renderer.setSize(w, h, false);
+    this.mover.resize(w, h);
+    this.moved = true;
+  }
+}
