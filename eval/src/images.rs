@@ -24,7 +24,7 @@ pub(crate) fn colour_image(colour: &[f32], width: usize, height: usize) -> RgbIm
 }
 
 /// A photo as a picture.
-pub(crate) fn photo_image(photo: &Pixels) -> RgbImage {
+pub fn photo_image(photo: &Pixels) -> RgbImage {
     let area = photo.area();
     RgbImage::from_fn(photo.width, photo.height, |x, y| {
         let at = y as usize * photo.width as usize + x as usize;

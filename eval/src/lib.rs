@@ -44,7 +44,7 @@ pub use figures::{FIGURES, Means, ViewFigures, figures_from_frame, figures_to_fr
 pub use fits::Fits;
 pub use groups::{Groups, Kinds};
 pub use held_out::figures_of_views;
-pub use images::{frame_image, write_png};
+pub use images::{frame_image, photo_image, write_png};
 pub use judges::{DepthReport, DetectionReport};
 pub use label_colours::coloured_by;
 pub use lpips::Lpips;

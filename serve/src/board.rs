@@ -8,7 +8,7 @@ use proto::{LogKind, LogLine, StatusReply, TaskState, WorkerStatus};
 
 use crate::job::JobRecord;
 use crate::project::Project;
-use crate::views::{Delta, Event, Kind, Level, Server, Snapshot, Worker, WorkerState};
+use crate::views::{AttemptEnd, Delta, Event, Kind, Level, Server, Snapshot, Worker, WorkerState};
 
 /// Events that are kept for all jobs, and those of a snapshot.
 const EVENTS_KEPT: usize = 20_000;
@@ -226,6 +226,16 @@ impl Board {
             let oldest = self.workers.values().filter(|worker| gone(worker)).min_by_key(|worker| worker.since_unix_ms);
             let Some(name) = oldest.map(|worker| worker.name.clone()) else { break };
             self.workers.remove(&name);
+        }
+    }
+
+    /// The coordinator has ended in order, and with it its log: counts what its workers did from the attempts.
+    pub(crate) fn coordinator_ended(&mut self, now: u64) {
+        self.set_workers(now, &[]);
+        for (name, worker) in &mut self.workers {
+            let attempts = self.jobs.values().flat_map(|job| &job.tasks).flat_map(|task| &task.attempts);
+            let done = attempts.filter(|attempt| attempt.worker == *name && attempt.end == AttemptEnd::Done).count();
+            worker.done = done as u32;
         }
     }
 

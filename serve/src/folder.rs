@@ -103,7 +103,7 @@ pub(crate) fn finish(feed: &Feed, folder: &Path) -> Result<(), BadInput> {
     job.ended_unix_ms.get_or_insert(feed.now());
     job.merging = false;
     set_figures(job, folder);
-    board.set_workers(feed.now(), &[]);
+    board.coordinator_ended(feed.now());
     Ok(())
 }
 

@@ -343,7 +343,7 @@ impl JobRecord {
             weight: self.weight,
             blocks,
             evaluations: plan.eval_tasks.len(),
-            levels: plan.levels,
+            levels: plan.levels + 1,
             counts,
             started_unix_ms: self.started_unix_ms,
             ended_unix_ms: self.ended_unix_ms,

@@ -357,8 +357,7 @@ fn neighbours(block: BlockId) -> impl Iterator<Item = BlockId> {
 
 fn jpeg(pixels: &Pixels) -> Result<Vec<u8>, String> {
     let mut bytes = Vec::new();
-    let mut encoder = image::codecs::jpeg::JpegEncoder::new_with_quality(&mut bytes, JPEG_QUALITY);
-    let encoded = encoder.encode(&pixels.rgb, pixels.width, pixels.height, image::ExtendedColorType::Rgb8);
-    encoded.map_err(|error| error.to_string())?;
+    let encoder = image::codecs::jpeg::JpegEncoder::new_with_quality(&mut bytes, JPEG_QUALITY);
+    eval::photo_image(pixels).write_with_encoder(encoder).map_err(|error| error.to_string())?;
     Ok(bytes)
 }

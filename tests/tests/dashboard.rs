@@ -187,7 +187,58 @@ async fn a_job_is_shown_as_it_runs_and_can_be_controlled() {
     let page = String::from_utf8(page).unwrap();
     assert!(status == 200 && page.contains("town") && page.contains("1 of 5 done"), "{page}");
     drop(setup.serving);
-    assert!(TcpStream::connect(at).await.is_err());
+    while TcpStream::connect(at).await.is_ok() {
+        tokio::time::sleep(Duration::from_millis(20)).await;
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_folder_is_shown_while_it_is_written_and_afterwards() {
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().join("town");
+    let store = Store::open("memory://").unwrap();
+    let serve_it = async || {
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let address = listener.local_addr().unwrap();
+        let serving = serve::serve(listener, options(&folder), Source::Folder(out.clone())).await;
+        serving.map(|serving| (serving, address))
+    };
+    std::fs::create_dir(&out).unwrap();
+    let error = serve_it().await.map(|_| ()).unwrap_err().to_string();
+    assert!(error.contains("plan.json") && error.contains("plat train"), "{error}");
+
+    // As `plat train` writes it: the plan, lines of metrics, at last the model.
+    let plan = plan_of(1, ["0/0/0", "1/0/0", "1/1/1", "1/1/0", "1/0/1"].map(|block| task(block, &[])).to_vec());
+    model::save_json(&out.join("plan.json"), &plan).unwrap();
+    let (_serving, at) = serve_it().await.unwrap();
+    let job = json(at, "/api/snapshot").await["jobs"][0].clone();
+    assert_eq!((&job["name"], &job["state"], &job["model"]), (&"town".into(), &"running".into(), &false.into()));
+    let line = r#"{"task":"0/0/0","attempt":1,"step":5,"steps":10,"cpu_seconds":1.5,"wall_seconds":1.0,"splats":7,"loss":0.25,"psnr":null,"merged_splats":null}"#;
+    std::fs::write(out.join("metrics.jsonl"), format!("{line}\n{{\"torn\":")).unwrap();
+    let tasks = until(at, "/api/jobs/1/tasks", |tasks| tasks["progress"][0] == 500).await;
+    assert_eq!((&tasks["state"], &tasks["splats"][0]), (&"lwwww".into(), &7.into()));
+
+    let mut splats = Splats::new(0);
+    splats.push(&Splat::round(glam::Vec3::new(25.0, 25.0, 1.0), -1.0, glam::Vec3::splat(0.5), 0.9));
+    let artefact = store.put(encode_splats(&splats).into()).await.unwrap();
+    let written = tokio::task::spawn_blocking(move || {
+        let capture = scene::Capture::default();
+        model::write(&out, &plan, &[artefact; 5], &store.blocking(), &capture, 1).map(|_| ()).unwrap();
+    });
+    written.await.unwrap();
+    let job = until(at, "/api/snapshot", |all| all["jobs"][0]["state"] == "done").await["jobs"][0].clone();
+    assert_eq!((&job["counts"]["done"], &job["model"]), (&5.into(), &true.into()));
+    let path = format!("/api/jobs/1/blocks/{artefact}.spz");
+    assert_eq!(get(at, &path, "").await.0, 200);
+    let refused = "POST /api/jobs/1/control HTTP/1.1\r\nhost: localhost\r\nconnection: close\r\ncontent-type: application/json\r\ncontent-length: 16\r\n\r\n{\"what\":\"pause\"}";
+    assert_eq!(ask(at, refused).await.0, 409);
+    assert!(
+        json(at, "/api/downloads").await["files"]
+            .as_array()
+            .unwrap()
+            .iter()
+            .any(|file| file["path"] == "town/merged.ply")
+    );
 }
 
 #[tokio::test(flavor = "multi_thread")]
