@@ -28,11 +28,25 @@ export class Blocks {
   private loading = 0;
   private turn = 0;
   private closed = false;
+  private sky: SplatMesh | null = null;
   private queue: Node[] = [];
 
   constructor(private readonly job: number, private readonly model: ModelView, format: 'rad' | 'spz' | null, private readonly changed: () => void) {
     const told = model.formats;
     this.format = format ?? (told ? (told.includes('rad') ? 'rad' : 'spz') : null);
+  }
+
+  /** Sky and far background of the root: never handed on, always drawn. */
+  async backdrop(): Promise<void> {
+    if (!this.model.blocks.some((b) => b.backdrop)) return;
+    const reply = await fetch(`/api/jobs/${this.job}/backdrop.spz`);
+    if (!reply.ok || this.closed) return;
+    const mesh = new SplatMesh({ fileBytes: await reply.arrayBuffer(), fileType: SplatFileType.SPZ });
+    await mesh.initialized;
+    if (this.closed) { mesh.dispose(); return; }
+    this.group.add(mesh);
+    this.sky = mesh;
+    this.changed();
   }
 
   get pending(): number { return this.queue.length + this.loading; }
@@ -55,6 +69,7 @@ export class Blocks {
   close(): void {
     this.closed = true;
     for (const h of this.held.values()) h.mesh?.dispose();
+    this.sky?.dispose();
   }
 
   private next(): void {

@@ -51,6 +51,7 @@ export class Stage {
     this.spark = new SparkRenderer({ renderer: this.renderer, lodSplatCount: look.budget, ...blur, onDirty: () => { this.dirty = true; } });
     this.nodes = tree(model.blocks);
     this.blocks = new Blocks(job, model, format, () => { this.dirty = true; this.lines(); });
+    void this.blocks.backdrop().catch(() => { /* the city is drawn without its sky */ });
     this.boxes = new Boxes(model);
     this.scene.add(this.spark, this.blocks.group, this.boxes.group);
     this.mover = new Mover(canvas, model);
