@@ -84,6 +84,17 @@ export class Stage {
     this.choose();
   }
 
+  /** Looks through another stage's camera: the two sides of a wipe. */
+  follow(lead: Stage): void { this.lead = lead; }
+
+  private lead: Stage | null = null;
+  private copyLead(): void {
+    const [from, to] = [this.lead!.mover.camera, this.mover.camera];
+    if (from.position.equals(to.position) && from.quaternion.equals(to.quaternion) && from.projectionMatrix.equals(to.projectionMatrix)) return;
+    to.copy(from, false);
+    this.moved = true;
+  }
+
   /** Blocks have finished since: draws them without moving the eye. */
   setModel(model: ModelView): void {
     this.model = { ...model, centre: this.model.centre };
@@ -125,6 +136,7 @@ export class Stage {
     if (document.hidden) return;
     if (this.mover.step(Math.min(0.1, (time - this.last) / 1000))) this.moved = true;
     this.last = time;
+    if (this.lead) this.copyLead();
     if (this.moved && time - this.cutAt > 400) {
       this.moved = false;
       this.cutAt = time;
