@@ -147,13 +147,15 @@ function model(sim) {
   };
 }
 
+// The strictest policy that the pages need: Spark's WebAssembly and workers are inlined in its chunk.
+const POLICY = "default-src 'self'; script-src 'self' 'wasm-unsafe-eval'; worker-src 'self' blob:; connect-src 'self' data: blob:; img-src 'self' data: blob:; style-src 'self' 'unsafe-inline'";
 const types = { '.html': 'text/html; charset=utf-8', '.js': 'text/javascript', '.css': 'text/css', '.txt': 'text/plain; charset=utf-8' };
 function asset(path, request, response) {
   const file = normalize(path === '/' ? '/index.html' : path).replace(/^(\.\.[/\\])+/, '');
   try {
     const encoding = /\bbr\b/.test(request.headers['accept-encoding'] ?? '') && types[extname(file)] && extname(file) !== '.txt' ? 'br' : null;
     const bytes = readFileSync(join(dist, file + (encoding ? '.br' : '')));
-    response.writeHead(200, { 'content-type': types[extname(file)] ?? 'application/octet-stream', ...(encoding && { 'content-encoding': encoding }) });
+    response.writeHead(200, { 'content-type': types[extname(file)] ?? 'application/octet-stream', 'content-security-policy': POLICY, ...(encoding && { 'content-encoding': encoding }) });
     response.end(bytes);
   } catch {
     fail(response, 404, `${path}: no such file`);
