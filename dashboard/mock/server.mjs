@@ -1,6 +1,7 @@
 #!/usr/bin/env node
 // The contract of the server, simulated, for development and tests:
-//   node mock/server.mjs [--scenario demo|big|failed|several|empty] [--port N] [--seed N] [--token T]
+//   node mock/server.mjs [--scenario demo|big|failed|several|empty] [--port N] [--seed N] [--rad FILE]
+// --rad: a .rad file (plat export MODEL --to rad) that is served for every block, to try the viewer's paged format.
 // POST /mock/lose-worker, /mock/coordinator?reachable=0|1, /mock/drop (cuts streams), GET /mock/seen (what was asked of it).
 import { createServer } from 'node:http';
 import { readFileSync } from 'node:fs';
@@ -16,6 +17,7 @@ const scenario = option('scenario', 'demo');
 const seed = Number(option('seed', '7'));
 const dist = join(import.meta.dirname, '..', 'dist');
 const RING = 600;
+const rad = option('rad', null) && readFileSync(option('rad', null));
 
 let ticks = 0;
 let seq = 0;
@@ -135,7 +137,7 @@ function views(sim) {
 function model(sim) {
   const { root, blocks } = sim.plan;
   return {
-    seq, root, centre: [0, 0, 0], before_prune: false, sh_degree: 0, antialiased: true, formats: ['spz'], up: [0, 0, 1],
+    seq, root, centre: [0, 0, 0], before_prune: scenario === 'demo', sh_degree: 0, antialiased: true, formats: rad ? ['rad', 'spz'] : ['spz'], up: [0, 0, 1],
     blocks: blocks.level.map((l, t) => {
       const e = root.edge / 2 ** l;
       const [x0, y0] = [root.x + blocks.x[t] * e, root.y + blocks.y[t] * e];
@@ -145,18 +147,28 @@ function model(sim) {
   };
 }
 
+// The strictest policy that the pages need: Spark's WebAssembly and workers are inlined in its chunk.
+const POLICY = "default-src 'self'; script-src 'self' 'wasm-unsafe-eval'; worker-src 'self' blob:; connect-src 'self' data: blob:; img-src 'self' data: blob:; style-src 'self' 'unsafe-inline'";
 const types = { '.html': 'text/html; charset=utf-8', '.js': 'text/javascript', '.css': 'text/css', '.txt': 'text/plain; charset=utf-8' };
 function asset(path, request, response) {
   const file = normalize(path === '/' ? '/index.html' : path).replace(/^(\.\.[/\\])+/, '');
   try {
     const encoding = /\bbr\b/.test(request.headers['accept-encoding'] ?? '') && types[extname(file)] && extname(file) !== '.txt' ? 'br' : null;
     const bytes = readFileSync(join(dist, file + (encoding ? '.br' : '')));
-    response.writeHead(200, { 'content-type': types[extname(file)] ?? 'application/octet-stream', ...(encoding && { 'content-encoding': encoding }) });
+    response.writeHead(200, { 'content-type': types[extname(file)] ?? 'application/octet-stream', 'content-security-policy': POLICY, ...(encoding && { 'content-encoding': encoding }) });
     response.end(bytes);
   } catch {
     fail(response, 404, `${path}: no such file`);
   }
 }
+function ranged(bytes, request, response) {
+  const [, from, to] = /bytes=(\d+)-(\d*)/.exec(request.headers.range ?? '') ?? [];
+  if (from === undefined) return response.end(bytes);
+  const last = Math.min(bytes.length - 1, to ? Number(to) : bytes.length - 1);
+  response.writeHead(206, { 'content-type': 'application/octet-stream', 'content-range': `bytes ${from}-${last}/${bytes.length}`, 'content-length': last - from + 1 });
+  response.end(bytes.subarray(Number(from), last + 1));
+}
+
 const fail = (response, status, error) => { response.writeHead(status, { 'content-type': 'application/json' }); response.end(JSON.stringify({ error })); };
 
 function stream(request, response) {
@@ -223,6 +235,7 @@ createServer(async (request, response) => {
     case 'renders': return image(picture(Number.parseInt(argument, 10), true));
     case 'model': return json(model(sim));
     case 'blocks': {
+      if (rad && argument.endsWith('.rad')) return ranged(rad, request, response);
       if (!argument.endsWith('.spz')) return fail(response, 404, `${argument}: the mock has .spz only`);
       const block = model(sim).blocks.find((b) => b.artefact === argument.slice(0, -4));
       if (!block) return fail(response, 404, `${argument}: no such artefact`);

@@ -33,7 +33,7 @@ function blocked(job: Job | null, workers: Worker[]): Problem[] {
   const live = workers.filter((w) => w.state === 'busy' || w.state === 'idle');
   if (live.length === 0) return one('No worker is connected', 'Start one: plat worker --coordinator URL');
   const reasons = [...new Set(live.filter((w) => w.state === 'idle').map((w) => w.idle_reason))];
-  if (job.counts.ready > 0) return one(`${job.counts.ready} ready tasks, none runs`, reasons.join('; ') || 'The workers are busy with other jobs.');
+  if (job.counts.ready > 0) return one(`${job.counts.ready} ${job.counts.ready === 1 ? 'task is' : 'tasks are'} ready, none runs`, reasons.join('; ') || 'The workers are busy with other jobs.');
   return [];
 }
 

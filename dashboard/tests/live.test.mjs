@@ -82,6 +82,7 @@ if (!REAL) {
     assert.match(rows[0], /^Blocked/);
     const storm = rows.find((r) => /\d+ blocks (failed|quarantined), same cause/.test(r));
     assert.ok(storm, rows.join('\n'));
+    await page.waitForSelector('.map canvas[data-frames]');
     await shot(page, 'failed');
     assert.deepEqual(await violations(page), []);
     const sent = page.waitForResponse((r) => r.request().method() === 'POST');

@@ -41,7 +41,6 @@ test('10,000 blocks pan at 10 frames a second and more', { skip: REAL !== null }
     if (now.fps > best.fps) best = now;
   }
   await client.send('Page.stopScreencast');
-  console.log(`10,000 blocks: ${fps.toFixed(1)} frames drawn a second, ${(presented / seconds).toFixed(1)} presented a second, while 2 deltas a second come in`);
   await shot(page, 'big-blocks');
   assert.ok(best.fps >= 10 && best.shown >= 10);
 

@@ -26,6 +26,12 @@ test('the viewer', async (t) => {
       await page.waitForSelector('.wipe img');
       await page.waitForTimeout(2500);
       await shot(page, 'viewer-photo');
+      await page.selectOption('.tools select', '');
+      await page.getByLabel('before pruning').check();
+      await page.waitForSelector('text=pruned');
+      await page.waitForTimeout(2500);
+      assert.equal(await page.locator('.viewer canvas').count(), 2);
+      await shot(page, 'viewer-before');
     }
     assert.deepEqual(page.problems, []);
     await page.context().close();

@@ -9,6 +9,8 @@ import { NAMES, table, version } from '../tasks';
 import { Command, Empty, Panel, useGet, Waiting } from '../widgets/boundary';
 import type { Look, Stage, Stats } from '../viewer/stage';
 
+const FORMATS = ['rad', 'spz'] as const;
+
 export function View() {
   const asked = useGet<ModelView>(job.value!.model ? `/api/jobs/${jobId.value}/model` : null, job.value!.counts.done);
   const missing = useSignal(webgl2Missing());
@@ -23,6 +25,7 @@ function Scene({ model, onLost }: { model: ModelView; onLost: (reason: string) =
   const stage = useRef<Stage | null>(null);
   const ready = useSignal(false);
   const stats = useSignal<Stats | null>(null);
+  const before = useSignal(false);
   const mode = useSignal<'orbit' | 'fly'>('orbit');
   const photo = useSignal<{ view: Photo; frame: { left: number; top: number; width: number; height: number } } | null>(null);
   const { query } = route.value;
@@ -34,9 +37,9 @@ function Scene({ model, onLost }: { model: ModelView; onLost: (reason: string) =
     let live = true;
     void import('../viewer/stage').then(({ Stage }) => {
       if (!live || !canvas.current) return;
-      const format = query.get('format');
+      const format = FORMATS.find((f) => f === query.get('format')) ?? null;
       try {
-        stage.current = new Stage(canvas.current, jobId.value!, model, look.value, format === 'spz' || format === 'rad' ? format : null);
+        stage.current = new Stage(canvas.current, jobId.value!, model, look.value, format);
       } catch (e) { onLost((e as Error).message); return; }
       stage.current.onStats = (s) => { stats.value = s; };
       ready.value = true;
@@ -63,6 +66,7 @@ function Scene({ model, onLost }: { model: ModelView; onLost: (reason: string) =
       <div class="tools">
         <label>Budget <input type="range" min="4.3" max="6.602" step="0.01" value={Math.log10(look.value.budget)} aria-valuetext={`${count(look.value.budget)} splats`}
           onInput={(e) => { const budget = Math.round(10 ** Number(e.currentTarget.value)); set({ budget }); setQuery({ budget }); }} /><span class="num" style={{ minWidth: '62px' }}>{count(look.value.budget)}</span></label>
+        {model.before_prune && <label><input type="checkbox" checked={before.value} onChange={(e) => { before.value = e.currentTarget.checked; }} />before pruning</label>}
         {toggle('tint', 'levels')}{toggle('outlines', 'outlines')}{toggle('seams', 'seams')}{toggle('ghosts', 'missing blocks')}
         <span role="group" aria-label="Movement">{(['orbit', 'fly'] as const).map((m) => <button key={m} type="button" aria-pressed={mode.value === m} onClick={() => { mode.value = m; setQuery({ camera: null }); stage.current?.mover.setMode(m); canvas.current?.focus(); }}>{m}</button>)}</span>
         <button type="button" onClick={() => { setQuery({ camera: null, block: null }); stage.current?.mover.overview(); stage.current?.redraw(); }}>Show all</button>
@@ -75,6 +79,7 @@ function Scene({ model, onLost }: { model: ModelView; onLost: (reason: string) =
       </div>
       <div class="viewer">
         <canvas ref={canvas} tabIndex={0} role="application" aria-label="The model in 3D. Orbit: drag, wheel. Fly: W A S D, Q and E for height, shift for speed, drag to look." />
+        {before.value && stage.current && <Before lead={stage.current} look={look.value} />}
         {!ready.value && <div class="hud">Loading the viewer …</div>}
         {look.value.ghosts && !photo.value && <Labels stats={stats.value} />}
         {photo.value && photo.value.view.photo && <Wipe key={photo.value.view.view} {...photo.value} />}
@@ -105,6 +110,33 @@ function Labels({ stats }: { stats: Stats | null }) {
     <div class="labels">
       {stats?.labels.map((l) => <span key={l.text} style={{ left: `${l.left}px`, top: `${l.top}px` }}>{l.text} {t && l.task < t.length ? `${NAMES[t.state[l.task]!]}${t.progress[l.task]! > 0 ? ` ${Math.floor(t.progress[l.task]! / 10)} %` : ''}` : ''}</span>)}
     </div>
+  );
+}
+
+/** The model before pruning, drawn through the same camera, to the right of the slider. */
+function Before({ lead, look }: { lead: Stage; look: Look }) {
+  const canvas = useRef<HTMLCanvasElement>(null);
+  const share = useSignal(50);
+  const asked = useGet<ModelView>(`/api/jobs/${jobId.value}/model?before=1`);
+  const model = asked.value;
+  useEffect(() => {
+    if (!model) return undefined;
+    let stage: Stage | null = null;
+    let live = true;
+    void import('../viewer/stage').then(({ Stage }) => {
+      if (!live) return;
+      stage = new Stage(canvas.current!, jobId.value!, model, { ...look, ghosts: false }, null);
+      stage.follow(lead);
+    });
+    return () => { live = false; stage?.close(); };
+  }, [model, look]);
+  return (
+    <>
+      <canvas ref={canvas} aria-hidden="true" style={{ position: 'absolute', inset: 0, pointerEvents: 'none', clipPath: `inset(0 0 0 ${share.value}%)` }} />
+      <div class="hud" style={{ bottom: 'auto', top: '10px', left: 'auto', right: '10px' }}>
+        {asked.error || <label style={{ color: 'inherit' }}>pruned <input type="range" min="0" max="100" value={share.value} aria-label="Wipe between the pruned model and the one before" onInput={(e) => { share.value = Number(e.currentTarget.value); }} /> before</label>}
+      </div>
+    </>
   );
 }
 

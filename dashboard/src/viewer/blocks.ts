@@ -7,6 +7,7 @@ import { square, type Cut, type Node } from './cut';
 const LOADS_AT_ONCE = 3;
 /** Blocks that are no longer wanted stay so long, in case the eye turns back. */
 const KEPT = 48;
+const SETTLE_MILLIS = 1500;
 const TINTS = ['#ffffff', '#8fd0ff', '#7fe0b0', '#ffe27a', '#ffb07a', '#ff8fb8', '#d6a0ff', '#a0b0ff', '#c0ffc0', '#ffd0d0'];
 
 interface Held {
@@ -15,6 +16,8 @@ interface Held {
   bytes: number;
   error: string;
   used: number;
+  /** Paged splats come some time after their file is open; until then the coarser block stays under them. */
+  settled: 'no' | 'soon' | 'yes';
 }
 
 export class Blocks {
@@ -28,11 +31,25 @@ export class Blocks {
   private loading = 0;
   private turn = 0;
   private closed = false;
+  private sky: SplatMesh | null = null;
   private queue: Node[] = [];
 
   constructor(private readonly job: number, private readonly model: ModelView, format: 'rad' | 'spz' | null, private readonly changed: () => void) {
     const told = model.formats;
     this.format = format ?? (told ? (told.includes('rad') ? 'rad' : 'spz') : null);
+  }
+
+  /** Sky and far background of the root: never handed on, always drawn. */
+  async backdrop(): Promise<void> {
+    if (!this.model.blocks.some((b) => b.backdrop)) return;
+    const reply = await fetch(`/api/jobs/${this.job}/backdrop.spz`);
+    if (!reply.ok || this.closed) return;
+    const mesh = new SplatMesh({ fileBytes: await reply.arrayBuffer(), fileType: SplatFileType.SPZ });
+    await mesh.initialized;
+    if (this.closed) { mesh.dispose(); return; }
+    this.group.add(mesh);
+    this.sky = mesh;
+    this.changed();
   }
 
   get pending(): number { return this.queue.length + this.loading; }
@@ -55,6 +72,7 @@ export class Blocks {
   close(): void {
     this.closed = true;
     for (const h of this.held.values()) h.mesh?.dispose();
+    this.sky?.dispose();
   }
 
   private next(): void {
@@ -62,7 +80,7 @@ export class Blocks {
       const n = this.queue.shift()!;
       const key = n.block.artefact!;
       if (this.held.has(key)) continue;
-      const held: Held = { mesh: null, mask: new dyno.DynoInt({ value: 0 }), bytes: 0, error: '', used: this.turn };
+      const held: Held = { mesh: null, mask: new dyno.DynoInt({ value: 0 }), bytes: 0, error: '', used: this.turn, settled: 'no' };
       this.held.set(key, held);
       this.loading += 1;
       this.load(n, held)
@@ -94,6 +112,7 @@ export class Blocks {
     }
     await mesh.initialized;
     held.mesh = mesh;
+    if (this.format === 'spz') held.settled = 'yes';
     mesh.visible = false;
     this.group.add(mesh);
   }
@@ -129,13 +148,14 @@ export class Blocks {
       if (known === undefined) ready.set(n, known = loaded(n) || n.children.every((c) => c !== null && wanted.has(c) && covers(c)));
       return known;
     };
+    const settled = (n: Node): boolean => (loaded(n) ? this.held.get(n.block.artefact!)!.settled === 'yes' : n.children.every((c) => c !== null && settled(c)));
     this.shown.clear();
     const visit = (n: Node): void => {
       let mask = 0;
       n.children.forEach((c, quarter) => {
         if (!c || !wanted.has(c) || !covers(c)) return;
-        mask |= 1 << quarter;
         visit(c);
+        if (settled(c)) mask |= 1 << quarter;
       });
       if (mask === 15 || !loaded(n)) return;
       const held = this.held.get(n.block.artefact!)!;
@@ -149,6 +169,10 @@ export class Blocks {
       const n = visible.get(key);
       held.mesh.visible = n !== undefined;
       if (!n) continue;
+      if (held.settled === 'no') {
+        held.settled = 'soon';
+        setTimeout(() => { held.settled = 'yes'; if (!this.closed) { this.arrange(); this.changed(); } }, SETTLE_MILLIS);
+      }
       held.used = this.turn;
       const colour = new THREE.Color(this.tint ? TINTS[n.level % TINTS.length] : '#ffffff');
       if (!held.mesh.recolor.equals(colour)) { held.mesh.recolor.copy(colour); held.mesh.updateVersion(); }

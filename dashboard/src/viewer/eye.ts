@@ -51,7 +51,8 @@ export class Mover {
     this.free();
     this.orbit.target.set(x, y, 0);
     this.camera.position.set(x, y - 0.75 * edge, 0.6 * edge);
-    this.camera.far = Math.max(2000, this.model.root.edge * 4);
+    // The backdrop, sky and hills, lies far beyond the city.
+    this.camera.far = Math.max(20000, this.model.root.edge * 40);
     this.camera.near = Math.max(0.05, edge / 5000);
     this.camera.updateProjectionMatrix();
     this.orbit.update();

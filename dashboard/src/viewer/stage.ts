@@ -51,6 +51,7 @@ export class Stage {
     this.spark = new SparkRenderer({ renderer: this.renderer, lodSplatCount: look.budget, ...blur, onDirty: () => { this.dirty = true; } });
     this.nodes = tree(model.blocks);
     this.blocks = new Blocks(job, model, format, () => { this.dirty = true; this.lines(); });
+    void this.blocks.backdrop().catch(() => { /* the city is drawn without its sky */ });
     this.boxes = new Boxes(model);
     this.scene.add(this.spark, this.blocks.group, this.boxes.group);
     this.mover = new Mover(canvas, model);
@@ -81,6 +82,17 @@ export class Stage {
     this.spark.lodSplatCount = look.budget;
     this.moved = true;
     this.choose();
+  }
+
+  /** Looks through another stage's camera: the two sides of a wipe. */
+  follow(lead: Stage): void { this.lead = lead; }
+
+  private lead: Stage | null = null;
+  private copyLead(): void {
+    const [from, to] = [this.lead!.mover.camera, this.mover.camera];
+    if (from.position.equals(to.position) && from.quaternion.equals(to.quaternion) && from.projectionMatrix.equals(to.projectionMatrix)) return;
+    to.copy(from, false);
+    this.moved = true;
   }
 
   /** Blocks have finished since: draws them without moving the eye. */
@@ -124,6 +136,7 @@ export class Stage {
     if (document.hidden) return;
     if (this.mover.step(Math.min(0.1, (time - this.last) / 1000))) this.moved = true;
     this.last = time;
+    if (this.lead) this.copyLead();
     if (this.moved && time - this.cutAt > 400) {
       this.moved = false;
       this.cutAt = time;

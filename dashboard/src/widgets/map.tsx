@@ -90,7 +90,7 @@ class Painter {
 
   constructor(private readonly canvas: HTMLCanvasElement, private readonly selection: Signal<Set<number>>) {
     // Drawn by the CPU: thousands of small rectangles stall a software GPU and gain nothing on a real one.
-    this.g = canvas.getContext('2d', { alpha: false, willReadFrequently: true })!;
+    this.g = canvas.getContext('2d', { willReadFrequently: true })!;
     this.sizes = new ResizeObserver(() => this.resize());
     this.sizes.observe(canvas);
     this.listen();
@@ -122,7 +122,9 @@ class Painter {
     this.plane.width = clientWidth;
     this.plane.height = clientHeight;
     this.fitted = false;
-    this.stale();
+    this.layerPlane = null;
+    // At once: a canvas is empty after it has changed its size.
+    this.draw();
   }
 
   private draw(): void {

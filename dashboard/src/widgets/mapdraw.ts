@@ -1,8 +1,8 @@
 // Draws the blocks of a plan. The ground layer goes into a canvas larger than the view and is blitted while panning.
 import { css, GLYPHS, ramp, stateColours, workerColour } from '../colours';
-import { FAILED, QUARANTINED, RUNNING, type TaskTable } from '../tasks';
+import { DONE, FAILED, QUARANTINED, RUNNING, WAITING, type TaskTable } from '../tasks';
 import type { Plane } from './plane';
-import { packed, parsed, type Raster } from './raster';
+import { glyph, packed, parsed, type Raster } from './raster';
 
 export type ColourBy = 'state' | 'psnr' | 'splats' | 'speed' | 'worker';
 /** A level, or -1: the finest block at each place. */
@@ -45,8 +45,10 @@ export function drawGround(g: CanvasRenderingContext2D, raster: Raster, plane: P
     dots(raster, plane, { x, y }, css('camera'), Math.round(2 * ratio), (i) => !test[i]);
     dots(raster, plane, { x, y }, css('camera-test'), Math.round(2 * ratio), (i) => !!test[i]);
   }
+  for (const { tasks, edge } of marked) glyphs(raster, plane, ratio, t, look, tasks, edge);
   raster.put(g);
-  for (const { tasks, edge } of marked) if (tasks.length < 1500) glyphs(g, plane, ratio, t, look, tasks, edge);
+  g.setTransform(ratio, 0, 0, ratio, 0, 0);
+  for (const { tasks, edge } of marked) if (edge * plane.scale > LABELLED * ratio) labels(g, plane, ratio, t, look, tasks, edge);
 }
 
 /** Fills the cells of one level; returns those that have room for a glyph and are not covered. */
@@ -62,7 +64,7 @@ function drawLevel(raster: Raster, plane: Plane, t: TaskTable, look: Look, tasks
     const top = Math.round(plane.py(ry + (by[i]! + 1) * edge));
     if (left > plane.width || top > plane.height || left + size < 0 || top + size < 0) continue;
     const fill = colour(i);
-    if (fill === '') continue;
+    if (fill === '' || places.hidden(i, look.level)) continue;
     const state = t.state[i]!;
     // From rounded edge to rounded edge, so that neighbours neither part nor overlap.
     const w = Math.round(plane.px(rx + (bx[i]! + 1) * edge)) - left;
@@ -78,25 +80,34 @@ function drawLevel(raster: Raster, plane: Plane, t: TaskTable, look: Look, tasks
   return visible;
 }
 
-function glyphs(g: CanvasRenderingContext2D, plane: Plane, ratio: number, t: TaskTable, look: Look, tasks: number[], edge: number): void {
+function glyphs(raster: Raster, plane: Plane, ratio: number, t: TaskTable, look: Look, tasks: number[], edge: number): void {
   const size = (edge * plane.scale) / ratio;
-  g.setTransform(ratio, 0, 0, ratio, 0, 0);
-  g.textAlign = 'center';
-  g.textBaseline = 'middle';
+  const pixels = Math.round(Math.min(15, Math.max(9, size * 0.36)) * ratio);
+  const [onLight, white] = [packed(css('on-light')), packed('#ffffff')];
   for (const i of tasks) {
     const state = t.state[i]!;
+    if (look.by !== 'state' && state !== FAILED && state !== QUARANTINED) continue;
+    const x = plane.px(t.plan.root.x + (t.plan.blocks.x[i]! + 0.5) * edge);
+    const y = plane.py(t.plan.root.y + (t.plan.blocks.y[i]! + 0.5) * edge);
+    raster.stamp(glyph(GLYPHS[state]!, pixels), x, size > LABELLED ? y - 7 * ratio : y, look.by === 'state' && state < 2 ? onLight : white);
+  }
+}
+
+/** Edge in CSS pixels from which a cell has room for its number. */
+const LABELLED = 46;
+
+function labels(g: CanvasRenderingContext2D, plane: Plane, ratio: number, t: TaskTable, look: Look, tasks: number[], edge: number): void {
+  g.textAlign = 'center';
+  g.textBaseline = 'middle';
+  g.font = '10px system-ui, sans-serif';
+  for (const i of tasks) {
+    const text = label(t, look, i);
+    if (text === '') continue;
     const x = plane.px(t.plan.root.x + (t.plan.blocks.x[i]! + 0.5) * edge) / ratio;
     const y = plane.py(t.plan.root.y + (t.plan.blocks.y[i]! + 0.5) * edge) / ratio;
-    const light = look.by === 'state' && (state === 0 || state === 1);
-    g.fillStyle = light ? css('on-light') : '#fff';
-    g.font = `${Math.min(15, Math.max(9, size * 0.36))}px system-ui, sans-serif`;
-    if (look.by === 'state' || state === FAILED || state === QUARANTINED) g.fillText(GLYPHS[state]!, x, size > 46 ? y - 7 : y);
-    if (size > 46) {
-      const text = label(t, look, i);
-      g.font = '10px system-ui, sans-serif';
-      if (look.by !== 'state') { g.fillStyle = 'rgba(0,0,0,.45)'; g.fillRect(x - 20, y + 1, 40, 13); g.fillStyle = '#fff'; }
-      g.fillText(text, x, y + 8);
-    }
+    if (look.by !== 'state') { g.fillStyle = 'rgba(0,0,0,.45)'; g.fillRect(x - 20, y + 1, 40, 13); }
+    g.fillStyle = look.by === 'state' && t.state[i]! < 2 ? css('on-light') : '#fff';
+    g.fillText(text, x, y + 8);
   }
 }
 
@@ -159,7 +170,18 @@ export class Places {
 
   block(l: number, x: number, y: number): number | null { return this.at.get(Places.key(l, x, y)) ?? null; }
 
-  /** Whether no finer block lies over the middle of this one. */
+  /**
+   * At the finest level a block that waits below one that is not done yet has nothing to tell: the one above shows what
+   * holds it up (it runs, or it failed).
+   */
+  hidden(i: number, level: Level): boolean {
+    if (level >= 0 || this.t.state[i] !== WAITING) return false;
+    const { level: l, x, y } = this.t.plan.blocks;
+    const parent = this.block(l[i]! - 1, x[i]! >> 1, y[i]! >> 1);
+    return parent !== null && this.t.state[parent] !== DONE;
+  }
+
+  /** Whether no finer block lies over the middle of a quarter of this one. */
   onTop(i: number, level: Level): boolean {
     if (level >= 0) return true;
     const { root, blocks: b } = this.t.plan;
@@ -174,7 +196,7 @@ export class Places {
     for (let l = level >= 0 ? level : levels - 1; l >= (level >= 0 ? level : 0); l -= 1) {
       const e = this.t.edge(l);
       const found = this.block(l, Math.floor((x - root.x) / e), Math.floor((y - root.y) / e));
-      if (found !== null) return found;
+      if (found !== null && !this.hidden(found, level)) return found;
     }
     return null;
   }

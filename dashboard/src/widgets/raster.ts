@@ -43,9 +43,48 @@ export class Raster {
     }
   }
 
+  /** A glyph in one colour, its middle at (x, y). */
+  stamp(glyph: Glyph, x: number, y: number, colour: number): void {
+    const { size, alpha } = glyph;
+    const [left, top] = [Math.round(x - size / 2), Math.round(y - size / 2)];
+    for (let row = 0; row < size; row += 1) {
+      for (let at = 0; at < size; at += 1) {
+        const a = alpha[row * size + at]!;
+        if (a > 8 && left + at >= 0 && left + at < this.width && top + row >= 0 && top + row < this.height) {
+          const i = (top + row) * this.width + left + at;
+          this.pixels[i] = mixed(this.pixels[i]!, colour, a / 255);
+        }
+      }
+    }
+  }
+
   put(g: CanvasRenderingContext2D): void {
     g.putImageData(this.image, 0, 0);
   }
+}
+
+export interface Glyph {
+  size: number;
+  alpha: Uint8Array;
+}
+
+const glyphs = new Map<string, Glyph>();
+
+/** A character drawn once at this size, as opacities. */
+export function glyph(character: string, pixels: number): Glyph {
+  const key = `${character} ${pixels}`;
+  let made = glyphs.get(key);
+  if (!made) {
+    const size = Math.ceil(pixels * 1.5);
+    const g = new OffscreenCanvas(size, size).getContext('2d', { willReadFrequently: true })!;
+    g.font = `${pixels}px system-ui, sans-serif`;
+    g.textAlign = 'center';
+    g.textBaseline = 'middle';
+    g.fillText(character, size / 2, size / 2);
+    const { data } = g.getImageData(0, 0, size, size);
+    glyphs.set(key, made = { size, alpha: Uint8Array.from({ length: size * size }, (_, i) => data[4 * i + 3]!) });
+  }
+  return made;
 }
 
 function mixed(under: number, over: number, alpha: number): number {
