@@ -27,7 +27,7 @@ PYTHON
 # The environment is not part of a level: the model is compared with all of both.
 for level in 0 1; do
     transform "$scratch/sog/lod-meta.json" --select-lod "$level" "$scratch/$level.ply"
-    transform "$scratch/$level.ply" "$scratch/sog/env/meta.json" "$scratch/whole-$level.ply"
+    transform "$scratch/$level.ply" "$scratch/sog/env.sog" "$scratch/whole-$level.ply"
 done
 psnr() { plat eval "$1" "$scratch/city" --json | tail -1 | python3 -c 'import json, sys; print(json.load(sys.stdin)["psnr"])'; }
 python3 - "$(psnr "$scratch/model")" "$(psnr "$scratch/whole-0.ply")" "$(psnr "$scratch/whole-1.ply")" <<'PYTHON'

@@ -6,6 +6,8 @@ use super::gaussian::Gaussian;
 
 /// One number in this many may lie beyond a bound.
 const BEYOND: u64 = 1000;
+/// Largest SH coefficient at least: finer steps cannot be seen, and take more bytes.
+const LEAST_SH: f32 = 0.5;
 /// Steps of a histogram.
 const STEPS: usize = 1 << 13;
 
@@ -60,7 +62,7 @@ impl Bounds {
     pub fn encoding(&self) -> Encoding {
         let (rgb_min, rgb_max) = self.colour.bounds();
         let (ln_scale_min, ln_scale_max) = self.log_scale.bounds();
-        let [sh1_max, sh2_max, sh3_max] = [0, 1, 2].map(|degree: usize| self.sh[degree].bounds().1);
+        let [sh1_max, sh2_max, sh3_max] = [0, 1, 2].map(|degree: usize| self.sh[degree].bounds().1.max(LEAST_SH));
         let (rgb_min, rgb_max) = (rgb_min.min(0.0), rgb_max.max(1.0));
         Encoding { rgb_min, rgb_max, ln_scale_min, ln_scale_max, sh1_max, sh2_max, sh3_max, lod_opacity: true }
     }
