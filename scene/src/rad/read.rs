@@ -16,6 +16,11 @@ use crate::splats::{SH_C0, Splats, sh_coefficients};
 const MAX_READ: u64 = 1 << 26;
 /// Nodes at most of a chunk: a page of the viewer.
 const MAX_CHUNK: u64 = 1 << 16;
+/// Nodes at most of a chunk of no bytes, and for each of its bytes: real ones take 10 bytes and more, and each takes memory.
+const NODES: u64 = 1 << 10;
+const NODES_PER_BYTE: u64 = 2;
+/// What a chunk must have.
+const NEEDED: [&str; 5] = ["center", "alpha", "rgb", "scales", "orientation"];
 
 /// A file.
 #[derive(Debug, Clone, PartialEq)]
@@ -78,6 +83,12 @@ fn read_chunk(bytes: &[u8], most: u64, rad: &mut Rad) -> Result<(), CodecError> 
     let (meta, at) = prefixed::<ChunkMeta>(bytes, CHUNK_MAGIC, "a RAD chunk")?;
     if meta.base != rad.nodes.len() as u64 || meta.count > most.min(MAX_CHUNK) || meta.count == 0 {
         return Err(CodecError::new(format!("a RAD chunk of {} splats from {}", meta.count, meta.base)));
+    }
+    let names = || meta.properties.iter().map(|property| property.property.as_str());
+    if meta.count > NODES + NODES_PER_BYTE * bytes.len() as u64
+        || NEEDED.iter().any(|&name| !names().any(|n| n == name))
+    {
+        return Err(CodecError::new("a RAD chunk has too few bytes or properties for its splats"));
     }
     let count = meta.count as usize;
     let payload = bytes.get(at + 8..).unwrap_or_default();
