@@ -54,7 +54,7 @@ NODE
 "$scratch/npm/node_modules/node/bin/node" "$scratch/npm/validate.cjs" "$scratch"/tiles/*.glb
 
 # Tools that follow the tileset's links find every tile; the leaves and the backdrop have all splats of the model.
-tiles() { "$scratch/npm/node_modules/node/bin/node" "$scratch/npm/node_modules/3d-tiles-tools/bin/main.js" "$@" >"$scratch/log" 2>&1 || { cat "$scratch/log" >&2; return 1; }; }
+tiles() { "$scratch/npm/node_modules/node/bin/node" "$scratch/npm/node_modules/3d-tiles-tools/build/src/cli.mjs" "$@" >"$scratch/log" 2>&1 || { cat "$scratch/log" >&2; return 1; }; }
 tiles convert -i "$scratch/tiles/tileset.json" -o "$scratch/tiles.3tz"
 for tile in "$scratch"/tiles/*.glb; do tiles analyze -i "$tile" -o "$scratch/analysed"; done
 plat export "$scratch/model" --to ply --out "$scratch/model.ply"

@@ -169,7 +169,7 @@ pub(crate) enum Format {
     Spz,
     /// A folder of streamed SOG, the format of PlayCanvas and SuperSplat, with the model's levels of detail
     Sog,
-    /// RAD, the format of Spark, which streams it: a tree of levels of detail above the model's splats
+    /// RAD, one file that Spark streams: a tree of levels of detail above the model's finest splats
     Rad,
     /// A folder of 3D Tiles with splats in glTF, which CesiumJS streams, with the model's levels of detail
     Tiles,
