@@ -73,7 +73,8 @@ names = re.findall(rb"property float (\w+)", header)
 own = dict(zip(names, numpy.frombuffer(body, "<f4").reshape(-1, len(names)).T))
 for name, column in ((b"x", model.means[:, 0]), (b"f_dc_2", model.sh0[:, 2]), (b"rot_3", model.quats[:, 3]), (b"opacity", model.opacities.ravel())):
     assert numpy.array_equal(own[name], column), name
-assert packed.means.shape == model.means.shape and numpy.abs(packed.means - model.means).max() < 1e-3
+# gsply takes SPZ's axes as stored: y and z about.
+assert packed.means.shape == model.means.shape and numpy.abs(packed.means * [1, -1, -1] - model.means).max() < 1e-3
 print(f"gsply: {len(model.means)} splats in PLY and SPZ, SH degree {model.get_sh_degree()}")
 
 def finest(tile):
