@@ -223,7 +223,7 @@ impl Project {
         };
         let up = ground.to_world(DVec3::Z);
         json!({
-            "seq": seq, "root": self.root(), "centre": centre.to_array(), "up": up.to_array(), "before_prune": false, "formats": ["spz"],
+            "seq": seq, "root": self.root(), "centre": centre.to_array(), "up": up.to_array(), "before_prune": false, "formats": ["rad", "spz"],
             "sh_degree": plan.settings.sh_degree, "antialiased": plan.settings.antialiased,
             "blocks": plan.tasks.iter().zip(0..).map(block).collect::<Vec<Value>>(),
         })
