@@ -1,5 +1,5 @@
 // Draws views of a folder that .ci/check-viewers.sh laid out: node draw.mjs FOLDER OUT CHROMIUM VIEWER, where VIEWER.html is a page of the folder.
-// A page sets window.ready, then draws the view of a frame of cameras.json by window.draw(index), which returns a PNG as base64 and figures.
+// QUERY is added to its address, and VERBOSE=1 prints what it warns of. A page sets window.ready, then draws the view of a frame of cameras.json by window.draw(index), which returns a PNG as base64 and figures.
 import { createReadStream, readFileSync, statSync, writeFileSync } from "node:fs";
 import { createServer } from "node:http";
 import { extname, join, normalize, resolve } from "node:path";
