@@ -10,7 +10,7 @@
 
 use std::borrow::Cow;
 
-use blocks::{Cut, Plan, ViewTree};
+use blocks::{Cut, Plan};
 use dataset::windows::WindowReader;
 use model::Tree;
 use render::{Frame, Options};
@@ -31,8 +31,6 @@ const SAMPLE_STEP: usize = 4;
 pub enum CutRequest {
     /// The blocks of this level, and coarser ones where there are none.
     Level(u8),
-    /// For each view the sharpest cut with at most this many splats.
-    Budget(u32),
 }
 
 /// One model at a cut's viewing distance, rendered in three ways.
@@ -59,10 +57,8 @@ impl AwayFigures {
 /// Figures of one cut: means over the held-out views. The field names are keys of `eval/report.json`.
 #[derive(Debug, Clone, Serialize)]
 pub struct CutFigures {
-    /// Of [`CutRequest::Level`].
-    pub level: Option<u8>,
-    /// Of [`CutRequest::Budget`].
-    pub budget: Option<u32>,
+    /// The finest level.
+    pub level: u8,
     /// Splats rendered.
     pub splats: f64,
     /// At full resolution, rendered as the model says.
@@ -89,7 +85,6 @@ pub(crate) struct CutMeter<'a> {
     finest: &'a Splats,
     /// Rows of `finest`, most important first.
     ranking: Vec<u32>,
-    viewer: ViewTree,
     reader: &'a WindowReader,
     requests: &'a [CutRequest],
     sums: Vec<Sums>,
@@ -102,9 +97,8 @@ impl<'a> CutMeter<'a> {
         requests: &'a [CutRequest],
         reader: &'a WindowReader,
     ) -> Self {
-        let viewer = ViewTree::new(&tree.plan, tree.results.iter().map(|(&block, splats)| (block, splats)));
         let ranking = by_importance(finest);
-        Self { tree, finest, ranking, viewer, reader, requests, sums: vec![Sums::default(); requests.len()] }
+        Self { tree, finest, ranking, reader, requests, sums: vec![Sums::default(); requests.len()] }
     }
 
     /// Measures all cuts on the view of this index; `finest` are its figures for the finest model, `foreground` its foreground
@@ -118,10 +112,8 @@ impl<'a> CutMeter<'a> {
     ) -> Result<(), EvalError> {
         let view = &self.reader.capture().views[index as usize];
         for at in 0..self.requests.len() {
-            let cut = match self.requests[at] {
-                CutRequest::Level(level) => at_level(&self.tree.plan, level),
-                CutRequest::Budget(budget) => self.viewer.cut(&view.camera, budget as usize).unwrap_or_default(),
-            };
+            let CutRequest::Level(level) = self.requests[at];
+            let cut = at_level(&self.tree.plan, level);
             let splats = self.tree.merged(&cut);
             let mut most_important = self.ranking[..splats.len().min(self.ranking.len())].to_vec();
             most_important.sort_unstable();
@@ -182,7 +174,7 @@ fn at_level(plan: &Plan, level: u8) -> Cut {
 }
 
 /// Rows by opacity times the area of the splat's two longest axes, largest first.
-fn by_importance(splats: &Splats) -> Vec<u32> {
+pub(crate) fn by_importance(splats: &Splats) -> Vec<u32> {
     let importance = |i: usize| {
         let mut scales = [0, 1, 2].map(|axis| splats.col(column::LOG_SCALE + axis)[i]);
         scales.sort_by(f32::total_cmp);
@@ -254,13 +246,9 @@ impl Sums {
         let difference = |a: &Means, b: &Means| Some(a.psnr? - b.psnr?);
         let full = Means::of(&self.full);
         let [away, away_finest, away_pruned] = self.away.each_ref().map(away_figures);
-        let (level, budget) = match request {
-            CutRequest::Level(level) => (Some(level), None),
-            CutRequest::Budget(budget) => (None, Some(budget)),
-        };
+        let CutRequest::Level(level) = request;
         CutFigures {
             level,
-            budget,
             splats: mean(&self.splats),
             loss_db: difference(&Means::of(&self.finest), &full),
             full,

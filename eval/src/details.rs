@@ -22,8 +22,8 @@ pub enum Levels {
 pub struct DetailOptions {
     /// Measure the tree cut at these levels.
     pub levels: Option<Levels>,
-    /// For each view, measure the sharpest cut with at most this many splats.
-    pub budget: Option<u32>,
+    /// Measure what viewers draw within these budgets of splats.
+    pub budgets: Vec<u32>,
     /// Measure the seams between the model's own blocks.
     pub seams: bool,
     /// Measure at the seams of this model instead, of the same capture.
@@ -43,6 +43,7 @@ pub struct Details {
     /// The tree of [`DetailOptions::seams_of`].
     pub(crate) other: Option<Tree>,
     pub(crate) seam_metres: Option<f64>,
+    pub(crate) budgets: Vec<u32>,
 }
 
 impl Details {
@@ -53,10 +54,11 @@ impl Details {
     pub fn read(model: &Path, options: &DetailOptions) -> Result<Self, BadInput> {
         let other = options.seams_of.as_deref().map(read_tree).transpose()?;
         let own_seams = options.seams || (options.seam_metres.is_some() && other.is_none());
-        let needs_own = own_seams || options.levels.is_some() || options.budget.is_some();
+        let needs_own = own_seams || options.levels.is_some();
         let own = needs_own.then(|| read_tree(model)).transpose()?;
         let cuts = own.as_ref().map_or(Ok(Vec::new()), |tree| cut_requests(options, &tree.plan))?;
-        let details = Self { own, cuts, own_seams, other, seam_metres: options.seam_metres };
+        let budgets = options.budgets.clone();
+        let details = Self { own, cuts, own_seams, other, seam_metres: options.seam_metres, budgets };
         if details.seam_tree().is_some_and(|tree| tree.plan.leaves().blocks().len() < 2) {
             let path = options.seams_of.as_deref().unwrap_or(model).display().to_string();
             let advice = "name a model of several blocks with --seams-of";
@@ -72,7 +74,7 @@ impl Details {
 }
 
 fn cut_requests(options: &DetailOptions, plan: &Plan) -> Result<Vec<CutRequest>, BadInput> {
-    let mut requests = match options.levels {
+    let requests = match options.levels {
         None => Vec::new(),
         Some(Levels::All) => (0..=plan.levels).map(CutRequest::Level).collect(),
         Some(Levels::Only(level)) if level <= plan.levels => vec![CutRequest::Level(level)],
@@ -81,10 +83,9 @@ fn cut_requests(options: &DetailOptions, plan: &Plan) -> Result<Vec<CutRequest>,
             return Err(BadInput::new("--level", problem, "give a level that it has, or all"));
         }
     };
-    requests.extend(options.budget.map(CutRequest::Budget));
     if !requests.is_empty() && plan.tasks.iter().all(|task| task.block.level > 0) {
         let advice = "train with --blocks tree";
-        return Err(BadInput::new("--level or --budget", "needs a tree: the model has no coarser blocks", advice));
+        return Err(BadInput::new("--level", "needs a tree: the model has no coarser blocks", advice));
     }
     Ok(requests)
 }

@@ -11,6 +11,7 @@ use render::{Frame, Options};
 use scene::{BadInput, Camera, Splats};
 use train::Backend;
 
+use crate::budgets::{BudgetFigures, BudgetMeter};
 use crate::cuts::{CutFigures, CutMeter};
 use crate::details::Details;
 use crate::figures::{Comparison, ViewFigures, clamped};
@@ -75,6 +76,8 @@ pub struct Evaluation {
     pub sheet: PathBuf,
     /// In the order of the request.
     pub cuts: Vec<CutFigures>,
+    /// In the order of the request.
+    pub budgets: Vec<BudgetFigures>,
     /// Figures near the seams.
     pub seams: Option<SeamReport>,
 }
@@ -108,6 +111,9 @@ pub fn evaluate(request: &Request, observer: &dyn Observer) -> Result<Evaluation
     let has_cuts = !details.cuts.is_empty();
     let mut cuts =
         own.as_ref().filter(|_| has_cuts).map(|own| CutMeter::new(own.tree, &own.finest, &details.cuts, &reader));
+    let has_budgets = !details.budgets.is_empty();
+    let budgets = has_budgets.then(|| BudgetMeter::new(&model.splats, model.antialiased, &details.budgets));
+    let mut budgets = budgets.transpose()?;
     let seam_scene = other.as_ref().or(own.as_ref().filter(|_| details.own_seams));
     let mut seams = seam_scene
         .map(|scene| SeamMeter::new(scene.tree, &scene.finest, other.is_some(), details.seam_metres, &photos.capture));
@@ -142,6 +148,9 @@ pub fn evaluate(request: &Request, observer: &dyn Observer) -> Result<Evaluation
         observer.progress("evaluating", i as u64 + 1, total, "");
         if i >= test.len() {
             continue;
+        }
+        if let Some(budgets) = &mut budgets {
+            budgets.add_view(view, &photo, &views[i], &mut renderer)?;
         }
         let own_frame = own.as_ref().map(|own| own.foreground(&mut renderer, &view.camera)).transpose()?;
         if let (Some(cuts), Some(foreground)) = (&mut cuts, &own_frame) {
@@ -183,6 +192,7 @@ pub fn evaluate(request: &Request, observer: &dyn Observer) -> Result<Evaluation
         detections,
         sheet,
         cuts: cuts.map_or(Vec::new(), CutMeter::figures),
+        budgets: budgets.map_or(Vec::new(), BudgetMeter::figures),
         seams: seams.map(|seams| seams.finish(&photos.capture, out, &mut renderer)).transpose()?,
     })
 }

@@ -8,6 +8,7 @@
 //! Architecture invariant: no command line, no terminal, no clock. Progress and time come from the caller's [`Observer`].
 
 mod birdseye;
+mod budgets;
 mod depth;
 mod details;
 mod detections;
@@ -34,6 +35,7 @@ mod surface;
 pub mod cuts;
 pub mod seams;
 
+pub use budgets::BudgetFigures;
 pub use birdseye::{birdseye_camera, oblique_camera};
 pub use depth::{DepthFigures, DepthSummary};
 pub use details::{DetailOptions, Details, Levels};

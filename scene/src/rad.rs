@@ -21,6 +21,7 @@ mod gaussian;
 mod meta;
 mod quantise;
 mod read;
+mod view_cut;
 
 use glam::DVec3;
 

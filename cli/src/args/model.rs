@@ -56,9 +56,9 @@ pub(crate) struct EvalArgs {
     /// Also measure the tree cut at level L, or at every level, against the finest model
     #[arg(long, value_name = "L|all", value_parser = levels)]
     pub(crate) level: Option<Levels>,
-    /// Also measure for each view the sharpest cut of the tree with at most N splats
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
-    pub(crate) budget: Option<u32>,
+    /// Also measure what a viewer draws with at most N splats a view, against the whole model and against as many of its most important splats
+    #[arg(long, value_name = "N,...", value_delimiter = ',', value_parser = clap::value_parser!(u32).range(1..))]
+    pub(crate) budget: Vec<u32>,
     /// Also measure pixels near the faces between blocks against the other pixels of the same views, and the jump across each face
     #[arg(long)]
     pub(crate) seams: bool,
