@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use eval::cuts::CutFigures;
 use eval::seams::SeamReport;
-use eval::{ByKind, DepthReport, DetectionReport, Group, Summary, ViewFigures, mean};
+use eval::{BudgetFigures, ByKind, DepthReport, DetectionReport, Group, Summary, ViewFigures, mean};
 use perceive::Counts;
 use serde::Serialize;
 
@@ -41,9 +41,12 @@ pub(crate) struct Evaluated {
     /// With `--detector`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) detections: Option<DetectionReport>,
-    /// With `--level` or `--budget`.
+    /// With `--level`.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub(crate) cuts: Vec<CutFigures>,
+    /// With `--budget`.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub(crate) budgets: Vec<BudgetFigures>,
     /// With `--seams` or `--seams-of`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) seams: Option<SeamReport>,
@@ -66,6 +69,7 @@ impl Evaluated {
             depth: None,
             detections: None,
             cuts: Vec::new(),
+            budgets: Vec::new(),
             seams: None,
         }
     }
@@ -121,6 +125,9 @@ pub(crate) fn text(evaluated: &Evaluated) -> String {
     }
     if !evaluated.cuts.is_empty() {
         text += &format!("\n{}\n", cuts(&evaluated.cuts));
+    }
+    if !evaluated.budgets.is_empty() {
+        text += &format!("\n{}", budgets(&evaluated.budgets));
     }
     if let Some(report) = &evaluated.seams {
         text += &format!("\n{}\n\n", seams(report));
@@ -178,11 +185,7 @@ fn cuts(cuts: &[CutFigures]) -> String {
          cut         splats    PSNR    loss    mip    PSNR    loss  gain on the pruned finest   rendered\n",
     );
     for cut in cuts {
-        let name = match (cut.level, cut.budget) {
-            (Some(level), _) => format!("level {level}"),
-            (_, Some(budget)) => format!("≤{budget}"),
-            (None, None) => String::new(),
-        };
+        let name = format!("level {}", cut.level);
         let (way, best) = cut.away.best();
         text += &format!(
             "{name:<10} {:>7.0} {:>7} {:>7} {:>6.1} {:>7} {:>7} {:>26}   {way}\n",
@@ -194,6 +197,16 @@ fn cuts(cuts: &[CutFigures]) -> String {
             figure(cut.away_loss_db, 2),
             cut.away_gain_db.map_or("-".into(), |db| format!("{db:+.2}")),
         );
+    }
+    text
+}
+
+fn budgets(budgets: &[BudgetFigures]) -> String {
+    let mut text = String::from("  budget    drawn    PSNR    loss  gain on as many of the most important splats\n");
+    for of in budgets {
+        let gain = of.gain_db.map_or("-".into(), |db| format!("{db:+.2}"));
+        let (psnr, loss) = (figure(of.figures.psnr, 2), figure(of.loss_db, 2));
+        text += &format!("{:>8} {:>8.0} {psnr:>7} {loss:>7} {gain:>5}\n", of.budget, of.drawn);
     }
     text
 }

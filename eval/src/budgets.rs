@@ -51,7 +51,8 @@ struct Sums {
 impl<'a> BudgetMeter<'a> {
     /// Builds the tree of `finest`.
     pub(crate) fn new(finest: &'a Splats, antialiased: bool, budgets: &[u32]) -> Result<Self, BadInput> {
-        let bad = |error: scene::CodecError| BadInput::new("the model", error.to_string(), "repair it, or train it again");
+        let bad =
+            |error: scene::CodecError| BadInput::new("the model", error.to_string(), "repair it, or train it again");
         let count = finest.len().max(1) as f64;
         let origin = ((0..finest.len()).map(|i| finest.mean(i).as_dvec3() / count)).sum::<DVec3>().round();
         // Through the bytes, as viewers see them.

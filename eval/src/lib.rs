@@ -35,8 +35,8 @@ mod surface;
 pub mod cuts;
 pub mod seams;
 
-pub use budgets::BudgetFigures;
 pub use birdseye::{birdseye_camera, oblique_camera};
+pub use budgets::BudgetFigures;
 pub use depth::{DepthFigures, DepthSummary};
 pub use details::{DetailOptions, Details, Levels};
 pub use detections::{DetectionFigures, DetectionSummary};

@@ -158,7 +158,7 @@ pub(crate) fn tree(args: &BenchTreeArgs, output: &Output) -> Result<(), Failure>
     });
     let level = |cut: &CutFigures| {
         let away = [&cut.away, &cut.away_finest, &cut.away_pruned].map(|figures| figures.best().1.psnr);
-        let level = cut.level?;
+        let level = cut.level;
         Some(TreeLevel { level, splats: cut.splats, psnr: cut.full.psnr, away_mip: cut.away_mip, away_psnr: away })
     };
     let line = PartLine::Tree(Tree {

@@ -30,7 +30,7 @@ pub(crate) fn measure(args: &EvalArgs, output: &Output) -> Result<Evaluated, Fai
     let model = model::read(&args.model)?;
     let options = DetailOptions {
         levels: args.level,
-        budget: args.budget,
+        budgets: args.budget.clone(),
         seams: args.seams,
         seams_of: args.seams_of.clone(),
         seam_metres: args.seam_metres,
@@ -111,7 +111,19 @@ fn evaluated(request: &Request, output: &Output) -> Result<Evaluated, Failure> {
     };
     record.set_figures(&evaluation.views);
     record.detections_kept = evaluation.detections.as_ref().and_then(|found| found.groups.held_out.all.share_kept);
-    let Evaluation { views, by_kind, stretches, trained_on, depth, detections, sheet, cuts, seams, .. } = evaluation;
+    let Evaluation { views, by_kind, stretches, trained_on, depth, detections, sheet, cuts, budgets, seams, .. } =
+        evaluation;
     let evaluated = Evaluated::new(record, views);
-    Ok(Evaluated { by_kind, stretches, trained_on, depth, detections, sheet: Some(sheet), cuts, seams, ..evaluated })
+    Ok(Evaluated {
+        by_kind,
+        stretches,
+        trained_on,
+        depth,
+        detections,
+        sheet: Some(sheet),
+        cuts,
+        budgets,
+        seams,
+        ..evaluated
+    })
 }

@@ -116,7 +116,8 @@ mod tests {
             splats.push(&Splat::round(at, -1.5, Vec3::splat(f32::from(i % 7) / 7.0), 0.8));
         }
         let pinhole = Pinhole { width: 200, height: 100, fx: 100.0, fy: 100.0, cx: 100.0, cy: 50.0 };
-        let camera = Camera { pinhole, camera_from_world: Rigid { rotation: DQuat::IDENTITY, translation: DVec3::ZERO } };
+        let camera =
+            Camera { pinhole, camera_from_world: Rigid { rotation: DQuat::IDENTITY, translation: DVec3::ZERO } };
         (read(&write(&splats, DVec3::ZERO, None).unwrap()).unwrap(), camera)
     }
 
