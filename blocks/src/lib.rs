@@ -31,7 +31,6 @@ pub mod seams;
 mod split;
 #[cfg(test)]
 mod testing;
-pub mod view_cut;
 mod view_kind;
 mod view_selection;
 mod visibility;
@@ -51,5 +50,4 @@ pub use plan::{EvalTask, MAX_VIEWS_PER_STEP, Mode, Plan, PlanError, PlanSettings
 pub use planner::{plan, plan_at_most};
 pub use seams::{Face, Seams};
 pub use split::{Part, Split};
-pub use view_cut::ViewTree;
 pub use view_kind::{ViewKind, view_kinds};

@@ -129,7 +129,7 @@ fn make(project: &Project, wanted: Wanted, to: &std::path::Path) -> Result<Optio
     }
     let antialiased = project.plan.settings.antialiased;
     let bytes = match format {
-        // The splats are relative to the centre already.
+        // The splats are relative to the block's origin already.
         Format::Rad => rad::write(&splats, DVec3::ZERO, None).map_err(|error| error.to_string())?,
         Format::Spz => spz::write(&splats, antialiased, spz::Version::V3).map_err(|error| error.to_string())?,
     };

@@ -195,11 +195,16 @@ impl Project {
         json!({"x": ground.min.x, "y": ground.min.y, "edge": ground.edge_metres})
     }
 
-    /// World place that the splats sent to a viewer are relative to: f32 and f16 are exact near the origin only.
+    /// The middle of what a viewer shows, ground metres: places are sent relative to it, as f32 and f16 are exact near the origin only.
     pub(crate) fn centre(&self) -> DVec3 {
         let ground = &self.plan.ground;
-        let middle = ground.min + 0.5 * ground.edge_metres;
-        ground.to_world(middle.extend(ground.height_metres)).round()
+        (ground.min + 0.5 * ground.edge_metres).extend(ground.height_metres).round()
+    }
+
+    /// Where a block's own origin is, ground metres from [`centre`](Self::centre).
+    fn origin(&self, block: BlockId) -> DVec3 {
+        let ground = &self.plan.ground;
+        (ground.core(block).centre().extend(ground.height_metres) - self.centre()).round()
     }
 
     /// The tree for a viewer; `done` has the artefact and the splats of a finished block, by task.
@@ -208,22 +213,16 @@ impl Project {
         let [low, high] = self.heights();
         let block = |(task, index): (&blocks::Task, u32)| {
             let core = ground.core(task.block);
-            let corners = (0..8).map(|corner| {
-                let pick = |bit: u32, a: f64, b: f64| if corner >> bit & 1 == 0 { a } else { b };
-                let at =
-                    DVec3::new(pick(0, core.min.x, core.max.x), pick(1, core.min.y, core.max.y), pick(2, low, high));
-                ground.to_world(at) - centre
-            });
-            let (min, max) = corners.fold((DVec3::INFINITY, DVec3::NEG_INFINITY), |(a, b), at| (a.min(at), b.max(at)));
+            let (min, max) = (core.min.extend(low) - centre, core.max.extend(high) - centre);
             let (artefact, splats) = done(index).unzip();
             json!({
                 "block": task.block.to_string(), "task": index, "artefact": artefact, "splats": splats.unwrap_or(0),
-                "rho_metres": task.rho_metres, "box": [min.x, min.y, min.z, max.x, max.y, max.z],
+                "origin": self.origin(task.block).to_array(), "rho_metres": task.rho_metres, "box": [min.x, min.y, min.z, max.x, max.y, max.z],
             })
         };
-        let up = ground.to_world(DVec3::Z);
+        let turn = ground.ground_from_world.to_array();
         json!({
-            "seq": seq, "root": self.root(), "centre": centre.to_array(), "up": up.to_array(), "before_prune": false, "formats": ["rad", "spz"],
+            "seq": seq, "root": self.root(), "centre": centre.to_array(), "turn": turn, "before_prune": false, "formats": ["rad", "spz"],
             "sh_degree": plan.settings.sh_degree, "antialiased": plan.settings.antialiased,
             "blocks": plan.tasks.iter().zip(0..).map(block).collect::<Vec<Value>>(),
         })
@@ -241,7 +240,8 @@ impl Project {
         }
     }
 
-    /// The splats that a finished block owns, about [`centre`](Self::centre); with `backdrop` the root's background instead.
+    /// The splats that a finished block owns, about its own origin, in world axes; with `backdrop` the root's background instead, about the
+    /// [`centre`](Self::centre).
     pub(crate) fn splats(&self, block: BlockId, artefact: ArtefactId, backdrop: bool) -> Result<Splats, String> {
         let bytes = match &self.results {
             Results::Store(store) => store.get(artefact).map_err(|error| error.to_string())?.to_vec(),
@@ -251,12 +251,13 @@ impl Project {
             }
         };
         let (splats, _) = frame::decode_result(&bytes).map_err(|error| format!("block {block}: {error}"))?;
-        let (ground, centre) = (&self.plan.ground, self.centre());
+        let ground = &self.plan.ground;
+        let origin = ground.to_world(self.centre() + if backdrop { DVec3::ZERO } else { self.origin(block) });
         let mut kept = splats.filter(|i| {
             let place = splats.mean(i).as_dvec3();
             splats.is_finite(i) && ground.is_background(place) == backdrop && (backdrop || ground.owns(block, place))
         });
-        for (column, middle) in kept.columns_mut().iter_mut().zip(centre.to_array()) {
+        for (column, middle) in kept.columns_mut().iter_mut().zip(origin.to_array()) {
             column.iter_mut().for_each(|value| *value = (f64::from(*value) - middle) as f32);
         }
         Ok(kept)
@@ -311,16 +312,17 @@ impl Project {
         figures.by_block.get(task).copied().flatten()
     }
 
-    /// The views, with their cameras relative to [`centre`](Self::centre).
+    /// The views, with their cameras on the ground's axes.
     pub(crate) fn views(&self) -> Value {
         let Some(capture) = &self.capture else { return json!({"views": []}) };
         let figures = self.figures.read().unwrap_or_else(PoisonError::into_inner);
-        let (split, kinds, centre) = (Split::of(&self.plan, capture), view_kinds(capture), self.centre());
+        let (split, kinds, ground) = (Split::of(&self.plan, capture), view_kinds(capture), self.plan.ground);
         let leaves = self.plan.leaves();
         let view = |(index, view): (usize, &scene::View)| {
             let k = &view.camera.pinhole;
             let pose = view.camera.camera_from_world.inverse();
-            let matrix = DMat4::from_rotation_translation(pose.rotation, pose.translation - centre);
+            let turned = (ground.ground_from_world * pose.rotation, ground.from_world(pose.translation));
+            let matrix = DMat4::from_rotation_translation(turned.0, turned.1);
             let world_from_camera = matrix.transpose().to_cols_array();
             let of = figures.by_view.get(&(index as u32));
             json!({

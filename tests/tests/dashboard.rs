@@ -142,12 +142,15 @@ async fn a_job_is_shown_as_it_runs_and_can_be_controlled() {
         (&model["blocks"][0]["artefact"], &model["centre"]),
         (&artefact.clone().into(), &serde_json::json!([50.0, 50.0, 0.0]))
     );
+    assert_eq!(model["blocks"][1]["origin"], serde_json::json!([-25.0, -25.0, 0.0]));
     assert!(model["blocks"][1]["artefact"].is_null());
     let path = format!("/api/jobs/1/blocks/{artefact}.spz");
     let (status, head, whole) = get(at, &path, "").await;
     assert!(status == 200 && head.contains("immutable") && head.contains("etag: "), "{head}");
     let (splats, _) = scene::spz::read(&whole).unwrap();
     assert!(splats.len() == 2 && (splats.mean(0) - glam::Vec3::new(-25.0, -25.0, 1.0)).length() < 1e-3);
+    let rad = scene::rad::read(&get(at, &format!("/api/jobs/1/blocks/{artefact}.rad"), "").await.2).unwrap();
+    assert_eq!(rad.leaves().len(), 2);
     let (status, head, part) = get(at, &path, "range: bytes=2-5\r\n").await;
     assert!(status == 206 && part == whole[2..6] && head.contains(&format!("bytes 2-5/{}", whole.len())), "{head}");
     assert_eq!(get(at, &path, "range: bytes=99999999-\r\n").await.0, 416);

@@ -158,8 +158,8 @@ pub(crate) fn tree(args: &BenchTreeArgs, output: &Output) -> Result<(), Failure>
     });
     let level = |cut: &CutFigures| {
         let away = [&cut.away, &cut.away_finest, &cut.away_pruned].map(|figures| figures.best().1.psnr);
-        let level = cut.level;
-        Some(TreeLevel { level, splats: cut.splats, psnr: cut.full.psnr, away_mip: cut.away_mip, away_psnr: away })
+        let (level, splats) = (cut.level, cut.splats);
+        TreeLevel { level, splats, psnr: cut.full.psnr, away_mip: cut.away_mip, away_psnr: away }
     };
     let line = PartLine::Tree(Tree {
         commit: commit().to_owned(),
@@ -167,7 +167,7 @@ pub(crate) fn tree(args: &BenchTreeArgs, output: &Output) -> Result<(), Failure>
         scene: args.scene.clone().unwrap_or_else(|| of_tree.record.scene.clone()),
         downscale: of_tree.record.downscale,
         splats: of_tree.record.splats,
-        levels: of_tree.cuts.iter().filter_map(level).collect(),
+        levels: of_tree.cuts.iter().map(level).collect(),
         faces,
         command: invocation(),
     });
