@@ -1,7 +1,8 @@
 #!/usr/bin/env bash
-# Whether viewers draw what `plat export` writes as plat does: a small tree as 3D Tiles in CesiumJS in headless Chromium, from cameras of its
-# capture, beside `plat render`. Prints the PSNR of each view, and keeps the pictures in OUT (out/viewers), Cesium's left. Not part of .ci/run.
-# Half a minute. Needs Node, Debian's chromium, Python with NumPy and Pillow. PLAT names the program; without it, it is built.
+# Whether viewers draw what `plat export` writes as plat does: a small tree in headless Chromium, from cameras of its capture, beside `plat render`:
+# as 3D Tiles in CesiumJS, as RAD in Spark, as streamed SOG in PlayCanvas and Babylon.js, each with the finest splats. Prints the PSNR of each
+# view, and keeps the pictures in OUT (out/viewers), the viewer's left. Not part of .ci/run. Two minutes. Needs Node, Debian's chromium, Python
+# with NumPy and Pillow. PLAT names the program; without it, it is built. VIEWERS names some viewers.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 out=${OUT:-out/viewers}
@@ -14,10 +15,13 @@ plat train "$scratch/city" --out "$scratch/model" --levels 1 --residual 0 --step
 
 web=$scratch/web
 mkdir -p "$web"
-npm install --silent --no-audit --no-fund --prefix "$web" cesium@1.145.0 playwright-core@1.64.1
+npm install --silent --no-audit --no-fund --prefix "$web" playwright-core@1.64.1 cesium@1.145.0 @sparkjsdev/spark@2.2.0 three@0.187.0 \
+    playcanvas@2.23.3 @babylonjs/core@9.35.0 @babylonjs/loaders@9.28.0 fflate@0.8.2
 plat export "$scratch/model" --to tiles --out "$web/tiles"
+plat export "$scratch/model" --to rad --out "$web/city.rad"
+plat export "$scratch/model" --to sog --out "$web/sog"
 ln -s node_modules/cesium/Build/Cesium "$web/Cesium"
-cp .ci/viewers/cesium.html "$web/"
+cp .ci/viewers/*.html .ci/viewers/views.mjs "$scratch/model/model/model.json" "$web/"
 python3 - "$scratch/city/transforms.json" "$web/cameras.json" <<'PYTHON'
 import json, sys
 
@@ -31,28 +35,12 @@ for frame in frames:
 json.dump({"frames": frames}, open(sys.argv[2], "w"))
 PYTHON
 plat render "$scratch/model" --cameras "$web/cameras.json" --out "$scratch/ours"
-count=$(python3 -c 'import json, sys; print(len(json.load(open(sys.argv[1]))["frames"]))' "$web/cameras.json")
-mapfile -t indices < <(seq 0 $((count - 1)))
-node .ci/viewers/cesium.mjs "$web" "$scratch" "${CHROMIUM:-/usr/bin/chromium}" 1 "${indices[@]}"
-python3 - "$web/cameras.json" "$scratch" "$out" <<'PYTHON'
-import json, math, sys
-import numpy
-from PIL import Image
-
-cameras, scratch, out = sys.argv[1:]
-worst = {}
-for index, frame in enumerate(json.load(open(cameras))["frames"]):
-    name = frame["file_path"].removeprefix("images/")
-    pictures = [Image.open(f"{scratch}/{index}.png").convert("RGB"), Image.open(f"{scratch}/ours/images/{name}").convert("RGB")]
-    theirs, ours = (numpy.asarray(picture, float) for picture in pictures)
-    psnr = 10 * math.log10(255**2 / max(((theirs - ours) ** 2).mean(), 1e-9))
-    both = Image.new("RGB", (2 * pictures[0].width, pictures[0].height))
-    for side, picture in enumerate(pictures):
-        both.paste(picture, (side * picture.width, 0))
-    both.save(f"{out}/cesium-{name}")
-    print(f"{name}: {psnr:.2f} dB between CesiumJS and plat")
-    kind = name.split("-")[0]
-    worst[kind] = min(worst.get(kind, math.inf), psnr)
-# A black picture has 7 or 8 dB; right ones had 29 and more from the air, 25 and more on the street, one 23.
-assert worst["aerial"] > 25 and worst["street"] > 18, worst
-PYTHON
+# A black picture has 7 or 8 dB. What right ones had at least, from the air and on the street: CesiumJS 29 and 25, Spark 44 and 30, PlayCanvas
+# 31 and 29, Babylon.js 34 and 26. On the street each clips large splats before the camera in its way (one view drawn by hand in CesiumJS: 23).
+# CesiumJS and PlayCanvas widen splats by 0.075 square pixels in place of 0.3, which no option changes.
+declare -A least=([cesium]="25 18" [spark]="38 27" [playcanvas]="29 27" [babylon]="31 23")
+for viewer in ${VIEWERS:-cesium spark playcanvas babylon}; do
+    node .ci/viewers/draw.mjs "$web" "$scratch" "${CHROMIUM:-/usr/bin/chromium}" "$viewer"
+    read -ra limits <<<"${least[$viewer]}"
+    python3 .ci/viewers/compare.py "$viewer" "$web/cameras.json" "$scratch" "$scratch/ours" "$out" "${limits[@]}"
+done

@@ -138,6 +138,10 @@ fn a_city_is_trained_measured_and_exported_reproducibly() {
     assert_eq!((&streamed["splats"], &streamed["levels"]), (&merged.into(), &2.into()));
     assert!(text("streamed/lod-meta.json").contains("\"lodLevels\": 2"));
     refused(at, &["export", "one", "--to", "sog", "--out", "streamed"], "streamed");
+    let tree = done(at, &["export", "one", "--to", "rad", "--out", "tree/one.rad"]);
+    let leaves = scene::rad::read(&bytes("tree/one.rad")).unwrap().leaves();
+    assert_eq!((&tree["splats"], leaves.len()), (&merged.into(), merged));
+    assert_eq!(at.join("tree").read_dir().unwrap().count(), 1, "scratch files are removed");
 
     // Rendering needs cameras, but no photos.
     std::fs::remove_dir_all(at.join("city/images")).unwrap();

@@ -116,6 +116,7 @@ fn a_path_that_cannot_be_written_is_named() {
             &[&SYNTH[..], &["--out", out]].concat(),
             &["render", "some.ply", "--cameras", "city", "--out", out],
             &["export", "model", "--to", "ply", "--out", file],
+            &["export", "model", "--to", "rad", "--out", file],
             &["prune", "some.ply", "--keep", "0.5", "--out", file],
             &["prune", "model", "--keep", "0.5", "--out", out],
             &["eval", "some.ply", "city", "--out", out],

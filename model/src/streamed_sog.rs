@@ -3,7 +3,7 @@
 //! ```text
 //! OUT/lod-meta.json       the tree; written last, so that a folder without it is incomplete
 //! OUT/0_0/meta.json ...   splats of the finest level; 1_0 those of the level above, and so on
-//! OUT/env/meta.json       the backdrop, which is always drawn
+//! OUT/env.sog             the backdrop, which is always drawn; in one file, as Babylon.js wants it
 //! ```
 //!
 //! The tree is binary. Its leaves are cells ([`Cells`]), each with a run of splats for every level of detail: level 0 are those of
@@ -27,7 +27,7 @@ use crate::files::save_json;
 use crate::read;
 
 const META: &str = "lod-meta.json";
-const ENVIRONMENT: &str = "env";
+const ENVIRONMENT: &str = "env.sog";
 /// Splats at most of a cell at its finest level, and of the cells that share a file: what a viewer loads at once.
 const FILE_SPLATS: usize = 1 << 16;
 /// Times at most that a cell is quartered to hold no more: splats may coincide.
@@ -139,7 +139,11 @@ impl<'a> Writer<'a> {
         if block == BlockId::ROOT && !background.is_empty() {
             let rows = in_z_order(splats, &background);
             let files = sog::write(&splats.select(&rows), self.antialiased).map_err(|error| bad(block, &error))?;
-            self.save(ENVIRONMENT, &files)?;
+            let bytes = sog::bundle(&files).map_err(|error| bad(block, &error))?;
+            std::fs::create_dir_all(self.out).map_err(cannot("made", self.out))?;
+            save(&self.out.join(ENVIRONMENT), &bytes)?;
+            self.exported.files += 1;
+            self.exported.bytes += bytes.len() as u64;
             self.has_environment = true;
             self.exported.splats += rows.len() as u64;
         }
@@ -244,7 +248,7 @@ impl<'a> Writer<'a> {
             count: counts.iter().sum(),
             counts,
             lod_levels: self.exported.levels,
-            environment: self.has_environment.then(|| format!("{ENVIRONMENT}/{}", sog::META)),
+            environment: self.has_environment.then(|| ENVIRONMENT.to_owned()),
             filenames: self.filenames,
             tree,
         };

@@ -26,6 +26,7 @@ pub mod opensfm;
 pub mod parquet;
 pub mod ply;
 pub mod poses;
+pub mod rad;
 pub mod random;
 pub mod sog;
 pub mod splat_glb;

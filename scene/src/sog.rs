@@ -8,6 +8,7 @@
 //! Source: the specification of SOG and of streamed SOG in PlayCanvas' user manual, and the reader of `splat-transform`, which decides
 //! where the manual is silent: codes of rotations count from w, and codebooks of scales have logarithms.
 
+mod bundle;
 mod codebook;
 mod palette;
 mod picture;
@@ -16,9 +17,8 @@ use std::f32::consts::{FRAC_1_SQRT_2, SQRT_2};
 
 use serde::{Deserialize, Serialize};
 
-use self::codebook::Codebook;
-use self::palette::Palette;
-use self::picture::Picture;
+pub use self::bundle::bundle;
+use self::{codebook::Codebook, palette::Palette, picture::Picture};
 use crate::error::CodecError;
 use crate::splats::{Splats, column, sh_coefficients};
 

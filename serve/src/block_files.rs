@@ -6,7 +6,8 @@ use std::fs;
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};
 
-use scene::{ArtefactId, BlockId, spz};
+use glam::DVec3;
+use scene::{ArtefactId, BlockId, rad, spz};
 use tempfile::TempDir;
 use tokio::sync::Semaphore;
 
@@ -18,17 +19,20 @@ const BYTES_LIMIT: u64 = 4 << 30;
 /// A file format of blocks.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Format {
+    /// RAD with levels of detail.
+    Rad,
     /// SPZ of version 3.
     Spz,
 }
 
 impl Format {
     pub(crate) fn of(extension: &str) -> Option<Self> {
-        (extension == "spz").then_some(Self::Spz)
+        [Self::Rad, Self::Spz].into_iter().find(|format| format.extension() == extension)
     }
 
     fn extension(self) -> &'static str {
         match self {
+            Self::Rad => "rad",
             Self::Spz => "spz",
         }
     }
@@ -125,6 +129,8 @@ fn make(project: &Project, wanted: Wanted, to: &std::path::Path) -> Result<Optio
     }
     let antialiased = project.plan.settings.antialiased;
     let bytes = match format {
+        // The splats are relative to the centre already.
+        Format::Rad => rad::write(&splats, DVec3::ZERO, None).map_err(|error| error.to_string())?,
         Format::Spz => spz::write(&splats, antialiased, spz::Version::V3).map_err(|error| error.to_string())?,
     };
     store::file::save(to, &bytes).map_err(|error| error.to_string())?;

@@ -8,7 +8,7 @@ use proto::{LogKind, LogLine, StatusReply, TaskState, WorkerStatus};
 
 use crate::job::JobRecord;
 use crate::project::Project;
-use crate::views::{AttemptEnd, Delta, Event, Kind, Level, Server, Snapshot, Worker, WorkerState};
+use crate::views::{AttemptEnd, Delta, Event, EventKind, Kind, Level, Server, Snapshot, Worker, WorkerState};
 
 /// Events that are kept for all jobs, and those of a snapshot.
 const EVENTS_KEPT: usize = 20_000;
@@ -59,6 +59,13 @@ impl Board {
     /// Forgets the jobs that are not among these.
     pub(crate) fn retain(&mut self, known: &BTreeSet<u64>) {
         self.jobs.retain(|id, _| known.contains(id));
+    }
+
+    /// A job and all its tasks have new figures.
+    pub(crate) fn remeasured(&mut self, id: u64) -> Option<&mut JobRecord> {
+        let tasks = self.jobs.get(&id)?.project.blocks() as u32;
+        self.changed.tasks.entry(id).or_default().extend(0..tasks);
+        self.job_mut(id)
     }
 
     /// Marks a job as changed; `None` if it is not known.
@@ -143,8 +150,16 @@ impl Board {
                 LogKind::Ended | LogKind::Delayed => Level::Warn,
                 _ => Level::Info,
             };
+            let kind = match line.kind() {
+                LogKind::Granted => EventKind::Began,
+                LogKind::Done => EventKind::Done,
+                LogKind::Ended => EventKind::Failed,
+                LogKind::Delayed => EventKind::Lost,
+                LogKind::Stopped => EventKind::Revoked,
+                LogKind::Ready | LogKind::Failed | LogKind::Quarantined | LogKind::Other => EventKind::Other,
+            };
             let (task, attempt, what) = (line.task, line.attempt, line.what.clone());
-            self.event(Event { number: 0, unix_ms, job: Some(id), task, attempt, worker, level, what });
+            self.event(Event { number: 0, unix_ms, job: Some(id), task, attempt, worker, level, kind, what });
         }
         self.changed.jobs.insert(id);
     }

@@ -95,7 +95,7 @@ pub(crate) fn finish(feed: &Feed, folder: &Path) -> Result<(), BadInput> {
     let server = feed.board().server.clone();
     let mut board = feed.board();
     board.set_server(Server { controls: false, coordinator: None, ..server });
-    let Some(job) = board.job_mut(JOB) else {
+    let Some(job) = board.remeasured(JOB) else {
         drop(board);
         return load(feed, folder);
     };

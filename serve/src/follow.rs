@@ -197,7 +197,7 @@ async fn add_figures(feed: &Arc<Feed>, job: u64, task: u32, artefact: &[u8]) {
     {
         Ok(Ok(())) => {
             let [psnr, ssim, perceptual] = project.quality();
-            if let Some(job) = feed.board().job_mut(job) {
+            if let Some(job) = feed.board().remeasured(job) {
                 (job.psnr, job.ssim, job.perceptual) = (psnr.or(job.psnr), ssim, perceptual);
             }
         }

@@ -70,7 +70,7 @@ impl TaskRecord {
         }
     }
 
-    fn change(&self, task: u32) -> TaskChange {
+    fn change(&self, task: u32, psnr: Option<f64>) -> TaskChange {
         TaskChange {
             task,
             state: self.letter(),
@@ -80,6 +80,7 @@ impl TaskRecord {
             speed: self.speed,
             worker: self.worker.clone(),
             attempt: self.attempt,
+            psnr,
         }
     }
 
@@ -379,7 +380,8 @@ impl JobRecord {
     }
 
     pub(crate) fn task_change(&self, task: u32) -> Option<TaskChange> {
-        self.tasks.get(task as usize).map(|record| record.change(task))
+        let psnr = self.project.block_psnr(task as usize);
+        self.tasks.get(task as usize).map(|record| record.change(task, psnr))
     }
 
     pub(crate) fn tasks_view(&self, seq: u64) -> Tasks {

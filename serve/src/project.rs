@@ -223,7 +223,7 @@ impl Project {
         };
         let up = ground.to_world(DVec3::Z);
         json!({
-            "seq": seq, "root": self.root(), "centre": centre.to_array(), "up": up.to_array(), "before_prune": false,
+            "seq": seq, "root": self.root(), "centre": centre.to_array(), "up": up.to_array(), "before_prune": false, "formats": ["rad", "spz"],
             "sh_degree": plan.settings.sh_degree, "antialiased": plan.settings.antialiased,
             "blocks": plan.tasks.iter().zip(0..).map(block).collect::<Vec<Value>>(),
         })
@@ -316,6 +316,7 @@ impl Project {
         let Some(capture) = &self.capture else { return json!({"views": []}) };
         let figures = self.figures.read().unwrap_or_else(PoisonError::into_inner);
         let (split, kinds, centre) = (Split::of(&self.plan, capture), view_kinds(capture), self.centre());
+        let leaves = self.plan.leaves();
         let view = |(index, view): (usize, &scene::View)| {
             let k = &view.camera.pinhole;
             let pose = view.camera.camera_from_world.inverse();
@@ -323,6 +324,7 @@ impl Project {
             let world_from_camera = matrix.transpose().to_cols_array();
             let of = figures.by_view.get(&(index as u32));
             json!({
+                "task": leaves.owner_of(&self.plan.ground, pose.translation).and_then(|block| self.task_of(block)),
                 "view": index, "name": view.name, "width": k.width, "height": k.height,
                 "test": split.part(index as u32) != Part::Trained,
                 "camera": CameraView { fx: k.fx, fy: k.fy, cx: k.cx, cy: k.cy, world_from_camera },

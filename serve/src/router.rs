@@ -225,7 +225,7 @@ async fn block(
     Path((job, file)): Path<(u64, String)>,
     request: Request,
 ) -> Result<Response, Refused> {
-    let unknown = || nothing("blocks are blocks/ARTEFACT.spz");
+    let unknown = || nothing("blocks are blocks/ARTEFACT.rad and blocks/ARTEFACT.spz");
     let (name, extension) = file.rsplit_once('.').ok_or_else(unknown)?;
     let (artefact, format) =
         (name.parse::<ArtefactId>().map_err(|_| unknown())?, Format::of(extension).ok_or_else(unknown)?);

@@ -170,7 +170,21 @@ pub(crate) struct Event {
     pub(crate) attempt: u32,
     pub(crate) worker: String,
     pub(crate) level: Level,
+    pub(crate) kind: EventKind,
     pub(crate) what: String,
+}
+
+/// What a line says of its attempt.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub(crate) enum EventKind {
+    Began,
+    Done,
+    Failed,
+    Lost,
+    Revoked,
+    #[serde(rename = "")]
+    Other,
 }
 
 /// A changed task; short keys, as there may be thousands.
@@ -192,6 +206,8 @@ pub(crate) struct TaskChange {
     pub(crate) worker: String,
     #[serde(rename = "a")]
     pub(crate) attempt: u32,
+    #[serde(rename = "q")]
+    pub(crate) psnr: Option<f64>,
 }
 
 /// All tasks of a job, as columns by task.

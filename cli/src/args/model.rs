@@ -169,6 +169,8 @@ pub(crate) enum Format {
     Spz,
     /// A folder of streamed SOG, the format of PlayCanvas and SuperSplat, with the model's levels of detail
     Sog,
+    /// RAD, one file that Spark streams: a tree of levels of detail above the model's finest splats
+    Rad,
     /// A folder of 3D Tiles with splats in glTF, which CesiumJS streams, with the model's levels of detail
     Tiles,
 }

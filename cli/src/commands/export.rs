@@ -26,7 +26,7 @@ struct Exported<'a> {
 pub(crate) fn run(args: &ExportArgs, output: &Output) -> Result<(), Failure> {
     let exported = match args.to {
         Format::Ply | Format::Spz => file(args)?,
-        Format::Sog | Format::Tiles => folder(args, output)?,
+        Format::Sog | Format::Rad | Format::Tiles => streamed(args, output)?,
     };
     let text = format!("{} splats, {} bytes\n{}", exported.splats, exported.bytes, args.out.display());
     output.result(&exported, &text)
@@ -35,9 +35,7 @@ pub(crate) fn run(args: &ExportArgs, output: &Output) -> Result<(), Failure> {
 fn file(args: &ExportArgs) -> Result<Exported<'_>, Failure> {
     let model = model::read(&args.model)?;
     let bytes = if args.to == Format::Spz { model.to_spz()? } else { model.to_ply() };
-    if let Some(folder) = args.out.parent().filter(|folder| !folder.as_os_str().is_empty()) {
-        make_folder(folder)?;
-    }
+    make_parent(&args.out)?;
     save(&args.out, &bytes)?;
     Ok(Exported {
         command: "export",
@@ -50,12 +48,21 @@ fn file(args: &ExportArgs) -> Result<Exported<'_>, Failure> {
     })
 }
 
-fn folder<'a>(args: &'a ExportArgs, output: &Output) -> Result<Exported<'a>, Failure> {
+fn make_parent(out: &Path) -> Result<(), Failure> {
+    out.parent().filter(|folder| !folder.as_os_str().is_empty()).map_or(Ok(()), make_folder)
+}
+
+/// Writes a format that is read block by block.
+fn streamed<'a>(args: &'a ExportArgs, output: &Output) -> Result<Exported<'a>, Failure> {
     let mut progress = None;
     let mut report = |done: usize, all: usize| {
         progress.get_or_insert_with(|| output.progress("blocks", all as u64)).at(done as u64, "");
     };
     let written = match args.to {
+        Format::Rad => {
+            make_parent(&args.out)?;
+            model::write_rad(&args.model, &args.out, &mut report)?
+        }
         Format::Tiles => model::write_tiles(&args.model, &args.out, &mut report)?,
         _ => model::write_streamed_sog(&args.model, &args.out, &mut report)?,
     };
@@ -65,7 +72,7 @@ fn folder<'a>(args: &'a ExportArgs, output: &Output) -> Result<Exported<'a>, Fai
         splats: written.splats,
         bytes: written.bytes,
         antialiased: None,
-        levels: Some(written.levels),
+        levels: (args.to != Format::Rad).then_some(written.levels),
         files: Some(written.files),
     })
 }

@@ -9,13 +9,13 @@ use dataset::ingest;
 use dataset::mip_tiles;
 use dataset::open::{self, OpenOptions};
 use dataset::synth::{self, Settings};
-use glam::Vec3;
+use glam::{DVec3, Vec3};
 use image::{DynamicImage, ImageFormat, Luma, Rgb, RgbImage, Rgba, RgbaImage};
 use scene::frame;
 use scene::parquet::{Cells, Writer};
 use scene::transforms::{Frame, Intrinsics, Transforms};
 use scene::{CameraModel, Exposure, Exposures, Pixels, Splat, Splats};
-use scene::{npy, ply, spz, transforms};
+use scene::{npy, ply, rad, spz, transforms};
 
 use crate::readers::*;
 
@@ -254,6 +254,8 @@ impl Corpus {
                 let bytes = spz::write(&splats, degree == 0, version).expect("they are finite");
                 self.put("splats.spz", bytes, &spz_codec(), Seal::Gzip, COMPRESSED);
             }
+            let bytes = rad::write(&splats, DVec3::ZERO, None).expect("they are finite");
+            self.put("splats.rad", bytes, &rad_codec(), Seal::None, COMPRESSED);
             self.put("splat columns", frame::encode_splats(&splats), &splats_codec(), Seal::Frame, PLAIN);
         }
         let exposures: Exposures = (0..40).map(|view| (3 * view, Exposure::IDENTITY)).collect();

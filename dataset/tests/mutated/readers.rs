@@ -16,7 +16,7 @@ use scene::frame::{self, Kind};
 use scene::parquet::Table;
 use scene::transforms::{Frame, Intrinsics, Transforms};
 use scene::{CameraModel, Capture, CodecError, Exposures, Rect, Rigid};
-use scene::{colmap, kitti_raw, kitti360, npy, nuscenes, opensfm, ply, spz, transforms, waymo};
+use scene::{colmap, kitti_raw, kitti360, npy, nuscenes, opensfm, ply, rad, spz, transforms, waymo};
 use store::Store;
 
 use crate::corpus::{CLOUD, PHOTO_SIZE, encoded};
@@ -228,6 +228,12 @@ pub(crate) fn cloud_codec() -> Read {
 
 pub(crate) fn spz_codec() -> Read {
     codec("spz", spz::read, |(splats, _)| (0..splats.len()).all(|i| splats.is_finite(i)))
+}
+
+pub(crate) fn rad_codec() -> Read {
+    codec("rad", rad::read, |rad| {
+        rad.nodes.len() == rad.children.len() && rad.nodes.iter().all(|node| node.is_finite())
+    })
 }
 
 pub(crate) fn splats_codec() -> Read {
