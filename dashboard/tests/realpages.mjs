@@ -19,7 +19,7 @@ const PAGES = [
   }],
   ['block', 'block/1', async (page) => {
     await page.waitForSelector('.uplot canvas');
-    assert.match(await text(page, 'main'), /Block 1\/\d\/\d[\s\S]*attempt 1/);
+    assert.match(await text(page, 'main'), /Block 1\/\d\/\d[\s\S]*attempt \d/);
     await page.waitForSelector('.log div');
   }],
   ['compare', 'compare', async (page) => { await page.waitForSelector('svg.pareto .mark'); }],
