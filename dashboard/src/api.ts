@@ -83,6 +83,8 @@ export interface TaskChange {
   v: number | null;
   w: string;
   a: number;
+  /** PSNR of the block, once measured; absent from servers that do not say it here. */
+  q?: number | null;
 }
 
 export interface Delta {

@@ -45,6 +45,16 @@ export function range(low: number, high: number): string {
   return a === b ? a : `${a} – ${b}`;
 }
 
+/** Time left, as [low, high] seconds. Below a second it is no number: the last report may lag. */
+export function left(low: number, high: number): string {
+  return high < 1 ? 'about to end' : low < 1 ? `up to ${span(high)}` : range(low, high);
+}
+
+/** A line with its long hashes cut to 12 digits. */
+export function brief(text: string): string {
+  return text.replace(/\b([0-9a-f]{12})[0-9a-f]{20,}\b/g, '$1…');
+}
+
 export function clock(unixMs: number): string {
   const d = new Date(unixMs);
   return `${pad(d.getHours())}:${pad(d.getMinutes())}:${pad(d.getSeconds())}`;

@@ -110,7 +110,9 @@ function listenToServer(): void {
   const pass = (heard: Heard): void => { take(heard); channel?.postMessage(heard); };
   let source: EventSource | null = null;
   let waitMillis = 1000;
+  let openedMillis = 0;
   const open = (): void => {
+    openedMillis = Date.now();
     source?.close();
     source = new EventSource('/api/events');
     for (const type of ['snapshot', 'delta', 'tick']) {
@@ -133,6 +135,10 @@ function listenToServer(): void {
     };
   };
   open();
+  // A connection that died without a word (a sleeping laptop, a proxy) raises no error. The server says something each second, so silence tells.
+  setInterval(() => {
+    if (Date.now() - Math.max(openedMillis, heardMillis.peek()) > LOST_MILLIS) { broken.value = true; open(); }
+  }, 2000);
 }
 
 function follow(): void {

@@ -3,7 +3,7 @@ import type { ComponentType } from 'preact';
 import { useEffect } from 'preact/hooks';
 import { useComputed, useSignal } from '@preact/signals';
 import { events, job, jobs, link, loaded, nowMillis, server, serverNow, silentMillis, workers } from './live';
-import { fixed, percent, range, span } from './format';
+import { fixed, percent, left, span } from './format';
 import { problems } from './problems';
 import { href, route, setQuery } from './route';
 import { still } from './settings';
@@ -98,7 +98,7 @@ function Header() {
 function eta(): string {
   const now = job.value;
   if (!now || now.state !== 'running') return now?.state ?? '';
-  return now.eta_seconds ? `${range(...now.eta_seconds)} left` : 'time left unknown';
+  return !now.eta_seconds ? 'time left unknown' : now.eta_seconds[1] < 1 ? left(...now.eta_seconds) : `${left(...now.eta_seconds)} left`;
 }
 
 function Phases() {

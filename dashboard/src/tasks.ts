@@ -18,11 +18,14 @@ export class TaskTable {
   readonly psnr: Float32Array;
   readonly attempt: Uint16Array;
   readonly worker: string[];
+  /** Levels that blocks are on, with the root's: 1 where the root is all. */
+  readonly levels: number;
   seq: number;
 
   constructor(readonly job: number, readonly plan: Plan, tasks: Tasks) {
     const number = (column: (number | null)[]): Float32Array => Float32Array.from(column, (v) => v ?? NaN);
     this.length = tasks.state.length;
+    this.levels = plan.blocks.level.reduce((most, l) => Math.max(most, l + 1), 1);
     this.state = Uint8Array.from(tasks.state, (s) => LETTERS.indexOf(s as Letter));
     this.progress = Uint16Array.from(tasks.progress);
     this.splats = Float64Array.from(tasks.splats);
@@ -46,6 +49,7 @@ export class TaskTable {
     this.speed[c.t] = c.v ?? NaN;
     this.worker[c.t] = c.w;
     this.attempt[c.t] = c.a;
+    if (c.q !== undefined) this.psnr[c.t] = c.q ?? NaN;
   }
 
   name(task: number): string {
@@ -75,11 +79,11 @@ onTasks((job, changes, seq) => {
     return;
   }
   if (seq <= t.seq) return;
-  const finished = changes.some((c) => c.s === 'd' && t.state[c.t] !== DONE);
+  const finished = changes.some((c) => c.s === 'd' && c.q === undefined && t.state[c.t] !== DONE);
   for (const c of changes) if (c.t < t.length) t.take(c);
   t.seq = seq;
   version.value += 1;
-  // Deltas carry no PSNR; it is read again, at most every 10 s, when a block has finished.
+  // Where deltas carry no PSNR, it is read again, at most every 10 s, when a block has finished.
   if (finished && psnrDue === 0) psnrDue = window.setTimeout(() => { psnrDue = 0; void refreshPsnr(t); }, 10000);
 });
 

@@ -93,7 +93,7 @@ function Curves({ task, what }: { task: Task; what: 'loss' | 'splats' }) {
     const rows = new Map<number, (number | null)[]>();
     const attempts = [...new Set(curve.attempt)].slice(-4);
     const width = 3 + attempts.length;
-    const at = (step: number): (number | null)[] => {
+        const at = (step: number): (number | null)[] => {
       let row = rows.get(step);
       if (!row) rows.set(step, row = Array<number | null>(width).fill(null));
       return row;
@@ -108,13 +108,31 @@ function Curves({ task, what }: { task: Task; what: 'loss' | 'splats' }) {
     const muted = css('muted');
     const lines: Line[] = [
       { label: 'p10', values: column(0), colour: muted, dash: [2, 3] }, { label: 'median', values: column(1), colour: muted, dash: [5, 3] }, { label: 'p90', values: column(2), colour: muted, dash: [2, 3] },
-      ...attempts.map((a, k) => ({ label: `attempt ${a}`, values: column(3 + k), colour: css(`c${1 + (k % 4)}`) })),
+      // Each step's loss is of one view, so it jumps: the line to read is the smoothed one, the jumps stay pale under it.
+      ...attempts.flatMap((a, k): Line[] => {
+        const colour = css(`c${1 + (k % 4)}`);
+        const line = { label: `attempt ${a}`, values: column(3 + k), colour };
+        return what === 'loss' ? [{ ...line, label: `${line.label}, each`, colour: `${colour}59`, thin: true }, { ...line, values: smoothed(line.values) }] : [line];
+      }),
     ];
     return { x, lines };
   }, [curve, fleet, what, theme]);
   if (made.x.length === 0) return <div class="empty">{task.attempts.length ? 'The first report has not come yet.' : 'No attempt has begun.'}</div>;
   return <Chart title={what === 'loss' ? 'By step, log scale; band: p10 to p90 of its level' : 'By step; band: p10 to p90 of its level'} x={made.x} xLabel="step" lines={made.lines} band={[2, 0]} log={what === 'loss'}
     format={what === 'loss' ? (v) => String(+v.toPrecision(3)) : count} />;
+}
+
+/** A running mean of the logarithm, over about a twentieth of the points, without a lag at the beginning. */
+export function smoothed(values: (number | null)[]): (number | null)[] {
+  const keep = 1 - 1 / Math.max(2, values.filter((v) => v !== null).length / 20);
+  let sum = 0;
+  let weight = 0;
+  return values.map((v) => {
+    if (v === null) return null;
+    sum = keep * sum + Math.log(v);
+    weight = keep * weight + 1;
+    return Math.exp(sum / weight);
+  });
 }
 
 const ENDS: Record<string, string> = { running: '', done: 'good', failed: 'bad', lost: 'bad', revoked: 'warn' };

@@ -37,7 +37,7 @@ export function Blocks() {
           <label>Level
             <select value={String(look.level)} onChange={(e) => setQuery({ level: e.currentTarget.value === '-1' ? null : e.currentTarget.value })}>
               <option value="-1">finest</option>
-              {Array.from({ length: t.plan.levels }, (_, l) => <option key={l} value={String(l)}>{l}</option>)}
+              {Array.from({ length: t.levels }, (_, l) => <option key={l} value={String(l)}>{l}</option>)}
             </select>
           </label>
           <label><input type="checkbox" checked={look.cameras} onChange={(e) => { layers.value = { ...layers.value, cameras: e.currentTarget.checked }; }} />cameras</label>

@@ -7,7 +7,7 @@ import { median } from '../problems';
 import { href } from '../route';
 import { table } from '../tasks';
 import { Command, Empty, Panel } from '../widgets/boundary';
-import { bars, Gantt } from '../widgets/gantt';
+import { bars, Gantt, names } from '../widgets/gantt';
 import { Grid, type Column } from '../widgets/grid';
 
 const STATE: Record<Worker['state'], [glyph: string, tone: string]> = { busy: ['▶', 'good'], idle: ['○', ''], lost: ['✕', 'bad'], left: ['·', 'muted'] };
@@ -83,7 +83,8 @@ function ratio(speed: number | null, middle: number) {
 }
 
 function Times({ all }: { all: Worker[] }) {
-  const now = serverNow.value;
-  const made = useComputed(() => bars(events.value, workers.value, serverNow.value));
-  return <Gantt bars={made.value} workers={all.filter((w) => w.state !== 'left').map((w) => w.name)} now={now} />;
+  // Once all have left, time ends with the last event: a training of yesterday is looked at like one of now.
+  const over = all.every((w) => w.state === 'left') ? events.value.findLast((e) => e.worker)?.unix_ms : undefined;
+  const now = over ?? serverNow.value;
+  return <Gantt bars={bars(events.value, all, now)} workers={names(events.value, all)} now={now} />;
 }

@@ -1,7 +1,7 @@
 // The job at a glance: its numbers, the map, what needs attention, what happened.
 import { useSignal } from '@preact/signals';
 import { control, type Control } from '../api';
-import { count, DASH, fixed, range, span } from '../format';
+import { count, DASH, fixed, left, span } from '../format';
 import { job, server, serverNow, workers } from '../live';
 import { go, href } from '../route';
 import { table, tableError, version } from '../tasks';
@@ -47,13 +47,13 @@ function Numbers() {
       <dl class="kpis">
         <Kpi title="Blocks done" value={`${blocksDone ?? j.counts.done} / ${j.blocks}`} share={(blocksDone ?? j.counts.done) / Math.max(1, j.blocks)}
           note={`${j.counts.leased} running · ${j.counts.ready} ready${broken ? ` · ${broken} failed` : ''}`} />
-        <Kpi title="Splats" value={count(j.splats)} note={`${j.levels} levels`} />
+        <Kpi title="Splats" value={count(j.splats)} note={t ? `${t.levels} ${t.levels === 1 ? 'level' : 'levels'}` : ''} />
         <Kpi title="Held-out PSNR" value={j.psnr === null ? DASH : `${fixed(j.psnr, 2)} dB`} note={j.psnr === null ? 'not measured yet' : 'mean of the views'} />
         <Kpi title="SSIM" value={fixed(j.ssim, 3)} note="held-out" />
         <Kpi title="SSIMULACRA2" value={fixed(j.perceptual, 1)} note="held-out" />
         <Kpi title="CPU hours" value={fixed(j.cpu_seconds / 3600, j.cpu_seconds < 36000 ? 2 : 1)} note="of all attempts" />
         <Kpi title="Elapsed" value={span(elapsed)} note={live ? `${live} workers` : 'no worker'} />
-        <Kpi title="Time left" long value={j.eta_seconds ? range(...j.eta_seconds) : j.state === 'running' ? DASH : j.state} note={j.eta_note} />
+        <Kpi title="Time left" long value={j.state !== 'running' ? j.state : j.eta_seconds ? left(...j.eta_seconds) : DASH} note={j.eta_note} />
       </dl>
       {j.state === 'running' && live === 0 && server.value?.kind === 'coordinator' && (
         <div class="panel" style={{ marginBottom: '12px' }}><Empty><h3>No worker is connected</h3>The tasks wait. Start a worker on each machine:

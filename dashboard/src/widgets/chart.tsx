@@ -12,6 +12,7 @@ export interface Line {
   colour: string;
   dash?: number[];
   points?: boolean;
+  thin?: boolean;
 }
 
 interface Props {
@@ -45,7 +46,7 @@ export function Chart(props: Props) {
       series: [
         { label: xLabel },
         ...lines.map((l) => ({
-          label: l.label, stroke: l.colour, width: l.dash ? 1 : 1.75, dash: l.dash, spanGaps: true, points: { show: l.points ?? false, size: 5 },
+          label: l.label, stroke: l.colour, width: l.dash || l.thin ? 1 : 1.75, dash: l.dash, spanGaps: true, points: { show: l.points ?? false, size: 5 },
           value: (_: uPlot, v: number | null) => (v == null ? '–' : format(v)),
         })),
       ],

@@ -1,7 +1,7 @@
 // Lists of what happened and of what needs attention.
 import { useComputed, useSignal } from '@preact/signals';
 import { control, type Event } from '../api';
-import { clock, utc, span } from '../format';
+import { brief, clock, utc, span } from '../format';
 import { events, job, jobs, server, serverNow, workers } from '../live';
 import { KIND_TEXT, problems, type Problem } from '../problems';
 import { href } from '../route';
@@ -18,9 +18,9 @@ export function EventRow({ event: e, withJob }: { event: Event; withJob?: boolea
     <li>
       <time dateTime={new Date(e.unix_ms).toISOString()} title={utc(e.unix_ms)}>{clock(e.unix_ms)}</time>
       <span class={tone} aria-label={e.level} role="img">{mark}</span>
-      <span>
+      <span title={brief(e.what) === e.what ? undefined : e.what}>
         {of && <span class="who">{of} </span>}
-        {name && <a href={href(`block/${e.task}`, e.job === null ? {} : { job: e.job })}>{name}</a>} {e.what} {e.worker && <span class="who">{e.worker}</span>}
+        {name && <a href={href(`block/${e.task}`, e.job === null ? {} : { job: e.job })}>{name}</a>} {brief(e.what)} {e.worker && <span class="who">{e.worker}</span>}
       </span>
     </li>
   );

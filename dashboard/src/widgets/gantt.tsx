@@ -18,22 +18,25 @@ export interface Bar {
 /** Pairs the beginnings of attempts with their ends; what lies between two of a worker is idle. */
 export function bars(events: Event[], workers: Worker[], now: number): Bar[] {
   const out: Bar[] = [];
-  for (const w of workers) {
+  const known = new Map(workers.map((w) => [w.name, w]));
+  for (const name of names(events, workers)) {
+    const w = known.get(name);
     let open: Event | null = null;
     let idleFrom: number | null = null;
     for (const e of events) {
-      if (e.worker !== w.name) continue;
+      if (e.worker !== name) continue;
       const kind = kindOf(e);
       if (kind === 'began') {
-        if (idleFrom !== null && e.unix_ms - idleFrom > 1000) out.push({ worker: w.name, from: idleFrom, to: e.unix_ms, how: 'idle', text: 'idle' });
+        if (idleFrom !== null && e.unix_ms - idleFrom > 1000) out.push({ worker: name, from: idleFrom, to: e.unix_ms, how: 'idle', text: 'idle' });
         open = e;
         idleFrom = null;
       } else if (open && kind !== '' && (e.task === open.task || kind === 'lost')) {
-        out.push({ worker: w.name, from: open.unix_ms, to: e.unix_ms, how: kind === 'revoked' ? 'lost' : kind, text: e.what });
+        out.push({ worker: name, from: open.unix_ms, to: e.unix_ms, how: kind === 'revoked' ? 'lost' : kind, text: e.what });
         open = null;
         idleFrom = e.unix_ms;
       }
     }
+    if (!w || w.state === 'left') continue;
     if (w.state === 'busy') out.push({ worker: w.name, from: open?.unix_ms ?? w.since_unix_ms, to: null, how: 'running', text: 'running' });
     else if (w.state === 'idle') out.push({ worker: w.name, from: idleFrom ?? w.since_unix_ms, to: now, how: 'idle', text: w.idle_reason });
     else if (w.state === 'lost') out.push({ worker: w.name, from: w.heard_unix_ms, to: now, how: 'lost', text: 'no heartbeat' });
@@ -41,11 +44,16 @@ export function bars(events: Event[], workers: Worker[], now: number): Bar[] {
   return out;
 }
 
+/** Every worker there is, and those that only the events remember: a finished training has none left. */
+export function names(events: Event[], workers: Worker[]): string[] {
+  return [...new Set([...workers.map((w) => w.name), ...events.map((e) => e.worker)])].filter(Boolean);
+}
+
 function kindOf(e: Event): NonNullable<Event['kind']> {
   if (e.kind !== undefined) return e.kind;
-  if (/\b(began|started|leased)\b/.test(e.what)) return 'began';
+  if (/\b(began|started|leased|granted)\b/.test(e.what)) return 'began';
   if (/\blost\b|no heartbeat/.test(e.what)) return 'lost';
-  if (/\brevoked\b/.test(e.what)) return 'revoked';
+  if (/\brevoked\b|no longer needed|waits (for a worker again|before its next)/.test(e.what)) return 'revoked';
   if (e.level === 'error' || /\bfailed\b/.test(e.what)) return 'failed';
   return /\b(done|finished)\b/.test(e.what) ? 'done' : '';
 }

@@ -260,8 +260,8 @@ class Painter {
       const e = t.edge(b.level[this.focus]!);
       let [x, y] = [root.x + (b.x[this.focus]! + 0.5) * e, root.y + (b.y[this.focus]! + 0.5) * e];
       for (let k = 0; k < 64 && next === null; k += 1) {
-        x += dx * (k === 0 ? e * 0.5 + t.edge(t.plan.levels - 1) * 0.5 : t.edge(t.plan.levels - 1));
-        y += dy * (k === 0 ? e * 0.5 + t.edge(t.plan.levels - 1) * 0.5 : t.edge(t.plan.levels - 1));
+        x += dx * (k === 0 ? e * 0.5 + t.edge(t.levels - 1) * 0.5 : t.edge(t.levels - 1));
+        y += dy * (k === 0 ? e * 0.5 + t.edge(t.levels - 1) * 0.5 : t.edge(t.levels - 1));
         next = this.places!.find(x, y, this.look.level);
       }
     }

@@ -144,7 +144,7 @@ const levelsOf = new WeakMap<TaskTable, Uint32Array[]>();
 function order(t: TaskTable): Uint32Array[] {
   let known = levelsOf.get(t);
   if (!known) {
-    const lists: number[][] = Array.from({ length: t.plan.levels }, () => []);
+    const lists: number[][] = Array.from({ length: t.levels }, () => []);
     t.plan.blocks.level.forEach((l, i) => (lists[l] ??= []).push(i));
     levelsOf.set(t, known = lists.map((l) => Uint32Array.from(l)));
   }
@@ -192,8 +192,8 @@ export class Places {
 
   /** The block that is on top at a place, or null. */
   find(x: number, y: number, level: Level): number | null {
-    const { root, levels } = this.t.plan;
-    for (let l = level >= 0 ? level : levels - 1; l >= (level >= 0 ? level : 0); l -= 1) {
+    const { root } = this.t.plan;
+    for (let l = level >= 0 ? level : this.t.levels - 1; l >= (level >= 0 ? level : 0); l -= 1) {
       const e = this.t.edge(l);
       const found = this.block(l, Math.floor((x - root.x) / e), Math.floor((y - root.y) / e));
       if (found !== null && !this.hidden(found, level)) return found;
