@@ -137,7 +137,7 @@ function views(sim) {
 function model(sim) {
   const { root, blocks } = sim.plan;
   return {
-    seq, root, centre: [0, 0, 0], before_prune: scenario === 'demo', sh_degree: 0, antialiased: true, formats: rad ? ['rad', 'spz'] : ['spz'], up: [0, 0, 1],
+    seq, root, centre: [0, 0, 0], before_prune: scenario === 'demo', sh_degree: 0, antialiased: true, formats: rad ? ['rad', 'spz'] : ['spz'], turn: [0, 0, 0, 1],
     blocks: blocks.level.map((l, t) => {
       const e = root.edge / 2 ** l;
       const [x0, y0] = [root.x + blocks.x[t] * e, root.y + blocks.y[t] * e];

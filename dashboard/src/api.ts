@@ -190,6 +190,8 @@ export interface ModelBlock {
   rho_metres: number;
   box: number[] | null;
   backdrop: boolean;
+  /** What the file's places are relative to, itself relative to the model's centre. */
+  origin?: [number, number, number];
 }
 
 export interface ModelView {
@@ -202,7 +204,8 @@ export interface ModelView {
   antialiased: boolean;
   /** Which formats of blocks there are; tried out where the server does not say. */
   formats?: ('rad' | 'spz')[];
-  up: [number, number, number];
+  /** Quaternion (x, y, z, w) from the files' axes to those of the ground plane. */
+  turn?: [number, number, number, number];
 }
 
 export interface Curve {

@@ -204,7 +204,8 @@ impl Project {
     /// Where a block's own origin is, ground metres from [`centre`](Self::centre).
     fn origin(&self, block: BlockId) -> DVec3 {
         let ground = &self.plan.ground;
-        (ground.core(block).centre().extend(ground.height_metres) - self.centre()).round()
+        // Adding zero makes -0 a 0.
+        (ground.core(block).centre().extend(ground.height_metres) - self.centre()).round() + DVec3::ZERO
     }
 
     /// The tree for a viewer; `done` has the artefact and the splats of a finished block, by task.
@@ -217,6 +218,7 @@ impl Project {
             let (artefact, splats) = done(index).unzip();
             json!({
                 "block": task.block.to_string(), "task": index, "artefact": artefact, "splats": splats.unwrap_or(0),
+                "backdrop": task.block == BlockId::ROOT,
                 "origin": self.origin(task.block).to_array(), "rho_metres": task.rho_metres, "box": [min.x, min.y, min.z, max.x, max.y, max.z],
             })
         };

@@ -254,7 +254,8 @@ async fn backdrop(
 /// Answers with a block's file, or the range of it that was asked for.
 async fn file_of(app: &App, project: &Arc<Project>, wanted: Wanted, request: Request) -> Result<Response, Refused> {
     let path = app.0.block_files.path(project, wanted).await.map_err(|problem| failed(&problem))?;
-    let path = path.ok_or_else(|| nothing("there are no splats"))?;
+    // A model without a backdrop is no fault.
+    let Some(path) = path else { return Ok(StatusCode::NO_CONTENT.into_response()) };
     let served = ServeFile::new(path).try_call(request).await.map_err(|error| failed(&error.to_string()))?;
     let mut response = served.map(Body::new);
     response.headers_mut().insert(CACHE_CONTROL, HeaderValue::from_static(IMMUTABLE));

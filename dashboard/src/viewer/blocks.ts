@@ -23,6 +23,8 @@ interface Held {
 export class Blocks {
   readonly group = new THREE.Group();
   readonly shown = new Set<Node>();
+  /** From the files' axes to those of the ground plane. */
+  private readonly turning = new THREE.Quaternion();
   tint = false;
   private format: 'rad' | 'spz' | null;
   private probe: Promise<'rad' | 'spz'> | null = null;
@@ -35,6 +37,7 @@ export class Blocks {
   private queue: Node[] = [];
 
   constructor(private readonly job: number, private readonly model: ModelView, format: 'rad' | 'spz' | null, private readonly changed: () => void) {
+    if (model.turn) this.turning.set(...model.turn);
     const told = model.formats;
     this.format = format ?? (told ? (told.includes('rad') ? 'rad' : 'spz') : null);
   }
@@ -43,10 +46,11 @@ export class Blocks {
   async backdrop(): Promise<void> {
     if (!this.model.blocks.some((b) => b.backdrop)) return;
     const reply = await fetch(`/api/jobs/${this.job}/backdrop.spz`);
-    if (!reply.ok || this.closed) return;
+    if (reply.status !== 200 || this.closed) return; // 204: there is none
     const mesh = new SplatMesh({ fileBytes: await reply.arrayBuffer(), fileType: SplatFileType.SPZ });
     await mesh.initialized;
     if (this.closed) { mesh.dispose(); return; }
+    mesh.quaternion.copy(this.turning);
     this.group.add(mesh);
     this.sky = mesh;
     this.changed();
@@ -114,22 +118,30 @@ export class Blocks {
     held.mesh = mesh;
     if (this.format === 'spz') held.settled = 'yes';
     mesh.visible = false;
+    mesh.quaternion.copy(this.turning);
+    mesh.position.set(...origin(n));
     this.group.add(mesh);
   }
 
-  /** Switches off splats whose centre lies in a quarter that a child draws. */
+  /** Switches off splats whose centre lies in a quarter that a child draws. Centres are on the file's axes, about the block's origin. */
   private quarters(n: Node, mask: dyno.DynoInt<string>) {
     const s = square(n, this.model.root);
-    const middle = new dyno.DynoVec2({ value: new THREE.Vector2(s.x + s.edge / 2 - this.model.centre[0], s.y + s.edge / 2 - this.model.centre[1]) });
+    const [x, y] = origin(n);
+    const { centre } = this.model;
+    const middle = new THREE.Vector2(s.x + s.edge / 2 - centre[0] - x, s.y + s.edge / 2 - centre[1] - y);
+    const back = this.turning.clone().invert();
+    const [east, north] = [new THREE.Vector3(1, 0, 0), new THREE.Vector3(0, 1, 0)].map((axis) => axis.applyQuaternion(back));
+    const given = { middle: new dyno.DynoVec2({ value: middle }), east: new dyno.DynoVec3({ value: east }), north: new dyno.DynoVec3({ value: north }) };
     return dyno.dynoBlock({ gsplat: dyno.Gsplat }, { gsplat: dyno.Gsplat }, ({ gsplat }) => {
       const hide = new dyno.Dyno({
-        inTypes: { gsplat: dyno.Gsplat, mask: 'int', middle: 'vec2' },
+        inTypes: { gsplat: dyno.Gsplat, mask: 'int', middle: 'vec2', east: 'vec3', north: 'vec3' },
         outTypes: { gsplat: dyno.Gsplat },
-        inputs: { gsplat: gsplat!, mask, middle },
+        inputs: { gsplat: gsplat!, mask, ...given },
         globals: () => [dyno.defineGsplat],
         statements: ({ inputs, outputs }) => [
           `${outputs.gsplat} = ${inputs.gsplat};`,
-          `{ int quarter = (${inputs.gsplat}.center.x >= ${inputs.middle}.x ? 1 : 0) + (${inputs.gsplat}.center.y >= ${inputs.middle}.y ? 2 : 0);`,
+          `{ vec2 at = vec2(dot(${inputs.gsplat}.center, ${inputs.east}), dot(${inputs.gsplat}.center, ${inputs.north}));`,
+          `  int quarter = (at.x >= ${inputs.middle}.x ? 1 : 0) + (at.y >= ${inputs.middle}.y ? 2 : 0);`,
           `  if (((${inputs.mask} >> quarter) & 1) == 1) ${outputs.gsplat}.flags = 0u; }`,
         ],
       });
@@ -203,4 +215,8 @@ function top(n: Node): Node {
   let t = n;
   for (let p = n.parent; p; p = p.parent) if (p.block.artefact !== null) t = p;
   return t;
+}
+
+function origin(n: Node): [number, number, number] {
+  return n.block.origin ?? [0, 0, 0];
 }

@@ -17,7 +17,7 @@ export class Mover {
   private readonly stop = new AbortController();
 
   constructor(private readonly canvas: HTMLCanvasElement, private readonly model: ModelView) {
-    this.camera.up.set(...model.up);
+    this.camera.up.set(0, 0, 1);
     this.orbit = new OrbitControls(this.camera, canvas);
     this.orbit.enableDamping = false;
     this.orbit.maxPolarAngle = Math.PI * 0.495;

@@ -48,7 +48,9 @@ export class Stage {
     this.renderer.setClearColor(0x101418);
     // Trained with the anti-aliasing filter: compensated blur. Otherwise the plain one, as the trainer draws.
     const blur = model.antialiased ? { preBlurAmount: 0, blurAmount: 0.3 } : { preBlurAmount: 0.3, blurAmount: 0 };
-    this.spark = new SparkRenderer({ renderer: this.renderer, lodSplatCount: look.budget, ...blur, onDirty: () => { this.dirty = true; } });
+    // What is outside the picture counts for little; `plat eval --budget` chooses nodes by the same weights.
+    const around = { coneFov0: 90, coneFov: 150, coneFoveate: 0.1, behindFoveate: 0.05 };
+    this.spark = new SparkRenderer({ renderer: this.renderer, lodSplatCount: look.budget, ...blur, ...around, onDirty: () => { this.dirty = true; } });
     this.nodes = tree(model.blocks);
     this.blocks = new Blocks(job, model, format, () => { this.dirty = true; this.lines(); });
     void this.blocks.backdrop().catch(() => { /* the city is drawn without its sky */ });
