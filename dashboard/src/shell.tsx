@@ -142,7 +142,7 @@ function Banners() {
       )}
       {state !== 'disconnected' && gone.length > 0 && (
         <div class="banner" data-testid="worker-lost"><b>{gone.length === 1 ? `Worker ${gone[0]!.name} is lost.` : `${gone.length} workers are lost.`}</b>
-          Last heard {span((serverNow.value - Math.max(...gone.map((w) => w.heard_unix_ms))) / 1000)} ago. {job.value?.state === 'running' ? 'Its task goes to another worker.' : ''}
+          Last heard {span((serverNow.value - Math.max(...gone.map((w) => w.heard_unix_ms))) / 1000)} ago. {job.value?.state === 'running' ? gone.length === 1 ? 'Its task goes to another worker.' : 'Their tasks go to others.' : ''}
           {' '}<a href={href('cluster')}>Cluster</a>
           <button type="button" class="quiet" onClick={() => { dismissed.value = new Set([...dismissed.value, ...gone.map((w) => w.name)]); }}>Dismiss</button></div>
       )}

@@ -51,7 +51,7 @@ export function Compare() {
               : <Pareto all={all} line={line} split={split} x={x} y={y} pinned={pinned.value} onPin={pin} svg={svg} />}
         </div>
         <div class="legend">
-          <span>● run</span><span>▲ own job</span><span>○ other held-out views{other ? `: ${other}, not comparable` : ''}</span><span>□ published figure, not joined</span><span>faded: dominated</span><span>size: splats</span>
+          <span>● run</span><span>▲ own job</span><span>○ other held-out views{other ? `: ${other}, not comparable` : ''}</span><span>□ published figure, not joined</span><span>faded: dominated</span>{x === 'cpu_seconds' && y === 'psnr' && <span>thin line: how a run got there (point or click)</span>}<span>size: splats</span>
         </div>
       </Panel>
       <Panel title="Comparison"><Diff results={of} pinned={pinned.value} /></Panel>

@@ -1,15 +1,16 @@
 // The job at a glance: its numbers, the map, what needs attention, what happened.
 import { useSignal } from '@preact/signals';
-import { control, type Control } from '../api';
+import { control, type Control, type Curve } from '../api';
 import { count, DASH, fixed, left, span } from '../format';
 import { job, server, serverNow, workers } from '../live';
 import { go, href } from '../route';
 import { table, tableError, version } from '../tasks';
-import { Command, Empty, Panel, Waiting } from '../widgets/boundary';
+import { Command, Empty, Panel, useGet, Waiting } from '../widgets/boundary';
 import { Attention, Feed } from '../widgets/feed';
 import { Legend } from '../widgets/legend';
 import { CityMap } from '../widgets/map';
 import type { Look } from '../widgets/mapdraw';
+import { QualityCurve } from '../widgets/spark';
 
 const LOOK: Look = { by: 'state', level: -1, cameras: false, points: true };
 
@@ -26,11 +27,19 @@ export function Overview() {
         </Panel>
         <div class="w5" style={{ display: 'grid', gap: '12px' }}>
           <Panel title="Needs attention"><Attention /></Panel>
+          <Quality />
           <Panel title="Activity" aside={<a href={href('events')}>All events</a>}><Feed count={14} /></Panel>
         </div>
       </div>
     </>
   );
+}
+
+function Quality() {
+  const j = job.value!;
+  const asked = useGet<Curve>(`/api/jobs/${j.id}/curve`, `${j.counts.done} ${j.state}`);
+  if (!asked.value || asked.value.psnr.length === 0) return null;
+  return <Panel title="Held-out PSNR while it trains" aside={<a href={href('compare')}>Speed and accuracy</a>}><QualityCurve curve={asked.value} /></Panel>;
 }
 
 function Numbers() {
@@ -51,7 +60,8 @@ function Numbers() {
         <Kpi title="Held-out PSNR" value={j.psnr === null ? DASH : `${fixed(j.psnr, 2)} dB`} note={j.psnr === null ? 'not measured yet' : 'mean of the views'} />
         <Kpi title="SSIM" value={fixed(j.ssim, 3)} note="held-out" />
         <Kpi title="SSIMULACRA2" value={fixed(j.perceptual, 1)} note="held-out" />
-        <Kpi title="CPU hours" value={fixed(j.cpu_seconds / 3600, j.cpu_seconds < 36000 ? 2 : 1)} note="of all attempts" />
+        {j.cpu_seconds < 3600 ? <Kpi title="CPU time" value={span(j.cpu_seconds)} note="of all attempts" />
+          : <Kpi title="CPU hours" value={fixed(j.cpu_seconds / 3600, j.cpu_seconds < 36000 ? 2 : 1)} note="of all attempts" />}
         <Kpi title="Elapsed" value={span(elapsed)} note={live ? `${live} workers` : 'no worker'} />
         <Kpi title="Time left" long value={j.state !== 'running' ? j.state : j.eta_seconds ? left(...j.eta_seconds) : DASH} note={j.eta_note} />
       </dl>

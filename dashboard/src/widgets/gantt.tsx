@@ -60,13 +60,17 @@ function kindOf(e: Event): NonNullable<Event['kind']> {
 
 const ROW = 20;
 const LEFT = 84;
+const SPANS = [2, 10, 60, 360];
 
 export function Gantt({ bars: all, workers, now }: { bars: Bar[]; workers: string[]; now: number }) {
   const canvas = useRef<HTMLCanvasElement>(null);
-  const minutes = useSignal(10);
+  // The shortest span that holds all that is known, until the reader chooses another.
+  const chosen = useSignal(0);
+  const first = Math.min(now, ...all.map((b) => b.from));
+  const minutes = chosen.value || (SPANS.find((m) => now - first <= m * 60000) ?? SPANS.at(-1)!);
   const tip = useSignal<{ x: number; y: number; bar: Bar } | null>(null);
   const height = workers.length * ROW + 26;
-  const from = now - minutes.value * 60000;
+  const from = now - minutes * 60000;
   const width = (): number => (canvas.current?.clientWidth ?? 600) - LEFT;
   const at = (t: number): number => LEFT + ((t - from) / (now - from)) * width();
 
@@ -114,10 +118,10 @@ export function Gantt({ bars: all, workers, now }: { bars: Bar[]; workers: strin
   void dark.value;
   return (
     <>
-      <div class="tools"><label>Last <select value={String(minutes.value)} onChange={(e) => { minutes.value = Number(e.currentTarget.value); }}>
-        {[2, 10, 60, 360].map((m) => <option key={m} value={String(m)}>{m < 60 ? `${m} min` : `${m / 60} h`}</option>)}</select></label></div>
+      <div class="tools"><label>Last <select value={String(minutes)} onChange={(e) => { chosen.value = Number(e.currentTarget.value); }}>
+        {SPANS.map((m) => <option key={m} value={String(m)}>{m < 60 ? `${m} min` : `${m / 60} h`}</option>)}</select></label></div>
       <div class="scroll" style={{ position: 'relative', maxHeight: '420px', padding: '0 12px 8px' }} tabIndex={0} aria-label="Workers over time">
-        <canvas ref={canvas} style={{ width: '100%', height: `${height}px`, display: 'block' }} role="img" aria-label={`What ${workers.length} workers did in the last ${minutes.value} minutes; the events page lists the same`} onMouseMove={find} onMouseLeave={() => { tip.value = null; }} />
+        <canvas ref={canvas} style={{ width: '100%', height: `${height}px`, display: 'block' }} role="img" aria-label={`What ${workers.length} workers did in the last ${minutes} minutes; the events page lists the same`} onMouseMove={find} onMouseLeave={() => { tip.value = null; }} />
         {tip.value && <div class="tip" style={{ left: `${Math.min(tip.value.x + 14, width() - 160)}px`, top: `${tip.value.y + 14}px` }}><b>{tip.value.bar.worker}</b> {tip.value.bar.how}<br />{tip.value.bar.text}<br />{span(((tip.value.bar.to ?? now) - tip.value.bar.from) / 1000)} from {clock(tip.value.bar.from)}</div>}
       </div>
       <div class="legend">

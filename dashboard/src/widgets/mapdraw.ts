@@ -89,8 +89,13 @@ function glyphs(raster: Raster, plane: Plane, ratio: number, t: TaskTable, look:
     if (look.by !== 'state' && state !== FAILED && state !== QUARANTINED) continue;
     const x = plane.px(t.plan.root.x + (t.plan.blocks.x[i]! + 0.5) * edge);
     const y = plane.py(t.plan.root.y + (t.plan.blocks.y[i]! + 0.5) * edge);
-    raster.stamp(glyph(GLYPHS[state]!, pixels), x, size > LABELLED ? y - 7 * ratio : y, look.by === 'state' && state < 2 ? onLight : white);
+    raster.stamp(glyph(GLYPHS[state]!, pixels), x, size > LABELLED ? y - 7 * ratio : y, look.by === 'state' && onRest(t, i) ? onLight : white);
   }
+}
+
+/** Whether the middle of the cell is pale: waiting, ready, or running and not yet half filled. */
+function onRest(t: TaskTable, i: number): boolean {
+  return t.state[i]! < RUNNING || (t.state[i] === RUNNING && t.progress[i]! < 450);
 }
 
 /** Edge in CSS pixels from which a cell has room for its number. */
@@ -106,7 +111,7 @@ function labels(g: CanvasRenderingContext2D, plane: Plane, ratio: number, t: Tas
     const x = plane.px(t.plan.root.x + (t.plan.blocks.x[i]! + 0.5) * edge) / ratio;
     const y = plane.py(t.plan.root.y + (t.plan.blocks.y[i]! + 0.5) * edge) / ratio;
     if (look.by !== 'state') { g.fillStyle = 'rgba(0,0,0,.45)'; g.fillRect(x - 20, y + 1, 40, 13); }
-    g.fillStyle = look.by === 'state' && t.state[i]! < 2 ? css('on-light') : '#fff';
+    g.fillStyle = look.by === 'state' && onRest(t, i) ? css('on-light') : '#fff';
     g.fillText(text, x, y + 8);
   }
 }

@@ -23,9 +23,13 @@ export const DIGITS: Record<YAxis, number> = { psnr: 2, ssim: 4, perceptual: 1 }
 
 export function Pareto({ all, line, split, x, y, pinned, onPin, svg }: Props) {
   const hover = useSignal<number | null>(null);
-  const [x0, x1] = [Math.log10(Math.min(...all.map((p) => p.x))) - 0.08, Math.log10(Math.max(...all.map((p) => p.x))) + 0.15];
-  const ys = all.map((p) => p.y);
-  const pad = (Math.max(...ys) - Math.min(...ys) || 1) * 0.08;
+  // How the quality of a run grew, for the run under the pointer and those that are pinned. The plot makes room for pinned ones.
+  const grown = (id: number): [number, number][] => (x === 'cpu_seconds' && y === 'psnr' ? all.find((p) => p.id === id)?.r.curve.map((c): [number, number] => [c.cpu_seconds, c.psnr]).filter(([s]) => s > 0) ?? [] : []);
+  const kept = (all.length === 1 ? [all[0]!.id] : pinned).flatMap(grown);
+  const xs = [...all.map((p) => p.x), ...kept.map(([s]) => s)];
+  const [x0, x1] = [Math.log10(Math.min(...xs)) - 0.08, Math.max(Math.log10(Math.max(...xs)) + 0.15, Math.log10(Math.min(...xs)) + 0.5)];
+  const ys = [...all.map((p) => p.y), ...kept.map(([, v]) => v)];
+  const pad = Math.max((Math.max(...ys) - Math.min(...ys)) * 0.08, y === 'ssim' ? 0.01 : 0.25);
   const [y0, y1] = [Math.min(...ys) - pad, Math.max(...ys) + pad];
   const px = (v: number): number => LEFT + ((Math.log10(v) - x0) / (x1 - x0)) * (W - LEFT - RIGHT);
   const py = (v: number): number => TOP + (1 - (v - y0) / (y1 - y0)) * (H - TOP - BOTTOM);
@@ -45,6 +49,10 @@ export function Pareto({ all, line, split, x, y, pinned, onPin, svg }: Props) {
         <text x={(W + LEFT) / 2} y={H - 6} text-anchor="middle" font-size="11" fill="#666">{x === 'cpu_seconds' ? 'CPU seconds (log)' : 'wall seconds (log)'}</text>
         <text x={LEFT} y={TOP - 4} font-size="11" fill="#666">{Y_TEXT[y]}</text>
         <path d={steps} fill="none" style={{ stroke: 'var(--c1)' }} stroke="#0072b2" stroke-width="1.75" />
+        <clipPath id="plot"><rect x={LEFT} y={TOP} width={W - LEFT - RIGHT} height={H - TOP - BOTTOM} /></clipPath>
+        {[...new Set([...pinned, ...(hover.value === null ? [] : [hover.value]), ...(all.length === 1 ? [all[0]!.id] : [])])].map((id) => (
+          <polyline key={id} class="grown" points={grown(id).map(([s, v]) => `${px(s)},${py(v)}`).join(' ')} fill="none" stroke="#57616c" style={{ stroke: 'var(--muted)' }} stroke-width="1" clip-path="url(#plot)" />
+        ))}
         {all.map((p) => (
           <Mark key={p.id} run={p} cx={px(p.x)} cy={py(p.y)} onFront={line.includes(p)} comparable={p.r.split === split} beaten={beaten.get(p.id) != null} pinned={pinned.includes(p.id)} y={y}
             right={px(p.x) < W - 190} onHover={(id) => { hover.value = id; }} onPin={onPin} />
