@@ -63,8 +63,14 @@ fn plan(levels: u8, sh_degree: u8, seed: u64, splats: u64) -> Plan {
     let blocks = (0..=levels).flat_map(|level| side(level).flat_map(move |y| side(level).map(move |x| (level, x, y))));
     let mut tasks: Vec<Task> = blocks.map(|(level, x, y)| task(BlockId { level, x, y }, &rho_metres)).collect();
     tasks.sort_by_key(|task| blocks::lod::training_order(task.block));
-    let settings =
-        PlanSettings { levels: Some(levels), seed, budget: splats as u32, sh_degree, antialiased: true, ..Default::default() };
+    let settings = PlanSettings {
+        levels: Some(levels),
+        seed,
+        budget: splats as u32,
+        sh_degree,
+        antialiased: true,
+        ..Default::default()
+    };
     Plan {
         version: blocks::plan::VERSION,
         capture: ArtefactId::of(b"city of blocks"),
@@ -100,7 +106,8 @@ fn task(block: BlockId, rho_metres: &[f64]) -> Task {
 fn block(plan: &Plan, block: BlockId, splats: u64) -> Splats {
     let leaves = 1u64 << (2 * plan.levels);
     let index = u64::from(block.y) << block.level | u64::from(block.x);
-    let own = if block.level == plan.levels { splats * (index + 1) / leaves - splats * index / leaves } else { BLOCK_SPLATS };
+    let own =
+        if block.level == plan.levels { splats * (index + 1) / leaves - splats * index / leaves } else { BLOCK_SPLATS };
     let key = plan.settings.seed ^ block.code().map_or(0, u64::from).wrapping_mul(0x9e37_79b9_7f4a_7c15);
     let core = plan.ground.core(block);
     let edge = core.max.x - core.min.x;
