@@ -27,7 +27,7 @@ pub(crate) use cluster::{
     Connection, CoordinatorArgs, JobArgs, JobsArgs, LogFormat, LogsArgs, RetryArgs, ServeArgs, StatusArgs, SubmitArgs,
     TaskName, TelemetryArgs, WorkerArgs,
 };
-pub(crate) use model::{EvalArgs, ExportArgs, Format, PruneArgs, PruneCapture, RenderArgs};
+pub(crate) use model::{EvalArgs, ExportArgs, Format, ImportArgs, PruneArgs, PruneCapture, RenderArgs};
 pub(crate) use plan::{Blocks, DepthKind, PlanOptions, RESIDUAL};
 pub(crate) use sweep::Named;
 pub(crate) use synth::{Rig, SynthArgs};
@@ -73,6 +73,8 @@ pub(crate) enum Command {
     Prune(PruneArgs),
     /// Write a model in a format that other programs read
     Export(ExportArgs),
+    /// Write a model of another program as PLY or SPZ; every command reads such models as they are, too
+    Import(ImportArgs),
     /// Show jobs and models in a browser, and serve exported files
     Serve(ServeArgs),
     /// Run the coordinator of a cluster until it is stopped

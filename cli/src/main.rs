@@ -56,6 +56,7 @@ fn main() -> ExitCode {
         Command::Render(args) => commands::render::run(args, &output),
         Command::Prune(args) => commands::prune::run(args, &output),
         Command::Export(args) => commands::export::run(args, &output),
+        Command::Import(args) => commands::import::run(args, &output),
         Command::Serve(args) => commands::serve::run(args, &output),
         Command::Coordinator(args) => commands::coordinator::run(args, &output),
         Command::Worker(args) => commands::worker::run(args, &output),

@@ -49,6 +49,7 @@ fn bad_usage_and_bad_input_exit_with_2_and_one_line() {
     for model in ["missing.ply", "cut.ply", "cut2.ply", "notes.txt", "empty"] {
         refused(at, &["render", model, "--cameras", "cameras.json", "--out", "o"], model);
         refused(at, &["export", model, "--to", "ply", "--out", "o.ply"], model);
+        refused(at, &["import", model, "--out", "o.ply"], model);
     }
     refused(at, &["render", "whole.ply", "--cameras", "notes.txt", "--out", "o"], "notes.txt");
     refused(at, &["eval", "whole.ply", "missing"], "missing");
@@ -142,6 +143,19 @@ fn a_city_is_trained_measured_and_exported_reproducibly() {
     let leaves = scene::rad::read(&bytes("tree/one.rad")).unwrap().leaves();
     assert_eq!((&tree["splats"], leaves.len()), (&merged.into(), merged));
     assert_eq!(at.join("tree").read_dir().unwrap().count(), 1, "scratch files are removed");
+
+    // What was exported is read as it is, and imported as a file.
+    for (from, format) in [("streamed", "streamed SOG"), ("tree/one.rad", "RAD")] {
+        let back = done(at, &["import", from, "--out", "back.ply"]);
+        assert_eq!((&back["splats"], &back["format"]), (&merged.into(), &format.into()));
+        assert_eq!(back["antialiased"], antialiased);
+        let loss =
+            measured["psnr"].as_f64().unwrap() - done(at, &["eval", "back.ply", "city"])["psnr"].as_f64().unwrap();
+        assert!(loss.abs() < 0.3, "{format} costs {loss} dB");
+    }
+    refused(at, &["import", "streamed", "--out", "back.sog"], "back.sog");
+    std::fs::remove_file(at.join("streamed/0_0/quats.webp")).unwrap();
+    refused(at, &["import", "streamed", "--out", "back.ply"], "quats.webp");
 
     // Rendering needs cameras, but no photos.
     std::fs::remove_dir_all(at.join("city/images")).unwrap();

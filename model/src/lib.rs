@@ -1,4 +1,5 @@
-//! Reads and writes models: the folder that `plat train` writes, a `.ply` (INRIA's or PlayCanvas' compressed), a `.spz`.
+//! Reads and writes models: the folder that `plat train` writes, PLY (INRIA's, and reads PlayCanvas' compressed), SPZ, SOG, RAD; writes
+//! 3D Tiles.
 //!
 //! ```text
 //! OUT/model/model.json          the manifest; written last, so a folder without it holds no model
@@ -16,6 +17,7 @@
 mod error;
 mod export;
 mod files;
+mod import;
 mod manifest;
 mod rad;
 mod read;
@@ -32,6 +34,7 @@ use scene::{BadInput, Capture, Exposures, Poses, Splats, ply, spz};
 pub use error::ModelError;
 pub use export::Exported;
 pub use files::save_json;
+pub use import::{Kind, kind};
 pub use manifest::{BlockEntry, Manifest};
 pub use rad::write_rad;
 pub use read::{Tree, read, read_tree};

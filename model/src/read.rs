@@ -7,36 +7,24 @@ use std::path::{Path, PathBuf};
 
 use blocks::{Cut, Ground, Mode, Plan};
 use glam::DVec3;
-use scene::{BLOCK_ATTRIBUTE, BadInput, BlockId, CodecError, Exposures, GeoOrigin, Poses, Splats, frame, ply, spz};
+use scene::{BLOCK_ATTRIBUTE, BadInput, BlockId, CodecError, Exposures, GeoOrigin, Poses, Splats, frame};
 
+use crate::Model;
 use crate::files::{EXPOSURES_FILE, MANIFEST_FILE, PLAN_FILE, POSES_FILE, block_file, damaged, load};
+use crate::import::{self, Kind};
 use crate::manifest::{Manifest, VERSION};
-use crate::{ANTIALIASED, Model};
 
-/// Reads a model: a folder that `plat train` wrote, its `model` folder, a `.ply` or a `.spz`.
+/// Reads a model: a folder that `plat train` wrote, its `model` folder, or any file or folder that [`kind`](crate::kind) knows. A
+/// model of another kind than the first is one set of splats, the finest.
 ///
 /// # Errors
 /// A path that does not exist, cannot be read, or holds no model.
 pub fn read(path: &Path) -> Result<Model, BadInput> {
-    let advice = "give a folder that plat train wrote, a .ply or a .spz";
-    if path.is_dir() {
-        let Some(folder) = trained_folder(path) else {
-            return Err(BadInput::new(path.display().to_string(), "holds no model/model.json", advice));
-        };
-        return read_trained(&folder);
+    let (kind, first) = import::kind(path)?;
+    if kind == Kind::Trained {
+        return read_trained(first.parent().unwrap_or(path));
     }
-    let is = |extension: &str| path.extension().is_some_and(|e| e.eq_ignore_ascii_case(extension));
-    if !path.exists() || !(is("ply") || is("spz")) {
-        let problem = if path.exists() { "is neither a folder nor a .ply or .spz" } else { "does not exist" };
-        return Err(BadInput::new(path.display().to_string(), problem, advice));
-    }
-    let bytes = load(path)?;
-    if is("spz") {
-        let (splats, antialiased) = spz::read(&bytes).map_err(|error| damaged(path, &error))?;
-        return Ok(Model { splats, antialiased, exposures: None, poses: None, trained: None });
-    }
-    let splats = ply::read(&bytes).map_err(|error| damaged(path, &error))?;
-    let antialiased = ply::comments(&bytes).iter().any(|comment| comment.trim() == ANTIALIASED);
+    let (splats, antialiased) = import::read(kind, &first)?;
     Ok(Model { splats, antialiased, exposures: None, poses: None, trained: None })
 }
 
@@ -257,7 +245,7 @@ mod tests {
         for (name, wanted) in [
             ("", "holds no model/model.json"),
             ("none.ply", "does not exist"),
-            ("notes.txt", "is neither a folder nor a .ply or .spz"),
+            ("notes.txt", "is no model that can be read"),
             ("cut.ply", "cut.ply"),
         ] {
             let error = super::read(&folder.path().join(name)).unwrap_err().to_string();

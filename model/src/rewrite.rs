@@ -8,6 +8,7 @@ use store::file::save;
 
 use crate::error::{ModelError, cannot};
 use crate::files::{EXPOSURES_FILE, MANIFEST_FILE, MERGED_FILE, POSES_FILE, block_file, save_json};
+use crate::import::{Kind, kind};
 use crate::read::{Tree, read_tree};
 use crate::write::begin;
 use crate::{BlockEntry, Manifest, Model};
@@ -15,7 +16,7 @@ use crate::{BlockEntry, Manifest, Model};
 /// Checks where a rewritten model shall go.
 ///
 /// # Errors
-/// A path that would overwrite the model itself, or that is of another format.
+/// A model that is none, a path that would overwrite the model itself, or that is of another format.
 pub fn check_out(path: &Path, out: &Path) -> Result<(), BadInput> {
     let bad = |problem: &str, advice: String| Err(BadInput::new(out.display().to_string(), problem, advice));
     // A folder and its `model` folder are the same model.
@@ -27,26 +28,28 @@ pub fn check_out(path: &Path, out: &Path) -> Result<(), BadInput> {
     if model_path(path).is_some_and(|path| model_path(out) == Some(path)) {
         return bad("is the model itself", "give another --out".into());
     }
-    let extension = |path: &Path| path.extension().map(|extension| extension.to_ascii_lowercase());
-    if path.is_dir() {
-        return if out.is_file() { bad("is a file", "give a folder, as the model is one".into()) } else { Ok(()) };
+    let is = |wanted: &str| out.extension().is_some_and(|extension| extension.eq_ignore_ascii_case(wanted));
+    match kind(path)?.0 {
+        Kind::Trained if out.is_file() => bad("is a file", "give a folder, as the model is one".into()),
+        Kind::Trained => Ok(()),
+        _ if out.is_dir() => bad("has another format than the model", "give a .ply or a .spz".into()),
+        Kind::Ply if !is("ply") => bad("has another format than the model", "give a .ply".into()),
+        Kind::Spz if !is("spz") => bad("has another format than the model", "give a .spz".into()),
+        // Of the others there is no writer of one set of splats.
+        _ if !is("ply") && !is("spz") => bad("has a format that is not written here", "give a .ply or a .spz".into()),
+        _ => Ok(()),
     }
-    if out.is_dir() || extension(path) != extension(out) {
-        let extension = extension(path).unwrap_or_default();
-        return bad("has another format than the model", format!("give a .{}", extension.to_string_lossy()));
-    }
-    Ok(())
 }
 
-/// Writes the model that was read from `path` with other splats as its finest cut, in the same format: a file, or a folder, where
-/// each block keeps the splats that it does not own in the finest cut. Returns the bytes of the file or of `merged.ply`.
+/// Writes the model that was read from `path` with other splats as its finest cut: a `.ply` or `.spz` where it was a file, or a folder,
+/// where each block keeps the splats that it does not own in the finest cut. Returns the bytes of the file or of `merged.ply`.
 ///
 /// # Errors
 /// A model that cannot be read again, or a file that cannot be written.
 pub fn rewrite(path: &Path, out: &Path, model: Model, splats: Splats) -> Result<u64, ModelError> {
     let Some((manifest, _)) = &model.trained else {
         let model = Model { splats, ..model };
-        let is_spz = path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("spz"));
+        let is_spz = out.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("spz"));
         let bytes = if is_spz { model.to_spz()? } else { model.to_ply() };
         if let Some(folder) = out.parent().filter(|folder| !folder.as_os_str().is_empty()) {
             fs::create_dir_all(folder).map_err(cannot("made", folder))?;
@@ -99,7 +102,8 @@ mod tests {
         let at = |name: &str| folder.path().join(name);
         fs::create_dir_all(at("trained/model")).unwrap();
         fs::write(at("trained/model/model.json"), "{}").unwrap();
-        fs::write(at("a.ply"), "").unwrap();
+        fs::write(at("a.ply"), "ply").unwrap();
+        fs::write(at("a.rad"), "RAD0").unwrap();
         let problem = |path: &str, out: &str| check_out(&at(path), &at(out)).err().map(|error| error.problem);
         assert_eq!(problem("a.ply", "new/b.PLY"), None);
         assert_eq!(problem("trained", "pruned"), None);
@@ -108,5 +112,7 @@ mod tests {
         assert_eq!(problem("a.ply", "a.spz").as_deref(), Some("has another format than the model"));
         assert_eq!(problem("a.ply", "trained").as_deref(), Some("has another format than the model"));
         assert_eq!(problem("trained", "a.ply").as_deref(), Some("is a file"));
+        assert_eq!(problem("a.rad", "b.ply"), None);
+        assert_eq!(problem("a.rad", "b.rad").as_deref(), Some("has a format that is not written here"));
     }
 }

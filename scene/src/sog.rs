@@ -12,12 +12,14 @@ mod bundle;
 mod codebook;
 mod palette;
 mod picture;
+mod read;
 
-use std::f32::consts::{FRAC_1_SQRT_2, SQRT_2};
+use std::f32::consts::SQRT_2;
 
 use serde::{Deserialize, Serialize};
 
 pub use self::bundle::bundle;
+pub use self::read::{read, read_bundle};
 use self::{codebook::Codebook, palette::Palette, picture::Picture};
 use crate::error::CodecError;
 use crate::splats::{Splats, column, sh_coefficients};
@@ -26,8 +28,6 @@ use crate::splats::{Splats, column, sh_coefficients};
 pub const META: &str = "meta.json";
 /// Most splats of a chunk that is written: what viewers load at once.
 pub const MAX_SPLATS: usize = 1 << 20;
-/// Most splats of a chunk that is read: a picture of 16,383 pixels a side.
-const MAX_READ: usize = 16_383 * 16_383;
 /// Entries of the palette in a row of its picture.
 const ROW: usize = 64;
 /// Codes of rotations: this plus the index of the largest component.
@@ -172,99 +172,8 @@ pub fn write(splats: &Splats, antialiased: bool) -> Result<Vec<File>, CodecError
     Ok(files)
 }
 
-/// Decodes splats from the bytes of `meta.json`; `file` reads another file by its name, which may be anything: the caller confines
-/// it. The flag is true if they are to be rendered anti-aliased.
-///
-/// # Errors
-/// Another version, a picture of the wrong size, a number that is not finite, and what `file` returns.
-pub fn read(
-    meta: &[u8],
-    mut file: impl FnMut(&str) -> Result<Vec<u8>, CodecError>,
-) -> Result<(Splats, bool), CodecError> {
-    let meta: Meta = serde_json::from_slice(meta).map_err(|error| CodecError::new(format!("{META}: {error}")))?;
-    let count = meta.count;
-    if meta.version != 2 {
-        return Err(CodecError::new(format!("SOG of version {}; version 2 can be read", meta.version)));
-    }
-    if count > MAX_READ {
-        return Err(CodecError::new(format!("SOG of {count} splats; up to {MAX_READ} can be read")));
-    }
-    let mut picture = |name: &str| -> Result<Picture, CodecError> {
-        let picture = Picture::decode(&file(name)?).map_err(|error| CodecError::new(format!("{name}: {error}")))?;
-        if picture.len() < count {
-            return Err(CodecError::new(format!("{name} has {} pixels for {count} splats", picture.len())));
-        }
-        Ok(picture)
-    };
-    let book = |coded: &[f32], what: &str| -> Result<[f32; 256], CodecError> {
-        let found = <[f32; 256]>::try_from(coded).ok().filter(|values| values.iter().all(|value| value.is_finite()));
-        found.ok_or_else(|| CodecError::new(format!("the codebook of {what} does not have 256 finite values")))
-    };
-    if !meta.means.mins.iter().chain(&meta.means.maxs).all(|limit| limit.is_finite()) {
-        return Err(CodecError::new("the limits of the means are not finite"));
-    }
-
-    let bands = meta.sh_n.as_ref().map_or(0, |rest| rest.bands);
-    if bands > 3 {
-        return Err(CodecError::new(format!("SOG with {bands} SH bands; up to 3 can be read")));
-    }
-    let low = picture(&meta.means.files[0])?;
-    let mut splats = Splats::new(bands);
-    let columns = splats.columns_mut();
-    columns.iter_mut().for_each(|column| column.reserve_exact(count));
-    let high = picture(&meta.means.files[1])?;
-    for i in 0..count {
-        let (low, high) = (low.get(i), high.get(i));
-        for axis in 0..3 {
-            let share = f32::from(u16::from_le_bytes([low[axis], high[axis]])) / 65_535.0;
-            let (min, max) = (meta.means.mins[axis], meta.means.maxs[axis]);
-            columns[axis].push(signed_exp(min + (max - min) * share));
-        }
-    }
-    drop((low, high));
-    let quats = picture(&meta.quats.files[0])?;
-    for i in 0..count {
-        let quat = rotation_of(quats.get(i)).into_iter().enumerate();
-        quat.for_each(|(k, value)| columns[column::QUAT + k].push(value));
-    }
-    let (scales, values) = (picture(&meta.scales.files[0])?, book(&meta.scales.codebook, "scales")?);
-    for i in 0..count {
-        (0..3).for_each(|k| columns[column::LOG_SCALE + k].push(values[usize::from(scales.get(i)[k])]));
-    }
-    let (colours, values) = (picture(&meta.sh0.files[0])?, book(&meta.sh0.codebook, "sh0")?);
-    for i in 0..count {
-        let pixel = colours.get(i);
-        (0..3).for_each(|c| columns[column::SH + c].push(values[usize::from(pixel[c])]));
-        columns[column::OPACITY].push(crate::ply::logit_of_byte(pixel[3]));
-    }
-    if let Some(rest) = meta.sh_n.filter(|rest| rest.bands > 0) {
-        let values = book(&rest.codebook, "shN")?;
-        let labels = picture(&rest.files[1])?;
-        let centroids = Picture::decode(&file(&rest.files[0])?)?;
-        let coefficients = sh_coefficients(bands) - 1;
-        if centroids.width() != ROW * coefficients || centroids.len() < rest.count.saturating_mul(coefficients) {
-            return Err(CodecError::new(format!("{} has another size than {} entries", rest.files[0], rest.count)));
-        }
-        for i in 0..count {
-            let pixel = labels.get(i);
-            let entry = usize::from(u16::from_le_bytes([pixel[0], pixel[1]]));
-            for k in 0..coefficients {
-                let rgb = if entry < rest.count { Some(centroids.get(entry * coefficients + k)) } else { None };
-                for c in 0..3 {
-                    columns[column::SH + 3 * (k + 1) + c].push(rgb.map_or(0.0, |rgb| values[usize::from(rgb[c])]));
-                }
-            }
-        }
-    }
-    Ok((splats, meta.antialias))
-}
-
 fn signed_log(x: f32) -> f32 {
     x.abs().ln_1p().copysign(x)
-}
-
-fn signed_exp(l: f32) -> f32 {
-    l.abs().exp_m1().copysign(l)
 }
 
 /// The three smaller components of a rotation wxyz in their order, and which one is left out.
@@ -283,17 +192,6 @@ fn rotation_code(quat: [f32; 4]) -> [u8; 4] {
         code[to] = (255.0 * (0.5 * scale * quat[k] + 0.5)).round().clamp(0.0, 255.0) as u8;
     }
     code
-}
-
-/// The rotation wxyz of a code; no rotation where there is none of that code.
-fn rotation_of(code: [u8; 4]) -> [f32; 4] {
-    let Some(largest) = code[3].checked_sub(FIRST_ROTATION).map(usize::from) else { return [1.0, 0.0, 0.0, 0.0] };
-    let mut quat = [0.0; 4];
-    for (from, k) in (0..4).filter(|&k| k != largest).enumerate() {
-        quat[k] = (f32::from(code[from]) / 255.0 * 2.0 - 1.0) * FRAC_1_SQRT_2;
-    }
-    quat[largest] = (1.0 - quat.iter().map(|v| v * v).sum::<f32>()).max(0.0).sqrt();
-    quat
 }
 
 #[cfg(test)]

@@ -1,4 +1,4 @@
-//! The command lines of `plat eval`, `render`, `prune` and `export`.
+//! The command lines of `plat eval`, `render`, `prune`, `export` and `import`.
 
 use std::path::PathBuf;
 
@@ -9,7 +9,7 @@ use super::values::{Backend, Size, decibels, levels, metres, share};
 
 #[derive(Debug, Clone, Default, Args)]
 pub(crate) struct EvalArgs {
-    /// Folder that `plat train` wrote, a .ply or a .spz
+    /// Folder that `plat train` wrote, or a model as PLY, SPZ, SOG, streamed SOG or RAD
     pub(crate) model: PathBuf,
     /// Folder of the capture
     pub(crate) capture: PathBuf,
@@ -29,7 +29,7 @@ pub(crate) struct EvalArgs {
     #[arg(long, value_enum, default_value = "auto")]
     pub(crate) backend: Backend,
     /// Folder for the contact sheet and the figures; by default OUT/eval for a folder that `plat train` wrote, NAME-eval beside a
-    /// file NAME.ply or NAME.spz
+    /// model NAME.ply or another
     #[arg(long, value_name = "DIR")]
     pub(crate) out: Option<PathBuf>,
     /// Store of the photos; by default the model's own if it exists, else a temporary one
@@ -97,7 +97,7 @@ values in -1..1, one output, a number. The Python package lpips exports one (net
 
 #[derive(Debug, Clone, Args)]
 pub(crate) struct RenderArgs {
-    /// Folder that `plat train` wrote, a .ply or a .spz
+    /// Folder that `plat train` wrote, or a model as PLY, SPZ, SOG, streamed SOG or RAD
     pub(crate) model: PathBuf,
     /// Cameras to render from: the folder of a capture, whose photos need not exist, or a transforms.json
     #[arg(long, value_name = "CAPTURE|FILE")]
@@ -128,9 +128,9 @@ pub(crate) struct RenderArgs {
 
 #[derive(Debug, Clone, Args)]
 pub(crate) struct PruneArgs {
-    /// Folder that `plat train` wrote, a .ply or a .spz
+    /// Folder that `plat train` wrote, or a model as PLY, SPZ, SOG, streamed SOG or RAD
     pub(crate) model: PathBuf,
-    /// Path of the pruned model: a folder if the model is one, else a file of the same format
+    /// Path of the pruned model: a folder if `plat train` wrote the model, else a file of the same format; .ply or .spz for others
     #[arg(long, value_name = "MODEL2")]
     pub(crate) out: PathBuf,
     /// Keep this share of the splats, in 0..1
@@ -177,12 +177,21 @@ pub(crate) enum Format {
 
 #[derive(Debug, Clone, Args)]
 pub(crate) struct ExportArgs {
-    /// Folder that `plat train` wrote, a .ply or a .spz
+    /// Folder that `plat train` wrote, or a model as PLY, SPZ, SOG, streamed SOG or RAD
     pub(crate) model: PathBuf,
     /// Format
     #[arg(long, value_enum)]
     pub(crate) to: Format,
     /// File to write; for sog and tiles a new folder
     #[arg(long, value_name = "PATH")]
+    pub(crate) out: PathBuf,
+}
+
+#[derive(Debug, Clone, Args)]
+pub(crate) struct ImportArgs {
+    /// Model as PLY, SPZ, SOG (.sog or meta.json), streamed SOG (lod-meta.json) or RAD, or the folder that it lies in
+    pub(crate) model: PathBuf,
+    /// File to write: .ply, or .spz, which rounds
+    #[arg(long, value_name = "FILE")]
     pub(crate) out: PathBuf,
 }

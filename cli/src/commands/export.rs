@@ -48,7 +48,7 @@ fn file(args: &ExportArgs) -> Result<Exported<'_>, Failure> {
     })
 }
 
-fn make_parent(out: &Path) -> Result<(), Failure> {
+pub(super) fn make_parent(out: &Path) -> Result<(), Failure> {
     out.parent().filter(|folder| !folder.as_os_str().is_empty()).map_or(Ok(()), make_folder)
 }
 

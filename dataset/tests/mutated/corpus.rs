@@ -15,7 +15,7 @@ use scene::frame;
 use scene::parquet::{Cells, Writer};
 use scene::transforms::{Frame, Intrinsics, Transforms};
 use scene::{CameraModel, Exposure, Exposures, Pixels, Splat, Splats};
-use scene::{npy, ply, rad, spz, transforms};
+use scene::{npy, ply, rad, sog, spz, transforms};
 
 use crate::readers::*;
 
@@ -41,6 +41,8 @@ pub(crate) struct Budget {
 const PLAIN: Budget = Budget { factor: 16, base: 16 << 20 };
 /// SPZ is compressed: the reader's own limit applies.
 const COMPRESSED: Budget = Budget { factor: 20, base: 34 << 20 };
+/// SOG: its own limit, and a picture of so many pixels with what its decoder takes.
+const PICTURES: Budget = Budget { factor: 80, base: 128 << 20 };
 /// Several times a photo's pixels, which `photo::BASE_PIXELS` limits.
 const PHOTO: Budget = Budget { factor: 0, base: 256 << 20 };
 
@@ -256,6 +258,13 @@ impl Corpus {
             }
             let bytes = rad::write(&splats, DVec3::ZERO, None).expect("they are finite");
             self.put("splats.rad", bytes, &rad_codec(), Seal::None, COMPRESSED);
+            let files = sog::write(&splats, true).expect("they are finite");
+            let bytes = sog::bundle(&files).expect("they are few");
+            self.put("splats.sog", bytes, &sog_codec(), Seal::None, PICTURES);
+            for file in files.clone() {
+                let codec = sog_file_codec(files.clone(), &file.name);
+                self.put(&file.name, file.bytes, &codec, Seal::None, PICTURES);
+            }
             self.put("splat columns", frame::encode_splats(&splats), &splats_codec(), Seal::Frame, PLAIN);
         }
         let exposures: Exposures = (0..40).map(|view| (3 * view, Exposure::IDENTITY)).collect();

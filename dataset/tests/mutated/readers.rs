@@ -16,7 +16,7 @@ use scene::frame::{self, Kind};
 use scene::parquet::Table;
 use scene::transforms::{Frame, Intrinsics, Transforms};
 use scene::{CameraModel, Capture, CodecError, Exposures, Rect, Rigid};
-use scene::{colmap, kitti_raw, kitti360, npy, nuscenes, opensfm, ply, rad, spz, transforms, waymo};
+use scene::{colmap, kitti_raw, kitti360, npy, nuscenes, opensfm, ply, rad, sog, spz, transforms, waymo};
 use store::Store;
 
 use crate::corpus::{CLOUD, PHOTO_SIZE, encoded};
@@ -233,6 +233,26 @@ pub(crate) fn spz_codec() -> Read {
 pub(crate) fn rad_codec() -> Read {
     codec("rad", rad::read, |rad| {
         rad.nodes.len() == rad.children.len() && rad.nodes.iter().all(|node| node.is_finite())
+    })
+}
+
+pub(crate) fn sog_codec() -> Read {
+    codec("sog", sog::read_bundle, |(splats, _)| (0..splats.len()).all(|i| splats.is_finite(i)))
+}
+
+/// The pictures of a SOG, and its `meta.json`, without the archive, whose checksums stop damage early.
+pub(crate) fn sog_file_codec(files: Vec<sog::File>, name: &str) -> Read {
+    let damaged = name.to_owned();
+    Reader::new("sog_file", move |bytes| {
+        let file = |name: &str| match files.iter().find(|file| file.name == name) {
+            Some(_) if name == damaged => Ok(bytes.to_vec()),
+            Some(file) => Ok(file.bytes.clone()),
+            None => Err(CodecError::new(format!("{name:?} is not there"))),
+        };
+        let meta = file(sog::META).map_err(|error| error.to_string())?;
+        let (splats, _) = sog::read(&meta, file).map_err(|error| error.to_string())?;
+        assert!((0..splats.len()).all(|i| splats.is_finite(i)), "accepted what it promises to refuse");
+        Ok(())
     })
 }
 

@@ -6,8 +6,8 @@ use image_webp::{ColorType, WebPDecoder, WebPEncoder};
 
 use crate::error::CodecError;
 
-/// Most bytes that a decoded picture and the decoder's tables may take.
-const MAX_BYTES: usize = 1 << 30;
+/// Most bytes that the decoder's tables may take.
+const TABLE_BYTES: usize = 16 << 20;
 
 /// A picture, RGBA, row by row.
 pub(super) struct Picture {
@@ -55,25 +55,31 @@ impl Picture {
         Ok(bytes)
     }
 
+    /// Decodes a picture of at most this many pixels; its size is known before memory is taken for it.
+    ///
     /// # Errors
-    /// Not WebP, lossy, damaged, or too large.
-    pub(super) fn decode(bytes: &[u8]) -> Result<Self, CodecError> {
+    /// Not WebP, lossy, damaged, or larger.
+    pub(super) fn decode(bytes: &[u8], most: usize) -> Result<Self, CodecError> {
         let bad = |error| CodecError::new(format!("not a WebP picture that can be read ({error})"));
         let mut decoder = WebPDecoder::new(Cursor::new(bytes)).map_err(bad)?;
-        decoder.set_memory_limit(MAX_BYTES);
+        decoder.set_memory_limit(TABLE_BYTES);
         if decoder.is_lossy() || decoder.is_animated() {
             return Err(CodecError::new("a WebP picture that is lossy or moves, where numbers were expected"));
         }
         let (width, height) = decoder.dimensions();
         let (width, height) = (width as usize, height as usize);
-        let size = decoder.output_buffer_size().filter(|&size| size <= MAX_BYTES);
+        let size = decoder.output_buffer_size().filter(|_| width * height <= most);
         let size =
             size.ok_or_else(|| CodecError::new(format!("a WebP picture of {width}×{height} pixels is too large")))?;
         let mut pixels = vec![0; size];
         decoder.read_image(&mut pixels).map_err(bad)?;
         let rgba = match decoder.has_alpha() {
             true => pixels,
-            false => pixels.chunks_exact(3).flat_map(|rgb| [rgb[0], rgb[1], rgb[2], 255]).collect(),
+            false => {
+                let mut rgba = Vec::with_capacity(4 * width * height);
+                pixels.as_chunks::<3>().0.iter().for_each(|&[r, g, b]| rgba.extend([r, g, b, 255]));
+                rgba
+            }
         };
         Ok(Self { width, height, rgba })
     }

@@ -2,6 +2,7 @@ use std::collections::BTreeMap;
 
 use proptest::prelude::*;
 
+use super::read::rotation_of;
 use super::*;
 use crate::splats::Splat;
 
@@ -98,10 +99,10 @@ fn damaged_files_are_refused() {
     assert!(changed(META, &|_| ()).is_ok());
     for (result, expected) in [
         (meta("\"version\":2", "\"version\":3"), "version 3"),
-        (meta("\"count\":50", "\"count\":5000000000"), "can be read"),
-        (meta("\"count\":50", "\"count\":500"), "pixels for 500 splats"),
+        (meta("\"count\":50", "\"count\":5000000000"), "cannot hold"),
+        (meta("\"count\":50", "\"count\":500"), "pixels of 500"),
         (meta("\"bands\":1", "\"bands\":9"), "9 SH bands"),
-        (meta("\"bands\":1", "\"bands\":2"), "another size"),
+        (meta("\"bands\":1", "\"bands\":2"), "pixels of 400"),
         (meta("means_u.webp", "../secret"), "no such file"),
         (meta("\"codebook\":[", "\"codebook\":[1.5,"), "codebook of scales"),
         (changed("sh0.webp", &|bytes| bytes.truncate(20)), "sh0.webp"),

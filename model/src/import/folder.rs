@@ -1,0 +1,43 @@
+//! Files that other files name.
+
+use std::fs;
+use std::path::{Component, Path, PathBuf};
+
+use scene::CodecError;
+
+/// A folder that no name leads out of.
+pub(super) struct Folder(PathBuf);
+
+impl Folder {
+    /// The folder of a file.
+    pub(super) fn of(file: &Path) -> Self {
+        let folder = file.parent().filter(|folder| !folder.as_os_str().is_empty());
+        Self(folder.unwrap_or(Path::new(".")).to_path_buf())
+    }
+
+    /// The path of a file in it, as another file names it.
+    ///
+    /// # Errors
+    /// A name that leads elsewhere, by its parts or by a link, and one of no file.
+    pub(super) fn path(&self, name: &str) -> Result<PathBuf, CodecError> {
+        let wrong = |what: String| CodecError::new(format!("{name:?} {what}"));
+        let mut parts = Path::new(name).components().filter(|part| *part != Component::CurDir).peekable();
+        if parts.peek().is_none() || parts.any(|part| !matches!(part, Component::Normal(_))) {
+            return Err(wrong("leads out of the folder".into()));
+        }
+        let path = self.0.join(name);
+        let real = |path: &Path| path.canonicalize().map_err(|error| wrong(format!("cannot be read ({error})")));
+        match real(&path)?.starts_with(real(&self.0)?) && path.is_file() {
+            true => Ok(path),
+            false => Err(wrong("is no file in the folder".into())),
+        }
+    }
+
+    /// The bytes of a file in it.
+    ///
+    /// # Errors
+    /// As [`Folder::path`], or a file that cannot be read.
+    pub(super) fn bytes(&self, name: &str) -> Result<Vec<u8>, CodecError> {
+        fs::read(self.path(name)?).map_err(|error| CodecError::new(format!("{name:?} cannot be read ({error})")))
+    }
+}
