@@ -247,7 +247,7 @@ async fn backdrop(
     let project = app.project(job)?;
     let root = project.task_of(BlockId::ROOT);
     let finished = root.and_then(|root| app.0.feed.board().jobs.get(&job)?.artefact_of(root));
-    let artefact = finished.ok_or_else(|| nothing("the root is not finished"))?;
+    let Some(artefact) = finished else { return Ok(StatusCode::NO_CONTENT.into_response()) };
     file_of(&app, &project, Wanted { block: BlockId::ROOT, artefact, backdrop: true, format }, request).await
 }
 
