@@ -1,14 +1,18 @@
 #!/usr/bin/env bash
 # Whether viewers draw what `plat export` writes as plat does: a small tree in headless Chromium, from cameras of its capture, beside `plat render`:
 # as 3D Tiles in CesiumJS, as RAD in Spark, as streamed SOG in PlayCanvas and Babylon.js, each with the finest splats. Prints the PSNR of each
-# view, and keeps the pictures in OUT (out/viewers), the viewer's left. Not part of .ci/run. Two minutes. Needs Node, Debian's chromium, Python
-# with NumPy and Pillow. PLAT names the program; without it, it is built. VIEWERS names some viewers.
+# view, and keeps the pictures in OUT (out/viewers), the viewer's left. Two minutes. Needs Node.
+# PLAT names the program; without it, it is built. VIEWERS names some viewers, CHROMIUM the browser.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 out=${OUT:-out/viewers}
 mkdir -p "$out"
 scratch=$(mktemp -d)
 trap 'rm -rf "$scratch"' EXIT
+chromium=${CHROMIUM:-/usr/bin/chromium}
+[[ -x $chromium ]] || { apt-get update -qq && apt-get install -qq --yes --no-install-recommends chromium; }
+python3 -m venv "$scratch/venv"
+"$scratch/venv/bin/pip" install --quiet --disable-pip-version-check numpy==2.4.6 pillow==13.0.0
 plat() { if [[ -n "${PLAT:-}" ]]; then "$PLAT" --quiet "$@"; else cargo run --release --locked --quiet -- --quiet "$@"; fi; }
 plat synth --out "$scratch/city" --area-km2 0.05 --views 48 --size 320x180
 plat train "$scratch/city" --out "$scratch/model" --levels 1 --residual 0 --steps 1200
@@ -40,7 +44,7 @@ plat render "$scratch/model" --cameras "$web/cameras.json" --out "$scratch/ours"
 # CesiumJS and PlayCanvas widen splats by 0.075 square pixels in place of 0.3, which no option changes.
 declare -A least=([cesium]="25 18" [spark]="38 27" [playcanvas]="29 27" [babylon]="31 23")
 for viewer in ${VIEWERS:-cesium spark playcanvas babylon}; do
-    node .ci/viewers/draw.mjs "$web" "$scratch" "${CHROMIUM:-/usr/bin/chromium}" "$viewer"
+    node .ci/viewers/draw.mjs "$web" "$scratch" "$chromium" "$viewer"
     read -ra limits <<<"${least[$viewer]}"
-    python3 .ci/viewers/compare.py "$viewer" "$web/cameras.json" "$scratch" "$scratch/ours" "$out" "${limits[@]}"
+    "$scratch/venv/bin/python" .ci/viewers/compare.py "$viewer" "$web/cameras.json" "$scratch" "$scratch/ours" "$out" "${limits[@]}"
 done
