@@ -40,7 +40,7 @@ const PAGES = [
   }],
   ['events', 'events', async (page) => {
     await page.waitForSelector('[data-testid=events] li');
-    assert.match(await text(page, '[data-testid=events]'), /quarantined/);
+    assert.match(await text(page, '[data-testid=events]'), /finished: Done/);
   }],
   ['downloads', 'downloads', async (page) => { await page.waitForSelector('main table, main .empty'); }],
   ['settings', 'settings', async (page) => { assert.match(await text(page, 'main'), /a coordinator/); }],
