@@ -65,7 +65,6 @@ export async function everyPage({ watched, url, theme, shows }) {
   await shows(`page viewer, ${theme}`, async () => {
     // A software GPU draws: the window is small.
     const viewer = await watched(`${url}/#/settings`, { colorScheme: theme, viewport: { width: 760, height: 560 } });
-    viewer.problems = [];
     const asked = new Set();
     viewer.on('response', (r) => { const m = /\/blocks\/([0-9a-f]+)\.(spz|rad)/.exec(r.url()); if (m && r.ok()) asked.add(m[1]); });
     await viewer.goto(`${url}/#/view`);
