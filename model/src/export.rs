@@ -21,6 +21,8 @@ pub struct Exported {
     pub files: usize,
     /// Bytes of all files.
     pub bytes: u64,
+    /// Whether the splats are rendered anti-aliased.
+    pub antialiased: bool,
 }
 
 #[derive(Debug, Clone, Copy, Serialize)]

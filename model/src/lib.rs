@@ -16,6 +16,7 @@
 
 mod error;
 mod export;
+mod export_file;
 mod files;
 mod import;
 mod manifest;
@@ -33,6 +34,7 @@ use scene::{BadInput, Capture, Exposures, Poses, Splats, ply, spz};
 
 pub use error::ModelError;
 pub use export::Exported;
+pub use export_file::{write_ply, write_spz};
 pub use files::save_json;
 pub use import::{Kind, kind};
 pub use manifest::{BlockEntry, Manifest};

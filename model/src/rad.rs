@@ -263,7 +263,7 @@ impl<'a> Writer<'a> {
         chunks.copy_to(&mut file)?;
         file.commit()?;
         let bytes = header.len() as u64 + lengths.iter().sum::<u64>();
-        Ok(Exported { splats: self.splats, levels: 1, files: 1, bytes })
+        Ok(Exported { splats: self.splats, levels: 1, files: 1, bytes, antialiased })
     }
 }
 

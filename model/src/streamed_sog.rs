@@ -127,7 +127,7 @@ impl<'a> Writer<'a> {
             leaves: BTreeMap::new(),
             filenames: Vec::new(),
             has_environment: false,
-            exported: Exported { levels: deepest.map_or(1, |deepest| deepest + 1), ..Exported::default() },
+            exported: Exported { levels: deepest.map_or(1, |deepest| deepest + 1), antialiased, ..Exported::default() },
         }
     }
 

@@ -111,7 +111,11 @@ impl<'a> Writer<'a> {
             antialiased,
             contents: BTreeMap::new(),
             backdrop: None,
-            exported: Exported { levels: if is_tree { levels.len() as u8 } else { 1 }, ..Exported::default() },
+            exported: Exported {
+                levels: if is_tree { levels.len() as u8 } else { 1 },
+                antialiased,
+                ..Exported::default()
+            },
         }
     }
 

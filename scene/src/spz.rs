@@ -11,21 +11,22 @@
 //! Source: `load-spz.cc` and `splat-types.h` of the SPZ library.
 
 mod quantise;
+mod write;
 
-use std::io::{self, Read, Write};
+use std::io::{self, Read};
 
-use flate2::{Compression, bufread::GzDecoder, write::GzEncoder};
+use flate2::bufread::GzDecoder;
 
 use self::quantise::{Rotation, sh_sign};
 use crate::error::CodecError;
 use crate::splats::{Splats, column, sh_coefficients};
 
+pub use self::write::{Layout, PLANES, Zipper, write};
+
 const MAGIC: u32 = 0x5053_474e;
 const GZIP: [u8; 2] = [0x1f, 0x8b];
 const ANTIALIASED: u8 = 1;
 const EXTENSIONS: u8 = 2;
-/// Fractional bits of written positions where their range allows it: steps of a quarter of a millimetre.
-const FRACTIONAL_BITS: u8 = 12;
 /// Largest decoded size: this many bytes plus this factor times the file's size. Trained splats take at most 12 times
 /// the file's size; more is a decompression bomb.
 const MEMORY_BYTES: u64 = 32 << 20;
@@ -129,65 +130,6 @@ pub fn read(bytes: &[u8]) -> Result<(Splats, bool), CodecError> {
     let mut streams = Streams::new(bytes, &header)?;
     let splats = decode(&header, &mut streams)?;
     Ok((splats, header.antialiased))
-}
-
-/// Encodes splats as SPZ.
-///
-/// # Errors
-/// A splat that is not finite or is over 8,388 km from the origin, or over four billion splats.
-pub fn write(splats: &Splats, antialiased: bool, version: Version) -> Result<Vec<u8>, CodecError> {
-    if let Some(row) = (0..splats.len()).find(|&i| !splats.is_finite(i)) {
-        let all = (row..splats.len()).filter(|&i| !splats.is_finite(i)).count();
-        return Err(CodecError::new(format!(
-            "splat {row} has numbers that are not finite ({all} of {} splats have), which SPZ cannot hold",
-            splats.len()
-        )));
-    }
-    let count = u32::try_from(splats.len()).map_err(|_| CodecError::new("more splats than SPZ supports"))?;
-    let farthest = splats.columns()[..3].iter().flatten().fold(0.0f64, |far, &v| far.max(f64::from(v).abs()));
-    let fits = |bits: &u8| (farthest * f64::from(1u32 << bits)).round() < f64::from(1 << 23);
-    let fractional_bits = (0..=FRACTIONAL_BITS).rev().find(fits);
-    let fractional_bits =
-        fractional_bits.ok_or_else(|| CodecError::new(format!("a splat {farthest} m out, too far for SPZ")))?;
-
-    let mut header = Vec::with_capacity(16);
-    header.extend(MAGIC.to_le_bytes());
-    header.extend(if version == Version::V2 { 2u32 } else { 3 }.to_le_bytes());
-    header.extend(count.to_le_bytes());
-    header.extend([splats.sh_degree(), fractional_bits, if antialiased { ANTIALIASED } else { 0 }, 0]);
-    let rotation = if version == Version::V2 { Rotation::FirstThree } else { Rotation::SmallestThree };
-    encode(splats, &header, fractional_bits, rotation).map_err(|e| CodecError::new(format!("gzip: {e}")))
-}
-
-fn encode(splats: &Splats, header: &[u8], fractional_bits: u8, rotation: Rotation) -> io::Result<Vec<u8>> {
-    let mut to = io::BufWriter::with_capacity(1 << 16, GzEncoder::new(Vec::new(), Compression::default()));
-    to.write_all(header)?;
-    let rows = 0..splats.len();
-    let col = |k: usize| splats.col(k);
-    for i in rows.clone() {
-        for (axis, sign) in quantise::FLIP.into_iter().enumerate() {
-            to.write_all(&quantise::position(sign * col(axis)[i], fractional_bits))?;
-        }
-    }
-    for i in rows.clone() {
-        to.write_all(&[quantise::opacity(col(column::OPACITY)[i])])?;
-    }
-    for i in rows.clone() {
-        to.write_all(&[0, 1, 2].map(|c| quantise::colour(col(column::SH + c)[i])))?;
-    }
-    for i in rows.clone() {
-        to.write_all(&[0, 1, 2].map(|k| quantise::log_scale(col(column::LOG_SCALE + k)[i])))?;
-    }
-    for i in rows.clone() {
-        let word = rotation.pack([0, 1, 2, 3].map(|k| col(column::QUAT + k)[i]));
-        to.write_all(&word.to_le_bytes()[..rotation.bytes()])?;
-    }
-    for i in rows {
-        for k in 1..sh_coefficients(splats.sh_degree()) {
-            to.write_all(&[0, 1, 2].map(|c| quantise::sh(sh_sign(k) * col(column::SH + 3 * k + c)[i], k)))?;
-        }
-    }
-    to.into_inner().map_err(io::IntoInnerError::into_error)?.finish()
 }
 
 fn decode(header: &Header, from: &mut impl Read) -> Result<Splats, CodecError> {

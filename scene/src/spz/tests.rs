@@ -1,3 +1,6 @@
+use std::io::Write;
+
+use flate2::{Compression, write::GzEncoder};
 use glam::{Quat, Vec3};
 use proptest::prelude::*;
 
