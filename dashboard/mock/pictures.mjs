@@ -68,7 +68,8 @@ export function spz(seed, square, count) {
     const house = hash(cell[0], cell[1], 5) > 0.35;
     const tall = 8 + 25 * hash(cell[0], cell[1], 6);
     const z = house ? tall * hash(seed, i, 3) : 0;
-    [x, y, z].forEach((p, k) => bytes.writeIntLE(Math.round(p * 2 ** fraction), positions + 9 * i + 3 * k, 3));
+    // SPZ's y and z are those of a PLY with the other sign.
+    [x, -y, -z].forEach((p, k) => bytes.writeIntLE(Math.round(p * 2 ** fraction), positions + 9 * i + 3 * k, 3));
     bytes[alphas + i] = 225;
     const tint = house ? [0.55 + 0.4 * hash(cell[0], cell[1], 7), 0.45 + 0.3 * hash(cell[0], cell[1], 8), 0.4] : [0.36, 0.38, 0.36];
     tint.forEach((c, k) => { bytes[colours + 3 * i + k] = Math.max(0, Math.min(255, ((c - 0.5) / 0.2820948) * 0.15 * 255 + 127.5)); });

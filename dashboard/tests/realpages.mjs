@@ -60,6 +60,19 @@ export async function everyPage({ watched, url, theme, shows }) {
       return 'axe has no serious objection';
     });
   }
+  await shows(`a held-out view rendered by the browser, ${theme}`, async () => {
+    const { views } = await fetch(`${url}/api/jobs/2/views`).then((r) => r.json());
+    const view = views.find((v) => v.psnr !== null && v.task != null && !v.render);
+    await page.goto(`${url}/#/block/${view.task}`);
+    await page.getByRole('button', { name: 'Render here' }).click();
+    await page.waitForFunction(() => /mean error \d/.test(document.querySelector('.triple').textContent), undefined, { timeout: 70000 });
+    await shot(page, `real-rendered-${theme}`);
+    assert.deepEqual(page.problems.splice(0), []);
+    const error = Number(/mean error ([\d.]+)/.exec(await text(page, '.triple'))[1]);
+    // Upside down or elsewhere it is 60 and more.
+    assert.ok(error < 45, `mean error ${error}`);
+    return `mean error ${error} of 255 where the evaluation had ${view.psnr.toFixed(1)} dB`;
+  });
   await page.context().close();
 
   await shows(`page viewer, ${theme}`, async () => {

@@ -30,7 +30,8 @@ function Scene({ model, onLost }: { model: ModelView; onLost: (reason: string) =
   const photo = useSignal<{ view: Photo; frame: { left: number; top: number; width: number; height: number } } | null>(null);
   const { query } = route.value;
   const look = useSignal<Look>({ budget: budgetOf(query), tint: false, outlines: false, seams: false, ghosts: true });
-  const views = useGet<{ views: Photo[] }>(`/api/jobs/${jobId.value}/views`, jobId.value);
+  // The list of cameras is long; it must not delay the first picture.
+  const views = useGet<{ views: Photo[] }>((stats.value?.shown ?? 0) > 0 || query.has('camera') ? `/api/jobs/${jobId.value}/views` : null, jobId.value);
   const photos = views.value?.views.filter((v) => v.camera) ?? [];
 
   useEffect(() => {

@@ -25,6 +25,8 @@ export class Blocks {
   readonly shown = new Set<Node>();
   /** From the files' axes to those of the ground plane. */
   private readonly turning = new THREE.Quaternion();
+  /** SPZ's own axes point up and back where those of the other files point down and ahead: half a turn about x. */
+  private readonly turningSpz = new THREE.Quaternion();
   tint = false;
   private format: 'rad' | 'spz' | null;
   private probe: Promise<'rad' | 'spz'> | null = null;
@@ -38,6 +40,7 @@ export class Blocks {
 
   constructor(private readonly job: number, private readonly model: ModelView, format: 'rad' | 'spz' | null, private readonly changed: () => void) {
     if (model.turn) this.turning.set(...model.turn);
+    this.turningSpz.copy(this.turning).multiply(new THREE.Quaternion(1, 0, 0, 0));
     const told = model.formats;
     this.format = format ?? (told ? (told.includes('rad') ? 'rad' : 'spz') : null);
   }
@@ -50,7 +53,7 @@ export class Blocks {
     const mesh = new SplatMesh({ fileBytes: await reply.arrayBuffer(), fileType: SplatFileType.SPZ });
     await mesh.initialized;
     if (this.closed) { mesh.dispose(); return; }
-    mesh.quaternion.copy(this.turning);
+    mesh.quaternion.copy(this.turningSpz);
     this.group.add(mesh);
     this.sky = mesh;
     this.changed();
@@ -118,7 +121,7 @@ export class Blocks {
     held.mesh = mesh;
     if (this.format === 'spz') held.settled = 'yes';
     mesh.visible = false;
-    mesh.quaternion.copy(this.turning);
+    mesh.quaternion.copy(this.format === 'rad' ? this.turning : this.turningSpz);
     mesh.position.set(...origin(n));
     this.group.add(mesh);
   }
@@ -129,7 +132,7 @@ export class Blocks {
     const [x, y] = origin(n);
     const { centre } = this.model;
     const middle = new THREE.Vector2(s.x + s.edge / 2 - centre[0] - x, s.y + s.edge / 2 - centre[1] - y);
-    const back = this.turning.clone().invert();
+    const back = (this.format === 'rad' ? this.turning : this.turningSpz).clone().invert();
     const [east, north] = [new THREE.Vector3(1, 0, 0), new THREE.Vector3(0, 1, 0)].map((axis) => axis.applyQuaternion(back));
     const given = { middle: new dyno.DynoVec2({ value: middle }), east: new dyno.DynoVec3({ value: east }), north: new dyno.DynoVec3({ value: north }) };
     return dyno.dynoBlock({ gsplat: dyno.Gsplat }, { gsplat: dyno.Gsplat }, ({ gsplat }) => {

@@ -21,8 +21,9 @@ export interface Stats {
 }
 
 /** Splats of the first picture: what the first chunk of a file has. More is asked for once that is seen, twice as much each time. */
-const FIRST_SPLATS = 50000;
-const MORE_MILLIS = 1000;
+const FIRST_SPLATS = 20000;
+const MORE_MILLIS = 500;
+const FETCHERS = 3;
 
 export interface Look { budget: number; tint: boolean; outlines: boolean; seams: boolean; ghosts: boolean }
 
@@ -54,7 +55,7 @@ export class Stage {
     const blur = model.antialiased ? { preBlurAmount: 0, blurAmount: 0.3 } : { preBlurAmount: 0.3, blurAmount: 0 };
     // What is outside the picture counts for little; `plat eval --budget` chooses nodes by the same weights.
     const around = { coneFov0: 90, coneFov: 150, coneFoveate: 0.1, behindFoveate: 0.05 };
-    this.spark = new SparkRenderer({ renderer: this.renderer, lodSplatCount: Math.min(FIRST_SPLATS, look.budget), ...blur, ...around, onDirty: () => { this.dirty = true; } });
+    this.spark = new SparkRenderer({ renderer: this.renderer, lodSplatCount: Math.min(FIRST_SPLATS, look.budget), numLodFetchers: 1, ...blur, ...around, onDirty: () => { this.dirty = true; } });
     this.nodes = tree(model.blocks);
     this.blocks = new Blocks(job, model, format, () => { this.dirty = true; this.lines(); });
     void this.blocks.backdrop().catch(() => { /* the city is drawn without its sky */ });
@@ -182,9 +183,15 @@ export class Stage {
   private allowed = FIRST_SPLATS;
   private allowedAt = 0;
   private allowMore(time: number): void {
-    if (this.spark.activeSplats === 0 || this.allowed >= this.look.budget) return;
-    this.dirty = true; // frames go on until all is allowed
-    if (this.allowedAt === 0) this.allowedAt = time;
+    // Frames go on until something is seen and all is allowed: Spark asks for pages while it draws, and says nothing when the first has come.
+    const seen = this.spark.activeSplats > 0;
+    if (this.blocks.shown.size > 0 && (!seen || this.allowed < this.look.budget)) this.dirty = true;
+    if (!seen || this.allowed >= this.look.budget) return;
+    if (this.allowedAt === 0) {
+      this.allowedAt = time;
+      // One chunk at a time until something is seen: two would share the line, and the first come later.
+      if (this.spark.pager) this.spark.pager.numFetchers = FETCHERS;
+    }
     if (time - this.allowedAt < MORE_MILLIS) return;
     this.allowedAt = time;
     this.allowed *= 2;
