@@ -20,6 +20,10 @@ export interface Stats {
   labels: { text: string; task: number; left: number; top: number }[];
 }
 
+/** Splats of the first picture: what the first chunk of a file has. More is asked for once that is seen, twice as much each time. */
+const FIRST_SPLATS = 50000;
+const MORE_MILLIS = 1000;
+
 export interface Look { budget: number; tint: boolean; outlines: boolean; seams: boolean; ghosts: boolean }
 
 export class Stage {
@@ -50,7 +54,7 @@ export class Stage {
     const blur = model.antialiased ? { preBlurAmount: 0, blurAmount: 0.3 } : { preBlurAmount: 0.3, blurAmount: 0 };
     // What is outside the picture counts for little; `plat eval --budget` chooses nodes by the same weights.
     const around = { coneFov0: 90, coneFov: 150, coneFoveate: 0.1, behindFoveate: 0.05 };
-    this.spark = new SparkRenderer({ renderer: this.renderer, lodSplatCount: look.budget, ...blur, ...around, onDirty: () => { this.dirty = true; } });
+    this.spark = new SparkRenderer({ renderer: this.renderer, lodSplatCount: Math.min(FIRST_SPLATS, look.budget), ...blur, ...around, onDirty: () => { this.dirty = true; } });
     this.nodes = tree(model.blocks);
     this.blocks = new Blocks(job, model, format, () => { this.dirty = true; this.lines(); });
     void this.blocks.backdrop().catch(() => { /* the city is drawn without its sky */ });
@@ -81,7 +85,7 @@ export class Stage {
   setLook(look: Look): void {
     if (look.tint !== this.look.tint) this.blocks.retint(look.tint);
     this.look = look;
-    this.spark.lodSplatCount = look.budget;
+    this.spark.lodSplatCount = Math.min(this.allowed, look.budget);
     this.moved = true;
     this.choose();
   }
@@ -120,6 +124,14 @@ export class Stage {
 
   redraw(): void { this.moved = true; }
 
+  /** What is drawn now, as a data URL. WebGL keeps no picture, so it is drawn and read in one go. */
+  picture(width: number, height: number): string {
+    this.renderer.render(this.scene, this.mover.camera);
+    const copy = Object.assign(document.createElement('canvas'), { width, height });
+    copy.getContext('2d')!.drawImage(this.canvas, 0, 0, width, height);
+    return copy.toDataURL('image/png');
+  }
+
   private choose(): void {
     const eye = this.mover.eye();
     this.now = cut(this.nodes, this.model.root, eye, this.look.budget);
@@ -152,6 +164,7 @@ export class Stage {
     this.fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
     gl.flush();
     this.frameTimes.push(time);
+    this.allowMore(time);
     this.tell(time, true);
   }
 
@@ -163,6 +176,19 @@ export class Stage {
     gl.deleteSync(this.fence);
     this.fence = null;
     return true;
+  }
+
+  /** Paged blocks share this many splats. Asking for all at once would bring megabytes before anything is seen. */
+  private allowed = FIRST_SPLATS;
+  private allowedAt = 0;
+  private allowMore(time: number): void {
+    if (this.spark.activeSplats === 0 || this.allowed >= this.look.budget) return;
+    this.dirty = true; // frames go on until all is allowed
+    if (this.allowedAt === 0) this.allowedAt = time;
+    if (time - this.allowedAt < MORE_MILLIS) return;
+    this.allowedAt = time;
+    this.allowed *= 2;
+    this.spark.lodSplatCount = Math.min(this.allowed, this.look.budget);
   }
 
   private fence: WebGLSync | null = null;

@@ -5,6 +5,7 @@ import type { View } from '../api';
 import { ramp } from '../colours';
 import { fixed } from '../format';
 import { href } from '../route';
+import { portrait } from '../viewer/portrait';
 
 export function WorstViews({ job, views }: { job: number; views: View[] }) {
   const worst = [...views].filter((v) => v.psnr !== null).sort((a, b) => a.psnr! - b.psnr!).slice(0, 8);
@@ -37,9 +38,11 @@ function Triple({ job, view }: { job: number; view: View }) {
   const error = useRef<HTMLCanvasElement>(null);
   const note = useSignal('');
   const photo = `/api/jobs/${job}/photos/${view.view}.jpg`;
-  const render = `/api/jobs/${job}/renders/${view.view}.png`;
+  const made = useSignal('');
+  const busy = useSignal(false);
+  const render = view.render ? `/api/jobs/${job}/renders/${view.view}.png` : made.value;
   useEffect(() => {
-    if (!view.photo || !view.render) return undefined;
+    if (!view.photo || !render) return undefined;
     let live = true;
     void Promise.all([picture(photo), picture(render)]).then(([a, b]) => {
       if (!live || !error.current) return;
@@ -47,11 +50,17 @@ function Triple({ job, view }: { job: number; view: View }) {
     }).catch((e: Error) => { note.value = e.message; });
     return () => { live = false; };
   }, [photo, render]);
+  const draw = async (): Promise<void> => {
+    busy.value = true;
+    note.value = '';
+    try { made.value = await portrait(job, view); } catch (e) { note.value = (e as Error).message; }
+    busy.value = false;
+  };
   return (
     <div class="triple">
       <figure>{view.photo ? <img src={photo} alt={`Photo ${view.name}`} /> : <div class="empty">The server has no photos.</div>}<figcaption>Photo · {view.name}</figcaption></figure>
-      <figure>{view.render ? <img src={render} alt={`Render of ${view.name}`} /> : <div class="empty">Not rendered yet.</div>}<figcaption>Render</figcaption></figure>
-      <figure>{view.photo && view.render ? <canvas ref={error} role="img" aria-label={`Error of ${view.name}: ${note.value}`} /> : <div class="empty">–</div>}<figcaption>Error · {note.value || 'dark is none, yellow is 64 of 255 and more'}</figcaption></figure>
+      <figure>{render ? <img src={render} alt={`Render of ${view.name}`} /> : <div class="empty"><button type="button" disabled={busy.value} onClick={() => void draw()}>{busy.value ? 'Rendering …' : 'Render here'}</button></div>}<figcaption>Render{made.value ? ' by this browser, which differs a little from plat' : ''}</figcaption></figure>
+      <figure>{view.photo && render ? <canvas ref={error} role="img" aria-label={`Error of ${view.name}: ${note.value}`} /> : <div class="empty">–</div>}<figcaption>Error · {note.value || 'dark is none, yellow is 64 of 255 and more'}</figcaption></figure>
     </div>
   );
 }
