@@ -18,11 +18,15 @@ fn cuts_and_seams_of_a_tree_are_measured() {
 
     let plain = done(at, &["eval", "tree", "city"]);
     assert!(plain.get("cuts").is_none() && plain.get("seams").is_none());
-    let said = done(at, &["eval", "tree", "city", "--level", "all", "--budget", "1000000", "--seams"]);
+    let said = done(at, &["eval", "tree", "city", "--level", "all", "--budget", "500,1000000", "--seams"]);
     let cuts = said["cuts"].as_array().unwrap();
     let figure = |cut: usize, key: &str| cuts[cut][key].as_f64().unwrap_or(f64::NAN);
-    assert_eq!(cuts.len(), 3);
-    assert_eq!((&cuts[0]["level"], &cuts[1]["level"], &cuts[2]["budget"]), (&0.into(), &1.into(), &1_000_000.into()));
+    assert_eq!(cuts.len(), 2);
+    assert_eq!((&cuts[0]["level"], &cuts[1]["level"]), (&0.into(), &1.into()));
+    // What a viewer draws: within the budget, and with enough of it all but what is smaller than a pixel.
+    let budget = |i: usize, key: &str| said["budgets"][i][key].as_f64().unwrap_or(f64::NAN);
+    assert!(budget(0, "budget") == 500.0 && budget(0, "drawn") <= 500.0 && budget(0, "gain_db").is_finite());
+    assert!(budget(0, "loss_db") > budget(1, "loss_db") && budget(1, "loss_db").abs() < 0.2, "{}", said["budgets"]);
     // The finest level is the model itself: it loses nothing, and pruning to as many splats removes none.
     assert_eq!([figure(1, "loss_db"), figure(1, "away_loss_db"), figure(1, "away_gain_db")], [0.0; 3]);
     assert_eq!((&cuts[1]["full"]["psnr"], &cuts[1]["splats"]), (&said["psnr"], &said["splats"].as_f64().into()));
@@ -64,7 +68,8 @@ fn cuts_and_seams_of_a_tree_are_measured() {
     refused(at, &["eval", "whole", "city", "--seams"], "--seams-of");
     refused(at, &["eval", "tree", "city", "--level", "2"], "--level");
     refused(at, &["eval", "tree", "city", "--level", "fine"], "--level");
-    refused(at, &["eval", "tree/merged.ply", "city", "--budget", "100"], "model.json");
+    assert_eq!(done(at, &["eval", "tree/merged.ply", "city", "--budget", "100"])["budgets"][0]["budget"], 100);
+    refused(at, &["eval", "tree", "city", "--budget", "0"], "--budget");
     for metres in ["0", "-1", "nan"] {
         refused(at, &["eval", "tree", "city", &format!("--seam-metres={metres}")], "--seam-metres");
     }

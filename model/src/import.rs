@@ -1,4 +1,4 @@
-//! Reads models that other programs wrote, and what `plat export` wrote: SOG, streamed SOG, RAD, 3D Tiles. PLY and SPZ are codecs of
+//! Reads models that other programs wrote, and what `plat export` wrote: SOG, streamed SOG, RAD. PLY and SPZ are codecs of
 //! [`scene`].
 //!
 //! The kind of a file is told by its content. All of it is of hostile origin: the codecs check sizes before they take memory, and no
@@ -17,6 +17,7 @@ use scene::{BadInput, CodecError, Splats, ply, spz};
 use serde::Deserialize;
 use serde::de::IgnoredAny;
 
+use self::folder::unreadable;
 use crate::ANTIALIASED;
 use crate::files::{MANIFEST_FILE, load};
 
@@ -113,11 +114,6 @@ pub(crate) fn read(kind: Kind, path: &Path) -> Result<(Splats, bool), BadInput> 
         }
     };
     Ok((splats, antialiased))
-}
-
-/// The error of a file whose bytes do not decode.
-fn unreadable(path: &Path, error: &CodecError) -> BadInput {
-    BadInput::new(path.display().to_string(), error.to_string(), "restore the file or export the model again")
 }
 
 #[cfg(test)]

@@ -29,10 +29,10 @@ use crate::error::CodecError;
 use crate::splats::Splats;
 
 pub use bounds::{Bounds, Encoding};
-pub use chunk::{CHUNK_NODES, chunk};
+pub use chunk::chunk;
 pub use forest::Forest;
 pub use gaussian::Gaussian;
-pub use meta::header;
+pub use meta::{CHUNK_NODES, header};
 pub use read::{Rad, read};
 
 /// A splat of the tree.

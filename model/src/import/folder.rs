@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::{Component, Path, PathBuf};
 
-use scene::CodecError;
+use scene::{BadInput, CodecError};
 
 /// A folder that no name leads out of.
 pub(super) struct Folder(PathBuf);
@@ -40,4 +40,9 @@ impl Folder {
     pub(super) fn bytes(&self, name: &str) -> Result<Vec<u8>, CodecError> {
         fs::read(self.path(name)?).map_err(|error| CodecError::new(format!("{name:?} cannot be read ({error})")))
     }
+}
+
+/// The error of a file whose bytes do not decode.
+pub(super) fn unreadable(path: &Path, error: &CodecError) -> BadInput {
+    BadInput::new(path.display().to_string(), error.to_string(), "restore the file or export the model again")
 }

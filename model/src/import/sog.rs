@@ -8,8 +8,7 @@ use std::path::Path;
 use scene::{BadInput, CodecError, Splats, sog};
 use serde::Deserialize;
 
-use super::folder::Folder;
-use super::unreadable;
+use super::folder::{Folder, unreadable};
 use crate::files::load;
 
 /// Name of the file with the tree.

@@ -11,9 +11,6 @@ use super::quantise::{f16_of, r8_of, rotation_of, s8_of, scale_of};
 use super::{Node, Order};
 use crate::error::CodecError;
 
-/// Nodes of a chunk: a page of the viewer's texture. Only the last has fewer.
-pub const CHUNK_NODES: usize = 1 << 16;
-
 /// Encodes the nodes from index `base` of the file on, in its order.
 ///
 /// # Errors

@@ -4,9 +4,10 @@ use serde::{Deserialize, Serialize};
 
 use super::Order;
 use super::bounds::Encoding;
-use super::chunk::CHUNK_NODES;
 use crate::error::CodecError;
 
+/// Nodes of a chunk: a page of the viewer's texture. Only the last has fewer.
+pub const CHUNK_NODES: usize = 1 << 16;
 pub(super) const MAGIC: [u8; 4] = *b"RAD0";
 pub(super) const CHUNK_MAGIC: [u8; 4] = *b"RADC";
 /// Bytes at most of the header: what viewers fetch of it.
