@@ -76,9 +76,9 @@ impl Board {
     }
 
     /// Applies a job's status.
-    pub(crate) fn status(&mut self, status: &StatusReply) {
+    pub(crate) fn status(&mut self, now: u64, status: &StatusReply) {
         if let Some(job) = self.jobs.get_mut(&status.job)
-            && job.set_status(status)
+            && job.set_status(now, status)
         {
             self.changed.jobs.insert(status.job);
         }

@@ -74,7 +74,8 @@ impl Follower {
         self.store = Some(store);
         // Another coordinator numbers its lines anew.
         self.logs.clear();
-        let mut watched = BTreeSet::new();
+        // Jobs whose stream is open, and those that were watched at all: one that has ended has to be watched once.
+        let (mut open, mut seen) = (BTreeSet::new(), BTreeSet::new());
         let mut watching = JoinSet::new();
         let mut period = tokio::time::interval(PERIOD);
         period.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
@@ -94,8 +95,9 @@ impl Follower {
                         }
                     }
                 }
-                self.feed.board().status(status);
-                if watched.insert(status.job) {
+                self.feed.board().status(self.feed.now(), status);
+                let is_new = seen.insert(status.job);
+                if (is_new || status.outcome.is_none()) && open.insert(status.job) {
                     watching.spawn(watch(self.feed.clone(), client.clone(), status.job));
                 }
             }
@@ -106,10 +108,10 @@ impl Follower {
             for status in &jobs {
                 self.read_log(&mut client, status.job, status.outcome.is_some()).await?;
             }
-            // A stream ends with its job, or because this browser's server lagged; then it starts over.
+            // A stream ends with its job, which may be retried later, or because this server lagged; then it starts over.
             while let Some(ended) = watching.try_join_next() {
-                if let Ok((job, false)) = ended {
-                    watched.remove(&job);
+                if let Ok(job) = ended {
+                    open.remove(&job);
                 }
             }
         }
@@ -125,6 +127,8 @@ impl Follower {
 
     async fn read_log(&mut self, client: &mut Client, job: u64, is_over: bool) -> Result<(), Status> {
         let (after, is_read) = self.logs.entry(job).or_default();
+        // A job that is retried goes on.
+        *is_read &= is_over;
         while !*is_read {
             let page = client.logs(LogsRequest { job, after: *after }).await?.into_inner().lines;
             let Some(last) = page.last() else {
@@ -168,9 +172,9 @@ fn read_project(name: String, plan: ArtefactId, store: BlockingStore) -> Result<
     Ok(Project::new(name, plan, Results::Store(store.clone()), capture.map(|capture| (capture, Some(store)))))
 }
 
-/// Watches one job; whether it ended.
-async fn watch(feed: Arc<Feed>, mut client: Client, job: u64) -> (u64, bool) {
-    let Ok(reply) = client.watch(WatchRequest { job }).await else { return (job, false) };
+/// Watches one job until its stream ends.
+async fn watch(feed: Arc<Feed>, mut client: Client, job: u64) -> u64 {
+    let Ok(reply) = client.watch(WatchRequest { job }).await else { return job };
     let mut updates = reply.into_inner();
     while let Ok(Some(event)) = updates.message().await {
         let Some(event) = event.event else { continue };
@@ -179,11 +183,11 @@ async fn watch(feed: Arc<Feed>, mut client: Client, job: u64) -> (u64, bool) {
             Update::Changed(changed) if changed.state() == TaskState::Done => {
                 add_figures(&feed, job, changed.task, &changed.artefact).await;
             }
-            Update::Finished(_) => return (job, true),
+            Update::Finished(_) => return job,
             _ => {}
         }
     }
-    (job, false)
+    job
 }
 
 /// Reads the figures of an evaluation task that is done.

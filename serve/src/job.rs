@@ -20,6 +20,8 @@ const QUALITY_LIMIT: usize = 2048;
 const ETA_RANGE: [f64; 2] = [0.7, 1.45];
 /// Share of the work before which no time is predicted.
 const ETA_SHARE: f64 = 0.02;
+/// Age of a status at most.
+const STATUS_AGE_MILLIS: u64 = 2000;
 /// Area of a halo with its core, relative to the core's.
 const HALO_AREA: f64 = blocks::ground::HALO_SCALE * blocks::ground::HALO_SCALE;
 
@@ -166,9 +168,16 @@ impl JobRecord {
     }
 
     /// Takes over the header of a status; whether anything changed.
-    pub(crate) fn set_status(&mut self, status: &StatusReply) -> bool {
+    pub(crate) fn set_status(&mut self, now: u64, status: &StatusReply) -> bool {
         let new = (status.paused, status.priority, status.weight);
-        let is_new = new != (self.paused, self.priority, self.weight);
+        // A job that has ended runs again once one of its tasks is retried. The status may be older than the end.
+        let runs_again = status.outcome.is_none()
+            && self.outcome.is_some()
+            && self.ended_unix_ms.is_some_and(|ended| now > ended + STATUS_AGE_MILLIS);
+        if runs_again {
+            (self.outcome, self.ended_unix_ms, self.work_since) = (None, None, None);
+        }
+        let is_new = runs_again || new != (self.paused, self.priority, self.weight);
         (self.paused, self.priority, self.weight) = new;
         is_new
     }

@@ -34,7 +34,9 @@ struct Setup {
 
 fn options(files: &tempfile::TempDir) -> Options {
     let files = Some(files.path().to_path_buf());
-    Options { identity: None, token: None, files, results: None, cors: false, clock: Arc::new(|| 1_800_000_000_000) }
+    let began = std::time::Instant::now();
+    let clock = Arc::new(move || 1_800_000_000_000 + began.elapsed().as_millis() as u64);
+    Options { identity: None, token: None, files, results: None, cors: false, clock }
 }
 
 async fn setup() -> Setup {
@@ -193,6 +195,31 @@ async fn a_job_is_shown_as_it_runs_and_can_be_controlled() {
     while TcpStream::connect(at).await.is_ok() {
         tokio::time::sleep(Duration::from_millis(20)).await;
     }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_job_that_failed_runs_again_when_it_is_retried() {
+    let mut setup = setup().await;
+    let at = setup.address;
+    let attempt = lease(&mut setup.client, "w").await;
+    let kind = proto::FailureKind::Input.into();
+    let request = proto::FailRequest { attempt: Some(attempt), message: "the photo is torn".into(), kind };
+    assert!(setup.client.fail(request).await.unwrap().into_inner().accepted);
+    until(at, "/api/snapshot", |all| all["jobs"][0]["state"] == "incomplete").await;
+    let task = until(at, "/api/jobs/1/tasks/0", |task| task["attempts"][0]["end"] == "failed").await;
+    assert!(task["state"] == "f" && task["attempts"][0]["reason"].as_str().unwrap().contains("the photo is torn"));
+    let body = r#"{"what":"retry","tasks":[0]}"#;
+    let request = format!(
+        "POST /api/jobs/1/control HTTP/1.1\r\nhost: localhost\r\nconnection: close\r\ncontent-type: application/json\r\ncontent-length: {}\r\n\r\n{body}",
+        body.len()
+    );
+    assert_eq!(ask(at, &request).await.0, 200);
+    until(at, "/api/snapshot", |all| all["jobs"][0]["state"] == "running").await;
+    for _ in 0..5 {
+        finish_one(&mut setup).await;
+    }
+    let all = until(at, "/api/snapshot", |all| all["jobs"][0]["state"] == "done").await;
+    assert_eq!(all["jobs"][0]["counts"]["done"], 5);
 }
 
 #[tokio::test(flavor = "multi_thread")]
