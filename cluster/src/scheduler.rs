@@ -62,8 +62,8 @@ pub struct Scheduler {
 pub struct WorkerView<'a> {
     /// What it offers.
     pub offer: &'a Offer,
-    /// Time since its last message, as of the scheduler's last step.
-    pub silent_millis: u64,
+    /// Time of its last message.
+    pub seen_millis: u64,
     /// The attempt that it executes.
     pub attempt: Option<AttemptId>,
 }
@@ -142,8 +142,7 @@ impl Scheduler {
     pub fn workers(&self) -> impl Iterator<Item = (WorkerId, WorkerView<'_>)> {
         self.workers.iter().map(|(id, worker)| {
             let attempt = self.indices.lease_of.get(id).copied();
-            let silent_millis = self.now_millis.saturating_sub(worker.seen_millis);
-            (*id, WorkerView { offer: &worker.offer, silent_millis, attempt })
+            (*id, WorkerView { offer: &worker.offer, seen_millis: worker.seen_millis, attempt })
         })
     }
 

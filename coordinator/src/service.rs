@@ -304,6 +304,6 @@ impl Coordinator for Service {
     }
 
     async fn workers(&self, _: Request<WorkersRequest>) -> Answer<WorkersReply> {
-        Ok(Response::new(self.call_at_once(|jobs, _| Ok(jobs.workers())).await?))
+        Ok(Response::new(self.call_at_once(|jobs, now| Ok(jobs.workers(now))).await?))
     }
 }

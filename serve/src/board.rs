@@ -15,8 +15,6 @@ const EVENTS_KEPT: usize = 20_000;
 const EVENTS_SHOWN: usize = 200;
 /// Workers that have gone and are still shown.
 const GONE_SHOWN: usize = 200;
-/// Without a heartbeat for this long a worker counts as lost even before its lease expires.
-const SILENT_MILLIS: u64 = 30_000;
 
 /// The state that the pages show.
 #[derive(Debug)]
@@ -175,8 +173,9 @@ impl Board {
         self.changed.events.push(event);
     }
 
-    /// Applies the list of connected workers. One that is missing was lost if it had a task, else it left.
-    pub(crate) fn set_workers(&mut self, now: u64, statuses: &[WorkerStatus]) {
+    /// Applies the list of connected workers. One that is silent for longer than a lease is lost; one that is missing was lost if it had a
+    /// task, else it left.
+    pub(crate) fn set_workers(&mut self, now: u64, statuses: &[WorkerStatus], lease_millis: u64) {
         let is_paused = self.jobs.values().all(|job| job.outcome.is_some());
         for status in statuses {
             let worker = self.workers.entry(status.name.clone()).or_insert_with(|| Worker {
@@ -198,7 +197,7 @@ impl Board {
             (worker.backend, worker.memory_bytes) = (status.backend.clone(), status.memory_bytes);
             worker.heard_unix_ms = worker.heard_unix_ms.max(now.saturating_sub(status.silent_millis));
             let state = match &status.attempt {
-                _ if status.silent_millis > SILENT_MILLIS => WorkerState::Lost,
+                _ if status.silent_millis > lease_millis => WorkerState::Lost,
                 Some(attempt) => {
                     (worker.job, worker.task, worker.attempt) = (Some(attempt.job), Some(attempt.task), attempt.number);
                     WorkerState::Busy
@@ -246,7 +245,7 @@ impl Board {
 
     /// The coordinator has ended in order, and with it its log: counts what its workers did from the attempts.
     pub(crate) fn coordinator_ended(&mut self, now: u64) {
-        self.set_workers(now, &[]);
+        self.set_workers(now, &[], 0);
         for (name, worker) in &mut self.workers {
             let attempts = self.jobs.values().flat_map(|job| &job.tasks).flat_map(|task| &task.attempts);
             let done = attempts.filter(|attempt| attempt.worker == *name && attempt.end == AttemptEnd::Done).count();
@@ -323,4 +322,42 @@ fn worker_of(job: &JobRecord, line: &LogLine) -> Option<String> {
     let attempts = &job.tasks.get(line.task? as usize)?.attempts;
     let attempt = attempts.iter().find(|attempt| attempt.number == line.attempt)?;
     Some(attempt.worker.clone())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::server;
+
+    #[test]
+    fn workers_are_busy_idle_lost_or_gone() {
+        let mut board = Board::new(server());
+        let status = |name: &str, silent_millis, attempt: Option<u32>| WorkerStatus {
+            name: name.into(),
+            silent_millis,
+            attempt: attempt.map(|task| proto::Attempt { job: 1, task, number: 1, epoch: 1 }),
+            ..WorkerStatus::default()
+        };
+        let states = |board: &Board| {
+            let snapshot = board.snapshot(0, 0);
+            snapshot.workers.iter().map(|worker| (worker.name.clone(), worker.state)).collect::<Vec<_>>()
+        };
+        let of = |name: &str, state| (name.to_owned(), state);
+        board.set_workers(10_000, &[status("a", 50, Some(3)), status("b", 900, None)], 3000);
+        assert_eq!(states(&board), [of("a", WorkerState::Busy), of("b", WorkerState::Idle)]);
+        assert_eq!(board.snapshot(0, 0).workers[1].idle_reason, "no job is running");
+        // A job was cancelled: its worker has no task and has not spoken since, but for no longer than a lease.
+        board.set_workers(12_000, &[status("a", 2050, None), status("b", 10, None)], 3000);
+        assert_eq!(states(&board)[0], of("a", WorkerState::Idle));
+        board.set_workers(13_500, &[status("a", 3550, None)], 3000);
+        assert_eq!(states(&board), [of("a", WorkerState::Lost), of("b", WorkerState::Left)]);
+        board.set_workers(14_000, &[status("a", 10, Some(4))], 3000);
+        assert_eq!(states(&board)[0], of("a", WorkerState::Busy));
+        // A heartbeat alone is told every two seconds.
+        assert!(board.take_delta(14_000).is_some());
+        board.set_workers(15_000, &[status("a", 10, Some(4))], 3000);
+        assert!(board.take_delta(15_000).is_none());
+        board.set_workers(16_500, &[status("a", 10, Some(4))], 3000);
+        assert_eq!(board.take_delta(16_500).unwrap().workers.len(), 1);
+    }
 }

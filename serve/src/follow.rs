@@ -103,8 +103,8 @@ impl Follower {
             }
             let known: BTreeSet<u64> = jobs.iter().map(|status| status.job).collect();
             self.feed.board().retain(&known);
-            let workers = client.workers(proto::WorkersRequest {}).await?.into_inner().workers;
-            self.feed.board().set_workers(self.feed.now(), &workers);
+            let connected = client.workers(proto::WorkersRequest {}).await?.into_inner();
+            self.feed.board().set_workers(self.feed.now(), &connected.workers, connected.lease_millis);
             for status in &jobs {
                 self.read_log(&mut client, status.job, status.outcome.is_some()).await?;
             }

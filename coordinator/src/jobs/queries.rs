@@ -88,12 +88,12 @@ impl Jobs {
     }
 
     /// The connected workers.
-    pub(crate) fn workers(&self) -> proto::WorkersReply {
+    pub(crate) fn workers(&self, now: u64) -> proto::WorkersReply {
         let status = |(id, view): (WorkerId, WorkerView<'_>)| proto::WorkerStatus {
             name: self.names.get(id.0 as usize).cloned().unwrap_or_default(),
             backend: view.offer.backend.clone(),
             memory_bytes: view.offer.memory_bytes,
-            silent_millis: view.silent_millis,
+            silent_millis: now.saturating_sub(view.seen_millis),
             attempt: view.attempt.map(|AttemptId { job, task, fence }| proto::Attempt {
                 job: job.0,
                 task: task.0,
@@ -101,6 +101,7 @@ impl Jobs {
                 epoch: fence.epoch,
             }),
         };
-        proto::WorkersReply { workers: self.scheduler.workers().map(status).collect() }
+        let lease_millis = self.options.settings.lease_millis;
+        proto::WorkersReply { workers: self.scheduler.workers().map(status).collect(), lease_millis }
     }
 }
