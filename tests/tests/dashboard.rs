@@ -153,6 +153,11 @@ async fn a_job_is_shown_as_it_runs_and_can_be_controlled() {
     assert!(splats.len() == 2 && (splats.mean(0) - glam::Vec3::new(-25.0, -25.0, 1.0)).length() < 1e-3);
     let rad = scene::rad::read(&get(at, &format!("/api/jobs/1/blocks/{artefact}.rad"), "").await.2).unwrap();
     assert_eq!(rad.leaves().len(), 2);
+    // JSON is compressed for browsers that read that, the splats' own compression is left alone.
+    for (path, is_compressed) in [("/api/jobs/1/model", true), (path.as_str(), false)] {
+        let (_, head, _) = get(at, path, "accept-encoding: gzip\r\n").await;
+        assert_eq!(head.contains("content-encoding: gzip"), is_compressed, "{path}: {head}");
+    }
     let (status, head, part) = get(at, &path, "range: bytes=2-5\r\n").await;
     assert!(status == 206 && part == whole[2..6] && head.contains(&format!("bytes 2-5/{}", whole.len())), "{head}");
     assert_eq!(get(at, &path, "range: bytes=99999999-\r\n").await.0, 416);
