@@ -115,7 +115,7 @@ function taskDetail(sim, t) {
     rho_metres: plan.blocks.rho_metres[t] ?? 0, memory_bytes: 1.6e9, parent: t < n ? sim.parents[t] : null, neighbours, attempts: task.attempts,
     curve: { attempt: column(0), step: column(1), loss: column(2), splats: column(3), cpu_seconds: column(4), wall_seconds: column(5) },
     fleet: { share, loss: share.map((f) => [loss(f) * 0.85, loss(f), loss(f) * 1.3]), splats: share.map((f) => [8000, 16000, 26000].map((b) => b * (0.3 + 0.7 * f))) },
-    psnr: task.psnr, seams: neighbours.map((u) => ({ neighbour: u, psnr: sim.tasks[u].s === 'd' && task.s === 'd' ? +(29 + 4 * hash(t, u)).toFixed(2) : null })),
+    psnr: task.psnr,
   };
 }
 
@@ -126,7 +126,7 @@ function views(sim) {
     const at = [300 * Math.cos(v), 260 * Math.sin(v * 1.7), 12];
     // Columns: right, down, forward; the camera looks along (c, s, -0.1).
     return {
-      view: v, name: `${String(v * 9).padStart(6, '0')}.jpg`, width: 320, height: 200, test: v % 3 === 0, photo: true, render: v % 3 === 0,
+      view: v, name: `${String(v * 9).padStart(6, '0')}.jpg`, width: 320, height: 200, test: v % 3 === 0, photo: true,
       camera: { fx: 260, fy: 260, cx: 160, cy: 100, world_from_camera: [s, 0, c, at[0], -c, 0, s, at[1], 0, -1, 0, at[2], 0, 0, 0, 1] },
       psnr: v % 3 ? null : +(22 + 9 * hash(v, 3)).toFixed(2), ssim: v % 3 ? null : +(0.7 + 0.25 * hash(v, 4)).toFixed(3), perceptual: v % 3 ? null : +(30 + 50 * hash(v, 5)).toFixed(1),
       street: v % 2 === 0, task: v % 5,
@@ -232,7 +232,6 @@ createServer(async (request, response) => {
     case 'curve': return json(sim.curve);
     case 'views': return json({ views: views(sim) });
     case 'photos': return image(picture(Number.parseInt(argument, 10), false));
-    case 'renders': return image(picture(Number.parseInt(argument, 10), true));
     case 'model': return json(model(sim));
     case 'blocks': {
       if (rad && argument.endsWith('.rad')) return ranged(rad, request, response);

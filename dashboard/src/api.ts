@@ -155,7 +155,6 @@ export interface Task {
   curve: { attempt: number[]; step: number[]; loss: (number | null)[]; splats: number[]; cpu_seconds: number[]; wall_seconds: number[] };
   fleet: { share: number[]; loss: Band[]; splats: Band[] };
   psnr: number | null;
-  seams: { neighbour: number; psnr: number | null }[];
 }
 
 export interface Camera {
@@ -178,7 +177,6 @@ export interface View {
   ssim: number | null;
   perceptual: number | null;
   street: boolean | null;
-  render: boolean;
   task?: number | null;
 }
 

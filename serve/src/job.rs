@@ -7,7 +7,7 @@ use proto::{LogKind, LogLine, Outcome, Report, StatusReply, TaskChanged, TaskSta
 use scene::ArtefactId;
 
 use crate::project::Project;
-use crate::views::{Attempt, AttemptEnd, Counts, Curve, Fleet, JobState, Phase, QualityCurve, Seam, TaskChange, Tasks};
+use crate::views::{Attempt, AttemptEnd, Counts, Curve, Fleet, JobState, Phase, QualityCurve, TaskChange, Tasks};
 use crate::{curve::CurveLog, views};
 
 /// Points of [`views::Fleet`].
@@ -412,7 +412,6 @@ impl JobRecord {
     pub(crate) fn task_view(&self, task: u32) -> Option<views::Task> {
         let record = self.tasks.get(task as usize)?;
         let about = self.project.about(task);
-        let neighbours = about.neighbours;
         Some(views::Task {
             task,
             block: about.block.map(|block| block.to_string()),
@@ -427,8 +426,7 @@ impl JobRecord {
             curve: record.curve.view(),
             fleet: about.block.map_or_else(Fleet::default, |block| self.fleet(block.level)),
             psnr: self.project.block_psnr(task as usize),
-            seams: neighbours.iter().map(|&neighbour| Seam { neighbour, psnr: None }).collect(),
-            neighbours,
+            neighbours: about.neighbours,
         })
     }
 

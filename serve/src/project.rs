@@ -335,7 +335,7 @@ impl Project {
                 "photo": self.photos.is_some() && !view.mips.is_empty(),
                 "street": kinds.get(index).map(|kind| *kind == ViewKind::Street),
                 "psnr": of.and_then(|of| of.psnr), "ssim": of.map(|of| of.ssim),
-                "perceptual": of.and_then(|of| of.perceptual), "render": false,
+                "perceptual": of.and_then(|of| of.perceptual),
             })
         };
         json!({"views": capture.views.iter().enumerate().map(view).collect::<Vec<Value>>()})

@@ -283,13 +283,6 @@ pub(crate) struct Task {
     pub(crate) curve: Curve,
     pub(crate) fleet: Fleet,
     pub(crate) psnr: Option<f64>,
-    pub(crate) seams: Vec<Seam>,
-}
-
-#[derive(Debug, Serialize)]
-pub(crate) struct Seam {
-    pub(crate) neighbour: u32,
-    pub(crate) psnr: Option<f64>,
 }
 
 /// Held-out PSNR of the merged model during training, as columns.

@@ -1,4 +1,4 @@
-// One block: its attempts and their reasons, its curves against the other blocks, its seams, worst views and log.
+// One block: its attempts and their reasons, its curves against the other blocks, its neighbours, worst views and log.
 import { useEffect, useMemo } from 'preact/hooks';
 import { useComputed, useSignal } from '@preact/signals';
 import { get, type Event, type Task, type View } from '../api';
@@ -32,7 +32,7 @@ export function Block() {
         <Panel title="Loss" class="w6"><div class="body"><Curves task={task} what="loss" /></div></Panel>
         <Panel title="Splats" class="w6"><div class="body"><Curves task={task} what="splats" /></div></Panel>
         <Panel title="Attempts" class="w6"><Attempts task={task} /></Panel>
-        <Panel title="Neighbours and seams" class="w6"><Seams task={task} /></Panel>
+        <Panel title="Neighbours" class="w6"><Neighbours task={task} /></Panel>
         <Panel title="Worst held-out views" class="w6">
           {views.error ? <div class="failure">{views.error}</div> : <WorstViews job={jobId.value!} views={mine} />}
         </Panel>
@@ -152,18 +152,17 @@ function Attempts({ task }: { task: Task }) {
   );
 }
 
-function Seams({ task }: { task: Task }) {
+function Neighbours({ task }: { task: Task }) {
   void version.value;
   const t = table.value;
   if (task.kind !== 'train') return <div class="empty">An evaluation has no neighbours.</div>;
-  const seams = new Map(task.seams.map((s) => [s.neighbour, s.psnr]));
   return (
     <div class="scroll"><table class="plain">
-      <thead><tr><th>Block</th><th>Relation</th><th>State</th><th class="n">Seam PSNR, dB</th></tr></thead>
+      <thead><tr><th>Block</th><th>Relation</th><th>State</th></tr></thead>
       <tbody>
-        {task.parent !== null && <tr><td><a href={href(`block/${task.parent}`)}>{t?.name(task.parent) ?? task.parent}</a></td><td>parent</td><td>{t ? NAMES[t.state[task.parent]!] : DASH}</td><td class="n">{DASH}</td></tr>}
-        {task.neighbours.map((n) => <tr key={n}><td><a href={href(`block/${n}`)}>{t?.name(n) ?? n}</a></td><td>neighbour</td><td>{t ? NAMES[t.state[n]!] : DASH}</td><td class="n num">{fixed(seams.get(n), 2)}</td></tr>)}
-        {task.parent === null && task.neighbours.length === 0 && <tr><td colSpan={4} class="muted">None: this block covers the scene.</td></tr>}
+        {task.parent !== null && <tr><td><a href={href(`block/${task.parent}`)}>{t?.name(task.parent) ?? task.parent}</a></td><td>parent</td><td>{t ? NAMES[t.state[task.parent]!] : DASH}</td></tr>}
+        {task.neighbours.map((n) => <tr key={n}><td><a href={href(`block/${n}`)}>{t?.name(n) ?? n}</a></td><td>neighbour</td><td>{t ? NAMES[t.state[n]!] : DASH}</td></tr>)}
+        {task.parent === null && task.neighbours.length === 0 && <tr><td colSpan={3} class="muted">None: this block covers the scene.</td></tr>}
       </tbody>
     </table></div>
   );

@@ -40,7 +40,7 @@ function Triple({ job, view }: { job: number; view: View }) {
   const photo = `/api/jobs/${job}/photos/${view.view}.jpg`;
   const made = useSignal('');
   const busy = useSignal(false);
-  const render = view.render ? `/api/jobs/${job}/renders/${view.view}.png` : made.value;
+  const render = made.value;
   useEffect(() => {
     if (!view.photo || !render) return undefined;
     let live = true;
@@ -59,7 +59,7 @@ function Triple({ job, view }: { job: number; view: View }) {
   return (
     <div class="triple">
       <figure>{view.photo ? <img src={photo} alt={`Photo ${view.name}`} /> : <div class="empty">The server has no photos.</div>}<figcaption>Photo · {view.name}</figcaption></figure>
-      <figure>{render ? <img src={render} alt={`Render of ${view.name}`} /> : <div class="empty"><button type="button" disabled={busy.value} onClick={() => void draw()}>{busy.value ? 'Rendering …' : 'Render here'}</button></div>}<figcaption>Render{made.value ? ' by this browser, which differs a little from plat' : ''}</figcaption></figure>
+      <figure>{render ? <img src={render} alt={`Render of ${view.name}`} /> : <div class="empty"><button type="button" disabled={busy.value} onClick={() => void draw()}>{busy.value ? 'Rendering …' : 'Render here'}</button></div>}<figcaption>Render{render ? ' by this browser, which differs a little from plat' : ''}</figcaption></figure>
       <figure>{view.photo && render ? <canvas ref={error} role="img" aria-label={`Error of ${view.name}: ${note.value}`} /> : <div class="empty">–</div>}<figcaption>Error · {note.value || 'dark is none, yellow is 64 of 255 and more'}</figcaption></figure>
     </div>
   );
