@@ -6,6 +6,7 @@
 pub mod chart;
 pub mod parts;
 pub mod reference;
+mod report_line;
 pub mod seeds;
 pub mod table;
 
@@ -18,6 +19,7 @@ use store::file::SaveError;
 
 pub use chart::chart;
 pub use parts::{PartLine, append_part};
+pub use report_line::ReportLine;
 pub use seeds::{Averaged, averaged};
 pub use table::{replace_table, short_table, table};
 

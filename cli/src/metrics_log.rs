@@ -4,34 +4,16 @@ use std::collections::BTreeMap;
 use std::fs::File;
 use std::path::{Path, PathBuf};
 
-use bench::CurvePoint;
+use bench::{CurvePoint, ReportLine};
 use blocks::Plan;
 use proto::watch_event::Event;
 use proto::{TaskChanged, TaskState};
 use scene::BlockId;
-use serde::Serialize;
 use store::file::{SaveError, append};
 
 use crate::clock::Stopwatch;
 use crate::failure::{Failure, cannot};
 use crate::output::Stages;
-
-/// A line of `metrics.jsonl`.
-#[derive(Debug, Serialize)]
-struct Line {
-    task: String,
-    attempt: u32,
-    step: u64,
-    steps: u64,
-    cpu_seconds: f64,
-    wall_seconds: f64,
-    splats: u64,
-    loss: Option<f64>,
-    /// PSNR of the merged model so far over the held-out views, dB; null if it was not measured.
-    psnr: Option<f64>,
-    /// Splats of that model.
-    merged_splats: Option<u64>,
-}
 
 /// Progress and time of a task's current attempt.
 #[derive(Debug, Clone, Default)]
@@ -162,7 +144,7 @@ impl MetricsLog {
         let step = (share * f64::from(planned)) as u64;
         *spent = Spent { attempt, step, cpu_seconds: report.cpu_seconds, wall_seconds: report.wall_seconds };
         let (cpu_seconds, wall_seconds) = self.clocks();
-        let line = Line {
+        let line = ReportLine {
             task: block.to_string(),
             attempt,
             step: report.step,

@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
+use bench::ReportLine;
 use blocks::Plan;
 use dataset::ingest::load_capture;
 use eval::ViewFigures;
@@ -30,21 +31,6 @@ const PERIOD: Duration = Duration::from_secs(2);
 /// Largest JSON file that is read, bytes.
 const FILE_BYTES_LIMIT: u64 = 1 << 30;
 const FILES: [&str; 5] = ["plan.json", "metrics.jsonl", "report.json", "eval/report.json", "model/model.json"];
-
-/// A line of `metrics.jsonl`.
-#[derive(Deserialize)]
-struct Line {
-    task: String,
-    attempt: u32,
-    step: u64,
-    steps: u64,
-    cpu_seconds: f64,
-    wall_seconds: f64,
-    splats: u64,
-    loss: Option<f64>,
-    psnr: Option<f64>,
-    merged_splats: Option<u64>,
-}
 
 /// What is shown of `report.json`.
 #[derive(Deserialize)]
@@ -150,12 +136,13 @@ pub(crate) fn load(feed: &Feed, folder: &Path) -> Result<(), BadInput> {
     let mut board = feed.board();
     board.add(JOB, project.clone());
     for line in lines.split(|byte| *byte == b'\n') {
-        let Ok(line) = serde_json::from_slice::<Line>(line) else { continue };
+        let Ok(line) = serde_json::from_slice::<ReportLine>(line) else { continue };
         let Some(task) = line.task.parse().ok().and_then(|block| project.task_of(block)) else { continue };
         let leased = TaskState::Leased.into();
         let changed =
             TaskChanged { task, state: leased, attempt: line.attempt, worker: "local".into(), ..Default::default() };
-        let Line { step, steps, cpu_seconds, wall_seconds, splats, loss, psnr, merged_splats, attempt, .. } = line;
+        let ReportLine { step, steps, cpu_seconds, wall_seconds, splats, loss, psnr, merged_splats, attempt, .. } =
+            line;
         let report = Report { step, steps, loss, splats, cpu_seconds, wall_seconds, psnr, merged_splats };
         board.update(now, JOB, &Update::Changed(changed));
         board.update(now, JOB, &Update::Reported(TaskReported { task, attempt, report: Some(report) }));
