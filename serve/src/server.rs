@@ -16,7 +16,6 @@ use rustls::pki_types::{CertificateDer, PrivateKeyDer};
 use scene::BadInput;
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::{TcpListener, TcpStream};
-use tokio::sync::Semaphore;
 use tokio_rustls::TlsAcceptor;
 use tokio_util::sync::CancellationToken;
 
@@ -54,29 +53,8 @@ pub(crate) fn tls(pair: &KeyPair) -> Result<TlsAcceptor, BadInput> {
 
 /// Serves until `stop`.
 pub(crate) async fn run(listener: TcpListener, tls: Option<TlsAcceptor>, router: Router, stop: CancellationToken) {
-    let slots = Arc::new(Semaphore::new(CONNECTIONS_LIMIT));
-    loop {
-        let accepted = tokio::select! {
-            () = stop.cancelled() => return,
-            accepted = async {
-                let slot = slots.clone().acquire_owned().await;
-                (slot, listener.accept().await)
-            } => accepted,
-        };
-        let (slot, Ok((stream, _))) = accepted else {
-            // Out of file descriptors, which is transient.
-            tokio::time::sleep(Duration::from_millis(100)).await;
-            continue;
-        };
-        let (tls, router, stop) = (tls.clone(), router.clone(), stop.clone());
-        tokio::spawn(async move {
-            tokio::select! {
-                () = stop.cancelled() => {}
-                () = connection(stream, tls, router) => {}
-            }
-            drop(slot);
-        });
-    }
+    let answer = |stream| connection(stream, tls.clone(), router.clone());
+    telemetry::accept(listener, CONNECTIONS_LIMIT, answer, stop).await;
 }
 
 async fn connection(stream: TcpStream, tls: Option<TlsAcceptor>, router: Router) {

@@ -9,6 +9,7 @@
 //! Architecture invariant: the work never waits for telemetry. A full queue drops spans, an unreachable collector costs one log line, a
 //! scrape reads atomics. No result depends on telemetry.
 
+mod accept;
 mod lines;
 pub mod metrics;
 mod otlp;
@@ -22,6 +23,7 @@ use tracing_subscriber::layer::{Layer, SubscriberExt};
 use tracing_subscriber::util::SubscriberInitExt;
 use tracing_subscriber::{EnvFilter, Registry, fmt};
 
+pub use accept::accept;
 pub use trace::{HEADER, TraceParent, traced};
 
 /// The crates whose spans are exported.

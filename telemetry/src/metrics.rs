@@ -17,8 +17,9 @@ use prometheus_client::encoding::text::encode;
 use prometheus_client::registry::Registry;
 use scene::BadInput;
 use tokio::net::{TcpListener, TcpStream};
-use tokio::sync::Semaphore;
 use tokio_util::sync::CancellationToken;
+
+use crate::accept::accept;
 
 /// Concurrent connections; further ones wait to be accepted.
 const CONNECTIONS_LIMIT: usize = 16;
@@ -43,27 +44,14 @@ pub async fn listen(address: SocketAddr) -> Result<TcpListener, BadInput> {
 /// Serves scrapes until `stop` is cancelled.
 pub async fn serve(listener: TcpListener, registry: Registry, stop: CancellationToken) {
     let registry = Arc::new(registry);
-    let slots = Arc::new(Semaphore::new(CONNECTIONS_LIMIT));
-    loop {
-        let accepted = tokio::select! {
-            () = stop.cancelled() => return,
-            accepted = async {
-                let slot = slots.clone().acquire_owned().await;
-                (slot, listener.accept().await)
-            } => accepted,
-        };
-        let (slot, Ok((stream, _))) = accepted else {
-            // Out of file descriptors, which is transient.
-            tokio::time::sleep(Duration::from_millis(100)).await;
-            continue;
-        };
+    let answer = |stream| {
         let registry = registry.clone();
-        tokio::spawn(async move {
+        async move {
             // An early disconnect is not an error here.
             let _ = tokio::time::timeout(CONNECTION_TIMEOUT, answer_one(stream, registry)).await;
-            drop(slot);
-        });
-    }
+        }
+    };
+    accept(listener, CONNECTIONS_LIMIT, answer, stop).await;
 }
 
 async fn answer_one(stream: TcpStream, registry: Arc<Registry>) -> hyper::Result<()> {
