@@ -2,8 +2,8 @@
 import { deflateSync, gzipSync, crc32 } from 'node:zlib';
 import { hash } from './world.mjs';
 
-/** A street front. With `render`, the same scene a little blurred, and wrong in one place. */
-export function picture(seed, render, width = 320, height = 200) {
+/** A street front. */
+export function picture(seed, width = 320, height = 200) {
   const rgb = Buffer.alloc((width * 3 + 1) * height);
   const houses = 9;
   for (let j = 0; j < height; j += 1) for (let i = 0; i < width; i += 1) {
@@ -16,9 +16,8 @@ export function picture(seed, render, width = 320, height = 200) {
     else if (v > top) {
       const window = (u * houses * 3) % 1 > 0.55 && ((v - top) * 14) % 1 > 0.5;
       c = window ? [60, 75, 95] : [150 + 80 * hash(seed, house, 2), 120 + 60 * hash(seed, house, 3), 95 + 50 * hash(seed, house, 4)];
-      if (render && house === seed % houses && v < top + 0.18) c = c.map((x) => 0.6 * x + 70);
     } else c = [150 + 60 * v, 185 + 40 * v, 230];
-    const noise = (hash(seed, i, j) - 0.5) * (render ? 4 : 16);
+    const noise = (hash(seed, i, j) - 0.5) * 16;
     const at = j * (width * 3 + 1) + 1 + 3 * i;
     for (let k = 0; k < 3; k += 1) rgb[at + k] = Math.max(0, Math.min(255, c[k] + noise));
   }

@@ -231,7 +231,7 @@ createServer(async (request, response) => {
     }
     case 'curve': return json(sim.curve);
     case 'views': return json({ views: views(sim) });
-    case 'photos': return image(picture(Number.parseInt(argument, 10), false));
+    case 'photos': return image(picture(Number.parseInt(argument, 10)));
     case 'model': return json(model(sim));
     case 'blocks': {
       if (rad && argument.endsWith('.rad')) return ranged(rad, request, response);

@@ -25,7 +25,10 @@ const PAGES = {
   block: ['block/0', async (page) => {
     await page.waitForSelector('.uplot canvas');
     assert.match(await text(page, 'main'), /Block 0\/0\/0/);
-    if (!REAL) await page.waitForFunction(() => /mean error \d+\.\d of 255/.test(document.body.textContent));
+    if (!REAL) {
+      await page.getByRole('button', { name: 'Render here' }).click();
+      await page.waitForFunction(() => /mean error \d+\.\d of 255/.test(document.body.textContent), undefined, { timeout: 60000 });
+    }
   }],
   compare: ['compare', async (page) => {
     await page.waitForSelector('svg.pareto .mark, .empty h3');
