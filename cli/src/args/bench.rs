@@ -77,7 +77,7 @@ pub(crate) struct IngestArgs {
 
 #[derive(Debug, Clone, Args)]
 pub(crate) struct BenchPruneArgs {
-    /// Folder that `plat train` wrote, a .ply or a .spz
+    /// Folder that `plat train` wrote, or a model as PLY, SPZ, SOG, streamed SOG or RAD
     pub(crate) model: PathBuf,
     /// Folder of the capture
     pub(crate) capture: PathBuf,
