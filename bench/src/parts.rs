@@ -259,6 +259,9 @@ pub struct Tree {
     pub levels: Vec<TreeLevel>,
     /// Figures at the seams; null if the finest cut is one block.
     pub faces: Option<TreeFaces>,
+    /// What viewers draw within budgets of splats. Lines of before have none.
+    #[serde(default)]
+    pub budgets: Vec<TreeBudget>,
     /// The command that wrote the line.
     pub command: String,
 }
@@ -276,6 +279,17 @@ pub struct TreeLevel {
     pub away_mip: f64,
     /// PSNR there, dB: of the cut, of the finest cut, and of as many of the finest cut's most important splats.
     pub away_psnr: [Option<f64>; 3],
+}
+
+/// What a viewer draws of a tree within a budget.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct TreeBudget {
+    /// Splats at most.
+    pub budget: u32,
+    /// Splats drawn.
+    pub drawn: f64,
+    /// PSNR of what is drawn, of as many of the model's most important splats, and of the whole model, dB.
+    pub psnr: [Option<f64>; 3],
 }
 
 /// Figures near the faces between the blocks of a finest cut.
@@ -321,7 +335,11 @@ impl PartLine {
                     let without = faces.without_psnr.into_iter().flatten();
                     without.chain(faces.psnr).chain(faces.ssim).chain(faces.flip).chain([faces.step])
                 });
-                of_levels.chain(of_faces).flatten().all(f64::is_finite)
+                of_levels
+                    .chain(of_faces)
+                    .chain(line.budgets.iter().flat_map(|of| of.psnr))
+                    .flatten()
+                    .all(f64::is_finite)
             }
             Self::Scale(line) => line.job_seconds.is_finite() && line.cpu_seconds.is_finite(),
             Self::Ablation(line) => {

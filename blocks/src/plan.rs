@@ -63,7 +63,7 @@ pub struct PlanSettings {
     pub views_per_step: u32,
     /// Splats of the merged model.
     pub budget: u32,
-    /// PSNR that pruning of a leaf may lose, dB. 0: no pruning.
+    /// PSNR that pruning of a block may lose, dB. 0: no pruning.
     pub tolerance_db: f64,
     /// Refinement threshold, relative: a block is trained only if the RMS error of its parent's splats in the block's
     /// windows exceeds this many times the root's overall RMS error. 0: every block is trained.

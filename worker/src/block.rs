@@ -90,11 +90,10 @@ impl Block<'_> {
         trainable(own, asked, plan.visits([task]))
     }
 
-    /// How the block is pruned. Only leaves are: they replace the blocks above them.
+    /// How the block is pruned. Inner blocks are too: viewers draw them from afar, and their children start from what is left.
     pub(crate) fn pruning(&self) -> Option<Pruning> {
         let tolerance_db = self.plan.settings.tolerance_db;
-        let is_leaf = self.plan.tasks.iter().all(|task| task.parent != Some(self.task.block));
-        (is_leaf && tolerance_db > 0.0).then(|| Pruning::within(tolerance_db))
+        (tolerance_db > 0.0).then(|| Pruning::within(tolerance_db))
     }
 
     /// The key of the block's random numbers.

@@ -56,10 +56,10 @@ pub struct Estimate {
 impl Estimate {
     /// The estimate for one task at a time, on a machine of this [speed](crate::speed::relative_speed).
     pub fn of(plan: &Plan, relative_speed: f64) -> Self {
-        let parents = parents(plan);
+        let parents: BTreeSet<BlockId> = plan.tasks.iter().filter_map(|task| task.parent).collect();
         let leaf = |task: &&Task| !parents.contains(&task.block);
         let splats: u64 = plan.tasks.iter().filter(leaf).map(|task| u64::from(task.budget)).sum();
-        let cpu_seconds: f64 = plan.tasks.iter().map(|task| cpu_seconds(plan, task, leaf(&task))).sum();
+        let cpu_seconds: f64 = plan.tasks.iter().map(|task| cpu_seconds(plan, task)).sum();
         let cpu_seconds = cpu_seconds / relative_speed;
         Self {
             cpu_seconds,
@@ -71,13 +71,8 @@ impl Estimate {
     }
 }
 
-/// Blocks that have children.
-pub(crate) fn parents(plan: &Plan) -> BTreeSet<BlockId> {
-    plan.tasks.iter().filter_map(|task| task.parent).collect()
-}
-
 /// CPU seconds of a task on the CPU backend of the machine of the constants.
-pub(crate) fn cpu_seconds(plan: &Plan, task: &Task, leaf: bool) -> f64 {
+pub(crate) fn cpu_seconds(plan: &Plan, task: &Task) -> f64 {
     let settings = &plan.settings;
     let pixels = StepCost::of(task).pixels;
     let is_child = task.parent.is_some();
@@ -111,7 +106,7 @@ pub(crate) fn cpu_seconds(plan: &Plan, task: &Task, leaf: bool) -> f64 {
     };
     let step = seconds(mean_pixels, mean_splats);
     let read = SECONDS_PER_READ_PIXEL * task.window_pixels() as f64;
-    if settings.tolerance_db == 0.0 || !leaf {
+    if settings.tolerance_db == 0.0 {
         return read + f64::from(task.steps) * step;
     }
     let trained = f64::from(prune::steps_before(task.steps));

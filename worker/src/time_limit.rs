@@ -16,7 +16,7 @@ use scene::{BlockId, Splats};
 use train::{Flow, Job, Recipe, TrainView};
 
 use crate::clock::Stopwatch;
-use crate::estimate::{cpu_seconds, parents};
+use crate::estimate::cpu_seconds;
 
 /// Cost of a pixel in a training step, and of a splat of the block, visible or not: only their ratio counts.
 const PIXEL_COST: f64 = 0.2;
@@ -79,12 +79,11 @@ fn share(plan: &Plan, task: u32, done: &BTreeSet<u32>, workers: u32) -> f64 {
     let mut depths: BTreeMap<BlockId, usize> = BTreeMap::new();
     let mut work: BTreeMap<usize, (f64, u32)> = BTreeMap::new();
     let mut own = 1.0;
-    let parents = parents(plan);
     for (i, of) in (0..).zip(&plan.tasks) {
         let dependencies = of.parent.iter().chain(&of.context).filter_map(|block| depths.get(block));
         let depth = dependencies.max().map_or(0, |depth| depth + 1);
         depths.insert(of.block, depth);
-        let seconds = cpu_seconds(plan, of, !parents.contains(&of.block)).max(f64::MIN_POSITIVE);
+        let seconds = cpu_seconds(plan, of).max(f64::MIN_POSITIVE);
         if i == task {
             own = seconds;
         }
@@ -244,8 +243,7 @@ mod tests {
         let plan = plan([10, 20, 20, 50]);
         let near = |a: f64, b: f64| assert!((a - b).abs() < 1e-9, "{a} {b}");
         let done = |tasks: &[u32]| tasks.iter().copied().collect::<BTreeSet<u32>>();
-        let leaves = [false, true, true, true];
-        let work = [0, 1, 2, 3].map(|i| cpu_seconds(&plan, &plan.tasks[i], leaves[i]));
+        let work = [0, 1, 2, 3].map(|i| cpu_seconds(&plan, &plan.tasks[i]));
         assert!((work[3] / work[1] - 2.5).abs() < 1e-9, "children cost as much as their steps");
         near(share(&plan, 0, &done(&[]), 1), work[0] / work.iter().sum::<f64>());
         near(share(&plan, 1, &done(&[0]), 1), 20.0 / 90.0);

@@ -124,6 +124,9 @@ pub(crate) struct BenchTreeArgs {
     /// Also measure this model at the tree's seams: one trained as one block on the same capture
     #[arg(long, value_name = "MODEL")]
     pub(crate) whole: Option<PathBuf>,
+    /// Also measure what viewers draw within these budgets, as --budget of plat eval
+    #[arg(long, value_name = "N,...", value_delimiter = ',', value_parser = clap::value_parser!(u32).range(1..))]
+    pub(crate) budget: Vec<u32>,
     /// Name of the capture in the line; by default that of its folder
     #[arg(long)]
     pub(crate) scene: Option<String>,

@@ -3,13 +3,13 @@
 use std::fs;
 use std::path::Path;
 
-use ::bench::parts::{Ingest, Tree, TreeFaces, TreeLevel};
+use ::bench::parts::{Ingest, Tree, TreeBudget, TreeFaces, TreeLevel};
 use ::bench::reference::read_references;
 use ::bench::{CurvePoint, PartLine, append_part, read_folder, replace_table, short_table, table};
 use city::CitySettings;
 use dataset::synth::Settings;
 use eval::cuts::CutFigures;
-use eval::{Levels, Photos, mean};
+use eval::{BudgetFigures, Levels, Photos, mean};
 use model::read_tree;
 use scene::BadInput;
 use serde::Serialize;
@@ -136,7 +136,9 @@ pub(crate) fn tree(args: &BenchTreeArgs, output: &Output) -> Result<(), Failure>
         ..EvalArgs::default()
     };
     let has_faces = read_tree(&args.model)?.plan.leaves().blocks().len() > 1;
-    let of_tree = measure(&EvalArgs { level: Some(Levels::All), seams: has_faces, ..options(&args.model) }, output)?;
+    let own =
+        EvalArgs { level: Some(Levels::All), seams: has_faces, budget: args.budget.clone(), ..options(&args.model) };
+    let of_tree = measure(&own, output)?;
     let of_whole = match &args.whole {
         Some(whole) if has_faces => {
             Some(measure(&EvalArgs { seams_of: Some(args.model.clone()), ..options(whole) }, output)?)
@@ -161,6 +163,10 @@ pub(crate) fn tree(args: &BenchTreeArgs, output: &Output) -> Result<(), Failure>
         let (level, splats) = (cut.level, cut.splats);
         TreeLevel { level, splats, psnr: cut.full.psnr, away_mip: cut.away_mip, away_psnr: away }
     };
+    let budget = |of: &BudgetFigures| {
+        let whole = of.figures.psnr.zip(of.loss_db).map(|(drawn, loss)| drawn + loss);
+        TreeBudget { budget: of.budget, drawn: of.drawn, psnr: [of.figures.psnr, of.pruned.psnr, whole] }
+    };
     let line = PartLine::Tree(Tree {
         commit: commit().to_owned(),
         machine: ::bench::machine(),
@@ -169,6 +175,7 @@ pub(crate) fn tree(args: &BenchTreeArgs, output: &Output) -> Result<(), Failure>
         splats: of_tree.record.splats,
         levels: of_tree.cuts.iter().map(level).collect(),
         faces,
+        budgets: of_tree.budgets.iter().map(budget).collect(),
         command: invocation(),
     });
     make_folder(&args.results)?;
