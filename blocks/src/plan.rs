@@ -14,7 +14,7 @@ use crate::ground::{Ground, HALO_SCALE};
 use crate::lod::{Cut, training_order};
 
 /// The format version of [`Plan`] that this program reads and writes.
-pub const VERSION: u32 = 8;
+pub const VERSION: u32 = 9;
 /// The frame kind of a plan.
 pub const PLAN: Kind = Kind(*b"plan", VERSION);
 /// The maximum depth of a plan: 65,536 blocks a side.
@@ -83,6 +83,8 @@ pub struct PlanSettings {
     pub label_blocks: bool,
     /// Weight of the depth loss against the capture's sparse points; 0 leaves it out.
     pub depth_weight: f64,
+    /// Additional weight of pixels in the capture's zones, in training and in pruning; 0: they count as others do.
+    pub zone_weight: f64,
     /// Whether tasks of the job measure the merged model on the held-out views after training.
     pub evaluate: bool,
     /// Width of the stretches of streets of which about one in ten is held out as well, metres; see [`crate::Split`]. 0: none.
@@ -109,6 +111,7 @@ impl Default for PlanSettings {
             memory_limit_bytes: 4 << 30,
             label_blocks: false,
             depth_weight: 0.0,
+            zone_weight: 0.0,
             evaluate: false,
             test_stretches: 0.0,
             refine_poses: false,
@@ -293,9 +296,10 @@ impl Plan {
         if self.version != VERSION {
             return bad(format!("has version {}; this program reads version {VERSION}", self.version));
         }
-        let PlanSettings { sh_degree, views_per_step, depth_weight, test_stretches, .. } = self.settings;
+        let PlanSettings { sh_degree, views_per_step, depth_weight, zone_weight, test_stretches, .. } = self.settings;
         let is_batch = (1..=MAX_VIEWS_PER_STEP).contains(&views_per_step);
-        let are_positive = [depth_weight, test_stretches].iter().all(|value| value.is_finite() && *value >= 0.0);
+        let are_positive =
+            [depth_weight, zone_weight, test_stretches].iter().all(|value| value.is_finite() && *value >= 0.0);
         if !self.ground.is_sane() || self.levels > MAX_LEVELS || sh_degree > 3 || !is_batch || !are_positive {
             return bad(
                 "has a ground, depth, SH degree, number of views per step, weight or stretches out of range".into()

@@ -6,7 +6,8 @@ use dataset::depth_maps::DepthMapOptions;
 use dataset::ingest::{IngestOptions, Ingested, downscaled, ingest};
 use dataset::mips::MIN_MIP_SIDE;
 use dataset::open::{OpenOptions, Source};
-use eval::{PhotoOptions, Photos};
+use dataset::zones::{BoxesFile, ZoneSource};
+use eval::{PhotoOptions, Photos, load_identified_detector};
 use model::Model;
 use scene::{BadInput, Camera, Capture, Pinhole};
 use store::BlockingStore;
@@ -87,17 +88,33 @@ pub(crate) fn name_of(path: &Path) -> String {
     path.file_name().unwrap_or_default().to_string_lossy().into_owned()
 }
 
-/// Ingests a capture's photos into a store, with progress.
+/// Where the plan's options say that objects on the photos come from.
+///
+/// # Errors
+/// A file that is no detector, or has no boxes.
+pub(crate) fn zone_source(options: &PlanOptions) -> Result<Option<ZoneSource>, BadInput> {
+    match (&options.zone_detector, &options.zones) {
+        (Some(path), _) => {
+            let (detector, id) = load_identified_detector(path)?;
+            Ok(Some(ZoneSource::Detector(Box::new(detector), id)))
+        }
+        (None, Some(path)) => Ok(Some(ZoneSource::Boxes(BoxesFile::read(path)?))),
+        (None, None) => Ok(None),
+    }
+}
+
+/// Ingests a capture's photos into a store, with the objects on them if `zones` is given, with progress.
 pub(crate) fn ingest_photos(
     source: &Source,
     store: &BlockingStore,
     downscale: u32,
+    zones: Option<&ZoneSource>,
     output: &Output,
 ) -> Result<Ingested, Failure> {
     let _traced = tracing::info_span!("ingest").entered();
     let threads = std::thread::available_parallelism().map_or(1, usize::from);
     let progress = output.progress("photos", source.photos.len() as u64);
-    let ingested =
+    let mut ingested =
         ingest(source, store, &IngestOptions { downscale, threads }, &|done, _| progress.at(done as u64, ""))?;
     let left_out = &ingested.depth_maps.left_out;
     for (name, reason) in left_out.iter().take(MAX_LEFT_OUT) {
@@ -105,6 +122,13 @@ pub(crate) fn ingest_photos(
     }
     if left_out.len() > MAX_LEFT_OUT {
         output.note(format!("left out {} more depth maps", left_out.len() - MAX_LEFT_OUT));
+    }
+    if let Some(zones) = zones {
+        drop(progress);
+        let progress = output.progress("objects", source.photos.len() as u64);
+        dataset::zones::enter(&mut ingested, zones, store, &|done, _| progress.at(done as u64, ""))?;
+        let zones = &ingested.capture.zones;
+        output.note(format!("{} objects on {} photos", zones.len(), zones.of_views.len()));
     }
     Ok(ingested)
 }

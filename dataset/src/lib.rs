@@ -19,3 +19,4 @@ pub mod synth;
 mod tables;
 pub mod undistortion;
 pub mod windows;
+pub mod zones;

@@ -9,6 +9,7 @@ mod locks;
 mod sparse_depth;
 mod target_depth;
 mod tile_cache;
+mod zone_weights;
 
 use std::collections::HashSet;
 use std::ops::Range;
@@ -114,7 +115,8 @@ impl WindowReader {
     ) -> Self {
         let cache = Mutex::new(WindowCache { windows: ByteLru::new(cache_bytes), pending: HashSet::new() });
         let (finished, counters, is_closed) = (Condvar::new(), Counters::default(), AtomicBool::new(false));
-        let shared = Shared { capture, store, tiles, depth: None, cache, finished, counters, is_closed };
+        let (depth, zone_weight) = (None, 0.0);
+        let shared = Shared { capture, store, tiles, depth, zone_weight, cache, finished, counters, is_closed };
         Self { shared: Arc::new(shared), prefetch_queue: OnceLock::new() }
     }
 
@@ -122,13 +124,26 @@ impl WindowReader {
     /// sparse points whose track contains the view.
     #[must_use]
     pub fn with_depth(self) -> Self {
+        let depth = Some(TargetDepth::new(&self.shared.capture));
+        self.with(depth, self.shared.zone_weight)
+    }
+
+    /// A new reader like this one whose windows weigh pixels of zones `1 + weight`, and others 1.
+    #[must_use]
+    pub fn with_zone_weight(self, weight: f32) -> Self {
+        let depth = self.shared.depth.is_some().then(|| TargetDepth::new(&self.shared.capture));
+        self.with(depth, weight)
+    }
+
+    fn with(&self, depth: Option<TargetDepth>, zone_weight: f32) -> Self {
         let Shared { capture, store, tiles, cache, .. } = &*self.shared;
         let windows = ByteLru::new(lock(cache).windows.limit());
         let shared = Shared {
             capture: Arc::clone(capture),
             store: store.clone(),
             tiles: Arc::clone(tiles),
-            depth: Some(TargetDepth::new(capture)),
+            depth,
+            zone_weight,
             cache: Mutex::new(WindowCache { windows, pending: HashSet::new() }),
             finished: Condvar::new(),
             counters: Counters::default(),
@@ -177,8 +192,9 @@ impl WindowReader {
         let key = (view, mip, rect);
         let queue = self.prefetch_queue.get_or_init(|| start_prefetch_threads(&self.shared));
         let mut cache = self.shared.cache();
-        // Colour and mask, and a float of depth.
-        let pixel_bytes = if self.shared.depth.is_some() { 8 } else { 4 };
+        // Colour and mask, and floats of depth and weight.
+        let floats = u64::from(self.shared.depth.is_some()) + u64::from(self.shared.zone_weight > 0.0);
+        let pixel_bytes = 4 + 4 * floats;
         let fits = rect.area().saturating_mul(pixel_bytes * 2 * PREFETCH_QUEUE as u64) <= cache.windows.limit() as u64;
         if !fits || cache.windows.contains(&key) || !cache.pending.insert(key) {
             return;
@@ -222,6 +238,8 @@ struct Shared {
     tiles: Arc<SharedTileCache>,
     /// Where windows carry target depths.
     depth: Option<TargetDepth>,
+    /// Additional weight of pixels in zones; 0 gives windows no weights.
+    zone_weight: f32,
     cache: Mutex<WindowCache>,
     /// Notified when a prefetch ends, with or without an error.
     finished: Condvar,
@@ -285,6 +303,10 @@ impl Shared {
                 DepthError::Store(error) => WindowError::Store { name: name(), mip, error },
             };
             pixels.depth = depth.plane(&self.capture, &self.store, number, mip, rect).map_err(error)?;
+        }
+        if self.zone_weight > 0.0 {
+            let zones = self.capture.zones.of(number as usize);
+            zone_weights::weigh(&mut pixels, zones, self.zone_weight, &view.camera.pinhole, &camera, rect);
         }
         self.tiles.insert_tiles((number, mip), missing.into_iter().map(|i| (ranges[i].start, tiles[i].clone())));
         Ok(Arc::new(pixels))

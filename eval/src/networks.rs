@@ -5,7 +5,7 @@ use std::io::Read;
 use std::path::Path;
 
 use perceive::Detector;
-use scene::BadInput;
+use scene::{ArtefactId, BadInput};
 
 /// Networks that are used here have 4 to 60 MB.
 const FILE_LIMIT: u64 = 1 << 30;
@@ -26,6 +26,14 @@ pub(crate) fn read_network(path: &Path, advice: &'static str) -> Result<Vec<u8>,
 /// # Errors
 /// A file that cannot be read, or a network that is not a detector whose output is understood.
 pub fn load_detector(path: &Path) -> Result<Detector, BadInput> {
+    load_identified_detector(path).map(|(detector, _)| detector)
+}
+
+/// As [`load_detector`], with the hash of the network and its card.
+///
+/// # Errors
+/// As [`load_detector`].
+pub fn load_identified_detector(path: &Path) -> Result<(Detector, ArtefactId), BadInput> {
     let bytes = read_network(path, "give a detector in an ONNX file")?;
     let beside = path.with_extension("toml");
     let card = if beside.is_file() {
@@ -35,7 +43,9 @@ pub fn load_detector(path: &Path) -> Result<Detector, BadInput> {
     } else {
         None
     };
-    Detector::load(&path.display().to_string(), bytes, card.as_deref())
+    let hashes = [ArtefactId::of(&bytes), ArtefactId::of(card.as_deref().unwrap_or_default().as_bytes())];
+    let detector = Detector::load(&path.display().to_string(), bytes, card.as_deref())?;
+    Ok((detector, ArtefactId::of(&hashes.map(|hash| hash.0).concat())))
 }
 
 fn read(path: &Path, limit: u64, advice: &'static str) -> Result<Vec<u8>, BadInput> {

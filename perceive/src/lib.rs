@@ -12,6 +12,7 @@ pub mod card;
 mod coco;
 mod detector;
 mod letterbox;
+mod masked;
 pub mod network;
 mod yolox;
 
@@ -19,6 +20,7 @@ pub use agreement::{Agreement, Counts, agreement};
 pub use boxes::{Detection, iou};
 pub use card::Card;
 pub use detector::{Detector, SCORE};
+pub use masked::masked_share;
 
 /// A picture: rows from the top, three bytes a pixel, red first.
 #[derive(Debug, Clone, Copy)]

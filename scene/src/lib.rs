@@ -34,6 +34,7 @@ pub mod splats;
 pub mod spz;
 pub mod transforms;
 pub mod waymo;
+pub mod zones;
 
 pub use camera::{Camera, CameraModel, Pinhole, Rect, Rigid};
 pub use capture::{Capture, GeoOrigin, SparsePoints, View};
@@ -43,3 +44,4 @@ pub use ids::{ArtefactId, BlockId};
 pub use image::Pixels;
 pub use poses::Poses;
 pub use splats::{Attribute, BLOCK_ATTRIBUTE, SH_C0, Splat, Splats, column};
+pub use zones::{Zone, Zones};

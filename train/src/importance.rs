@@ -212,12 +212,16 @@ fn explained_share(frame: &Frame) -> Vec<u8> {
     share.map(|share| (share.clamp(0.0, 1.0) * 255.0).round() as u8).collect()
 }
 
-/// Pixel weights: zero under a mask, else the fixed weight, or the explained share of the frame.
+/// Pixel weights: the fixed weight, or the explained share of the frame, times the photo's weight; zero under a mask.
 fn pixel_weights(frame: &Frame, photo: &Pixels, fixed: Option<&Vec<u8>>, weights: &mut Vec<f32>) {
     weights.clear();
     match fixed {
         Some(fixed) => weights.extend(fixed.iter().map(|share| f32::from(*share) / 255.0)),
         None => weights.extend(explained_share(frame).iter().map(|share| f32::from(*share) / 255.0)),
+    }
+    if let Some(of_photo) = &photo.weights {
+        weights.resize(of_photo.len(), 1.0);
+        weights.iter_mut().zip(of_photo).for_each(|(weight, of_photo)| *weight *= of_photo);
     }
     if let Some(mask) = &photo.mask {
         weights.resize(mask.len(), 1.0);

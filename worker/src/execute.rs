@@ -142,6 +142,8 @@ impl PlanExecutor {
         let TrainerContext { store, shared, options, .. } = &self.context;
         let fetching = job.fetch_span.enter();
         let reader = job.reader(store, options.cache_bytes - 2 * self.remote_bytes);
+        let zone_weight = plan.settings.zone_weight as f32;
+        let reader = if zone_weight > 0.0 { reader.with_zone_weight(zone_weight) } else { reader };
         let reader = if plan.settings.depth_weight > 0.0 { reader.with_depth() } else { reader };
         let (mut results, mut given) = (BTreeMap::new(), TrainingInfo::default());
         self.for_each_input(plan, PlannedTask::Train(task), order, report, |block, splats, training| {

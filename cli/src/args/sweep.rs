@@ -58,6 +58,10 @@ impl Args for Sweep {
             .mut_arg("store", |arg| {
                 arg.help("Store of photos and results, for a single run; by default the folder `store` under --out")
             })
+            .mut_arg("zone_detector", |arg| {
+                // --detector measures here.
+                arg.long("zone-detector")
+            })
             .mut_arg("fresh", |arg| {
                 arg.help("Also run combinations that already have a line of this commit on this machine")
             })

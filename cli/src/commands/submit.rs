@@ -17,7 +17,7 @@ use telemetry::traced;
 use tracing::field::Empty;
 
 use crate::args::{Backend, SubmitArgs};
-use crate::captures::{self, ingest_photos};
+use crate::captures::{self, ingest_photos, zone_source};
 use crate::clock::Stopwatch;
 use crate::eval_results;
 use crate::failure::{Failure, make_folder};
@@ -61,7 +61,9 @@ pub(crate) fn run(args: &SubmitArgs, output: &Output) -> Result<(), Failure> {
         make_folder(out)?;
     }
     let store = remote.store(&about)?;
-    let Ingested { capture, id, .. } = ingest_photos(&source, &store.blocking(), args.plan.downscale, output)?;
+    let zones = zone_source(&args.plan)?;
+    let Ingested { capture, id, .. } =
+        ingest_photos(&source, &store.blocking(), args.plan.downscale, zones.as_ref(), output)?;
     let plan = Plan { capture: id, ..plan };
     let plan_id = store.blocking().put(plan.to_frame())?;
     let request = proto::SubmitRequest { plan: plan_id.0.to_vec(), store_url: store.url().into() };

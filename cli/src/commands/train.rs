@@ -25,7 +25,7 @@ use worker::time_limit::TimeLimit;
 use worker::{PlanExecutor, Shared, TrainerOptions};
 
 use crate::args::TrainArgs;
-use crate::captures::ingest_photos;
+use crate::captures::{ingest_photos, zone_source};
 use crate::clock::Stopwatch;
 use crate::dashboard::Dashboard;
 use crate::eval_results;
@@ -195,7 +195,8 @@ fn prepare(args: &TrainArgs, clock: &Stopwatch, output: &Output) -> Result<Prepa
     check_plan(&plan, &planned_for, output)?;
     make_folder(&args.out)?;
     let store = Store::open(&store_url(args))?;
-    let ingested = ingest_photos(&source, &store.blocking(), args.plan.downscale, output)?;
+    let zones = zone_source(&args.plan)?;
+    let ingested = ingest_photos(&source, &store.blocking(), args.plan.downscale, zones.as_ref(), output)?;
     let ingest_cpu_seconds = clock.cpu_seconds();
 
     let Ingested { capture, id: capture_id, .. } = ingested;

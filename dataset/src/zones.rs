@@ -1,0 +1,112 @@
+//! Zones of a capture's photos: found by a detector, or read from a file of boxes.
+
+mod boxes_file;
+mod smoothing;
+
+use std::sync::Arc;
+
+use perceive::{Detector, Picture, SCORE, masked_share};
+use scene::frame::{self, Kind};
+use scene::{ArtefactId, BadInput, Capture, Pixels, Rect, Zone, Zones};
+use store::BlockingStore;
+
+pub use self::boxes_file::BoxesFile;
+use crate::ingest::{CAPTURE, IngestError, Ingested};
+use crate::windows::WindowReader;
+
+/// What a detector found on a photo.
+const RECORD: Kind = Kind(*b"zone", 1);
+/// Part of the name of a record. Raise it with each change of what a detector is shown or of what is kept of its boxes.
+const FORMAT: u32 = 1;
+/// Largest share of a zone that may be masked: moving objects, which no model shows, are not its zones.
+const MAX_MASKED: f64 = 0.5;
+
+/// Where zones come from.
+pub enum ZoneSource {
+    /// A detector, and the hash of its network and card.
+    Detector(Box<Detector>, ArtefactId),
+    /// A file of boxes.
+    Boxes(BoxesFile),
+}
+
+/// Enters zones into an ingested capture, which gets another id. `progress` is called with (photos done, photos in total).
+///
+/// What a detector finds on a photo is recorded in the store, so a repeated call only reads records.
+///
+/// # Errors
+/// A network that cannot be run, boxes that do not fit the photos, or a failing store.
+pub fn enter(
+    ingested: &mut Ingested,
+    from: &ZoneSource,
+    store: &BlockingStore,
+    progress: &dyn Fn(usize, usize),
+) -> Result<(), IngestError> {
+    let mut capture = std::mem::take(&mut ingested.capture);
+    let zones = match from {
+        ZoneSource::Detector(detector, id) => detected(&capture, detector, *id, store, progress),
+        ZoneSource::Boxes(file) => file.zones(&capture).map_err(IngestError::from),
+    };
+    let Zones { classes, of_views } = zones?;
+    let of_views = smoothing::smoothed(&of_views, |view| follows(&capture, view));
+    capture.zones = Zones { classes, of_views };
+    let checked = capture.check();
+    checked.map_err(|error| BadInput::new("the zones", error.to_string(), "correct the file that they come from"))?;
+    ingested.id = store.put(frame::encode(CAPTURE, &capture, &[]))?;
+    ingested.capture = capture;
+    Ok(())
+}
+
+/// Whether a view comes right after the one before it in a sequence: photos of one folder.
+fn follows(capture: &Capture, view: usize) -> bool {
+    let folder = |view: usize| capture.views[view].name.rsplit_once('/').map_or("", |(folder, _)| folder);
+    view > 0 && folder(view) == folder(view - 1)
+}
+
+fn detected(
+    capture: &Capture,
+    detector: &Detector,
+    id: ArtefactId,
+    store: &BlockingStore,
+    progress: &dyn Fn(usize, usize),
+) -> Result<Zones, IngestError> {
+    let reader = WindowReader::new(Arc::new(capture.clone()), store.clone(), 0);
+    let mut of_views = Vec::with_capacity(capture.views.len());
+    for (number, view) in (0u32..).zip(&capture.views) {
+        let key = frame::encode(RECORD, &(FORMAT, id, view.mips.first()), &[]);
+        let name = format!("zones/{}", ArtefactId::of(&key));
+        let recorded = store.get_record(&name)?;
+        let recorded = recorded.and_then(|bytes| frame::decode(RECORD, &bytes).ok().map(|(zones, _)| zones));
+        let zones: Vec<Zone> = match recorded {
+            Some(zones) => zones,
+            None => {
+                let k = view.camera.pinhole;
+                let photo = reader.window(number, 0, Rect { x: 0, y: 0, width: k.width, height: k.height });
+                let advice = "ingest the capture again";
+                let photo = photo.map_err(|error| BadInput::new(view.name.clone(), error.to_string(), advice))?;
+                let zones = found(detector, &photo)?;
+                store.put_record(&name, frame::encode(RECORD, &zones, &[]))?;
+                zones
+            }
+        };
+        of_views.push(zones);
+        progress(of_views.len(), capture.views.len());
+    }
+    Ok(Zones { classes: detector.card().written.classes.clone(), of_views })
+}
+
+/// What a detector finds on a photo outside its mask, surest first.
+fn found(detector: &Detector, photo: &Pixels) -> Result<Vec<Zone>, BadInput> {
+    let (width, height, area) = (photo.width as usize, photo.height as usize, photo.area());
+    let rgb: Vec<u8> = (0..area).flat_map(|i| [photo.rgb[i], photo.rgb[area + i], photo.rgb[2 * area + i]]).collect();
+    let found = detector.detect(&Picture { rgb: &rgb, width, height }, SCORE)?;
+    let zones = found.into_iter().filter_map(|of| {
+        let [left, top, right, bottom] = of.corners;
+        let (w, h) = (width as f32, height as f32);
+        let corners = [left.clamp(0.0, w), top.clamp(0.0, h), right.clamp(0.0, w), bottom.clamp(0.0, h)];
+        let is_empty = corners[0] >= corners[2] || corners[1] >= corners[3];
+        let is_masked = |mask: &Vec<u8>| masked_share(mask, width, corners) > MAX_MASKED;
+        let left_out = is_empty || photo.mask.as_ref().is_some_and(is_masked);
+        (!left_out).then_some(Zone { corners, class: of.class as u16, score: of.score.clamp(0.0, 1.0) })
+    });
+    Ok(zones.take(Zones::MAX).collect())
+}

@@ -1,0 +1,103 @@
+//! Zones: the objects on photos that training, pruning and measuring look at more closely.
+
+use serde::{Deserialize, Serialize};
+
+use crate::capture::View;
+use crate::error::CodecError;
+
+/// An object on a photo.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Zone {
+    /// Left, top, right and bottom edge, pixels of mip 0 from the top left corner of the picture.
+    pub corners: [f32; 4],
+    /// Index of its class in [`Zones::classes`].
+    pub class: u16,
+    /// How sure its source is, 0 to 1.
+    pub score: f32,
+}
+
+/// The zones of all views of a capture.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct Zones {
+    /// Names of the classes.
+    pub classes: Vec<String>,
+    /// Zones of each view, in the order of the capture's views; empty if nobody looked for zones.
+    pub of_views: Vec<Vec<Zone>>,
+}
+
+impl Zones {
+    /// Most zones of a view.
+    pub const MAX: usize = 1000;
+
+    /// The zones of a view, by its index in the capture.
+    pub fn of(&self, view: usize) -> &[Zone] {
+        self.of_views.get(view).map_or(&[], Vec::as_slice)
+    }
+
+    /// The number of zones.
+    pub fn len(&self) -> usize {
+        self.of_views.iter().map(Vec::len).sum()
+    }
+
+    /// Whether no view has a zone.
+    pub fn is_empty(&self) -> bool {
+        self.of_views.iter().all(Vec::is_empty)
+    }
+
+    /// # Errors
+    /// Zones that do not fit the views: in number, place, class or score.
+    pub(crate) fn check(&self, views: &[View]) -> Result<(), CodecError> {
+        if !self.of_views.is_empty() && self.of_views.len() != views.len() {
+            return Err(CodecError::new("zones are not of as many views as the capture has"));
+        }
+        for (view, zones) in views.iter().zip(&self.of_views) {
+            let bad = |what: String| Err(CodecError::new(format!("view {:?} {what}", view.name)));
+            if zones.len() > Self::MAX {
+                return bad(format!("has {} zones, and {} are the most", zones.len(), Self::MAX));
+            }
+            let size = [view.camera.pinhole.width as f32, view.camera.pinhole.height as f32];
+            for Zone { corners: [left, top, right, bottom], class, score } in zones {
+                let inside = *left >= 0.0 && left < right && *right <= size[0];
+                if !inside || !(*top >= 0.0 && top < bottom && *bottom <= size[1]) {
+                    return bad(format!("has a zone from {left}, {top} to {right}, {bottom}, not inside the photo"));
+                }
+                if usize::from(*class) >= self.classes.len() || !(0.0..=1.0).contains(score) {
+                    return bad("has a zone without a class or with a score outside 0 to 1".to_owned());
+                }
+            }
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::camera::{Camera, Pinhole, Rigid};
+
+    #[test]
+    fn zones_lie_inside_their_photos() {
+        let pinhole = Pinhole { width: 40, height: 30, fx: 5.0, fy: 5.0, cx: 20.0, cy: 15.0 };
+        let camera = Camera { pinhole, camera_from_world: Rigid::IDENTITY };
+        let views = [View { name: "a.png".into(), camera, mips: Vec::new(), masked: false, depth: None }];
+        let zones = |corners, class, score| Zones {
+            classes: vec!["car".into()],
+            of_views: vec![vec![Zone { corners, class, score }]],
+        };
+        let whole = [0.0, 0.0, 40.0, 30.0];
+        assert!(zones(whole, 0, 1.0).check(&views).is_ok() && Zones::default().check(&views).is_ok());
+        assert_eq!([zones(whole, 0, 1.0).of(0).len(), zones(whole, 0, 1.0).of(1).len()], [1, 0]);
+        for bad in [
+            zones([-1.0, 0.0, 4.0, 3.0], 0, 0.5),
+            zones([4.0, 0.0, 4.0, 3.0], 0, 0.5),
+            zones([0.0, 0.0, 41.0, 3.0], 0, 0.5),
+            zones([0.0, f32::NAN, 4.0, 3.0], 0, 0.5),
+            zones(whole, 1, 0.5),
+            zones(whole, 0, f32::NAN),
+            Zones { of_views: vec![Vec::new(); 2], ..zones(whole, 0, 1.0) },
+            Zones { of_views: vec![zones(whole, 0, 1.0).of(0).repeat(1001)], ..zones(whole, 0, 1.0) },
+        ] {
+            assert!(bad.check(&views).is_err(), "{bad:?}");
+        }
+    }
+}
