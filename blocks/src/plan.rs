@@ -249,6 +249,8 @@ pub struct Plan {
     pub version: u32,
     /// The capture that the plan is for.
     pub capture: ArtefactId,
+    /// The objects on its photos, if anyone looked for them.
+    pub zones: Option<ArtefactId>,
     /// The user's settings.
     pub settings: PlanSettings,
     /// Full name of the backend that every task must run on.

@@ -103,6 +103,7 @@ pub fn plan(
     Ok(Plan {
         version: VERSION,
         capture: capture_id,
+        zones: None,
         settings: settings.clone(),
         backend: backend.to_owned(),
         ground,

@@ -52,7 +52,7 @@ pub(crate) fn capture(cameras: &[Camera], positions: Vec<DVec3>, tracks: bool) -
             points.track_start.push(points.seen_by.len() as u32);
         }
     }
-    Capture { views, points, ..Capture::default() }
+    Capture { views, points, geo_origin: None }
 }
 
 /// An aerial survey: `n × n` nadir cameras 60 m above a square of `side` metres with `points` points. All cameras head

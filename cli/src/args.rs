@@ -9,6 +9,7 @@ mod reference;
 mod sweep;
 mod synth;
 mod values;
+mod zones;
 
 use std::net::SocketAddr;
 use std::path::PathBuf;
@@ -28,10 +29,11 @@ pub(crate) use cluster::{
     TaskName, TelemetryArgs, WorkerArgs,
 };
 pub(crate) use model::{EvalArgs, ExportArgs, Format, ImportArgs, PruneArgs, PruneCapture, RenderArgs};
-pub(crate) use plan::{Blocks, DepthKind, PlanOptions, RESIDUAL, ZONE_WEIGHT};
+pub(crate) use plan::{Blocks, DepthKind, PlanOptions, RESIDUAL};
 pub(crate) use sweep::Named;
 pub(crate) use synth::{Rig, SynthArgs};
 pub(crate) use values::{Auto, Backend, Size};
+pub(crate) use zones::ZoneOptions;
 
 /// Trains Gaussian-splat models of whole cities from photos with poses.
 ///

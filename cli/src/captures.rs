@@ -9,10 +9,10 @@ use dataset::open::{OpenOptions, Source};
 use dataset::zones::{BoxesFile, ZoneSource};
 use eval::{PhotoOptions, Photos, load_identified_detector};
 use model::Model;
-use scene::{BadInput, Camera, Capture, Pinhole};
+use scene::{ArtefactId, BadInput, Camera, Capture, Pinhole, Zones};
 use store::BlockingStore;
 
-use crate::args::{DepthKind, PlanOptions};
+use crate::args::{DepthKind, PlanOptions, ZoneOptions};
 use crate::failure::Failure;
 use crate::observer::OutputObserver;
 use crate::output::Output;
@@ -88,11 +88,11 @@ pub(crate) fn name_of(path: &Path) -> String {
     path.file_name().unwrap_or_default().to_string_lossy().into_owned()
 }
 
-/// Where the plan's options say that objects on the photos come from.
+/// Where the options say that objects on the photos come from.
 ///
 /// # Errors
 /// A file that is no detector, or has no boxes.
-pub(crate) fn zone_source(options: &PlanOptions) -> Result<Option<ZoneSource>, BadInput> {
+pub(crate) fn zone_source(options: &ZoneOptions) -> Result<Option<ZoneSource>, BadInput> {
     match (&options.zone_detector, &options.zones) {
         (Some(path), _) => {
             let (detector, id) = load_identified_detector(path)?;
@@ -103,18 +103,17 @@ pub(crate) fn zone_source(options: &PlanOptions) -> Result<Option<ZoneSource>, B
     }
 }
 
-/// Ingests a capture's photos into a store, with the objects on them if `zones` is given, with progress.
+/// Ingests a capture's photos into a store, with progress.
 pub(crate) fn ingest_photos(
     source: &Source,
     store: &BlockingStore,
     downscale: u32,
-    zones: Option<&ZoneSource>,
     output: &Output,
 ) -> Result<Ingested, Failure> {
     let _traced = tracing::info_span!("ingest").entered();
     let threads = std::thread::available_parallelism().map_or(1, usize::from);
     let progress = output.progress("photos", source.photos.len() as u64);
-    let mut ingested =
+    let ingested =
         ingest(source, store, &IngestOptions { downscale, threads }, &|done, _| progress.at(done as u64, ""))?;
     let left_out = &ingested.depth_maps.left_out;
     for (name, reason) in left_out.iter().take(MAX_LEFT_OUT) {
@@ -123,14 +122,22 @@ pub(crate) fn ingest_photos(
     if left_out.len() > MAX_LEFT_OUT {
         output.note(format!("left out {} more depth maps", left_out.len() - MAX_LEFT_OUT));
     }
-    if let Some(zones) = zones {
-        drop(progress);
-        let progress = output.progress("objects", source.photos.len() as u64);
-        dataset::zones::enter(&mut ingested, zones, store, &|done, _| progress.at(done as u64, ""))?;
-        let zones = &ingested.capture.zones;
-        output.note(format!("{} objects on {} photos", zones.len(), zones.of_views.len()));
-    }
     Ok(ingested)
+}
+
+/// Looks for the objects on a capture's photos, with progress.
+pub(crate) fn find_zones(
+    capture: &Capture,
+    from: &ZoneSource,
+    store: &BlockingStore,
+    output: &Output,
+) -> Result<(Zones, ArtefactId), Failure> {
+    let _traced = tracing::info_span!("zones").entered();
+    let progress = output.progress("objects", capture.views.len() as u64);
+    let (zones, id) = dataset::zones::find(capture, from, store, &|done, _| progress.at(done as u64, ""))?;
+    drop(progress);
+    output.note(format!("{} objects on {} photos", zones.len(), zones.of_views.len()));
+    Ok((zones, id))
 }
 
 /// Ingests the photos that a model is measured on, with progress.

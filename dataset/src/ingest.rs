@@ -32,7 +32,7 @@ use crate::undistortion::Undistorter;
 use crate::{box_masks, mip_tiles, mips, photo};
 
 /// An ingested capture in the store.
-pub const CAPTURE: Kind = Kind(*b"capt", 3);
+pub const CAPTURE: Kind = Kind(*b"capt", 2);
 /// The ingest record of a photo.
 const RECORD: Kind = Kind(*b"memo", 1);
 /// Part of the hash of a photo. Raise it with each change of decoding, undistortion, downscaling, mips or their format.
@@ -91,8 +91,7 @@ pub fn ingest(
     })?;
     let decoded = views.iter().filter(|(_, decoded)| *decoded).count();
     let views = views.into_iter().map(|(view, _)| view).collect();
-    let Capture { points, geo_origin, .. } = &source.capture;
-    let mut capture = Capture { views, points: points.clone(), geo_origin: *geo_origin, ..Capture::default() };
+    let mut capture = Capture { views, points: source.capture.points.clone(), geo_origin: source.capture.geo_origin };
     let depths = Depths::new(source, options.downscale);
     let concerned: Vec<usize> = (0..photos.len()).filter(|&view| depths.concerns(view)).collect();
     let measured = in_threads(options.threads, concerned.len(), |i, undistorter: &mut LastUndistorter| {

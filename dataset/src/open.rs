@@ -147,7 +147,7 @@ pub fn open(path: &Path, options: &OpenOptions) -> Result<Source, BadInput> {
             _ => "kitti360 without points",
         };
     }
-    let capture = Capture { views, points, geo_origin: geo_origin(&root)?.or(origin), ..Capture::default() };
+    let capture = Capture { views, points, geo_origin: geo_origin(&root)?.or(origin) };
     Ok(Source { capture, photos, left_out, format, sweeps, seeds, labels })
 }
 

@@ -18,7 +18,7 @@ use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, OnceLock, PoisonError};
 
 use bytes::Bytes;
-use scene::{Capture, CodecError, Pixels, Rect};
+use scene::{Capture, CodecError, Pixels, Rect, Zones};
 use store::{BlockingStore, StoreError};
 
 use self::locks::lock;
@@ -115,8 +115,8 @@ impl WindowReader {
     ) -> Self {
         let cache = Mutex::new(WindowCache { windows: ByteLru::new(cache_bytes), pending: HashSet::new() });
         let (finished, counters, is_closed) = (Condvar::new(), Counters::default(), AtomicBool::new(false));
-        let (depth, zone_weight) = (None, 0.0);
-        let shared = Shared { capture, store, tiles, depth, zone_weight, cache, finished, counters, is_closed };
+        let (depth, zones) = (None, None);
+        let shared = Shared { capture, store, tiles, depth, zones, cache, finished, counters, is_closed };
         Self { shared: Arc::new(shared), prefetch_queue: OnceLock::new() }
     }
 
@@ -125,17 +125,17 @@ impl WindowReader {
     #[must_use]
     pub fn with_depth(self) -> Self {
         let depth = Some(TargetDepth::new(&self.shared.capture));
-        self.with(depth, self.shared.zone_weight)
+        self.with(depth, self.shared.zones.clone())
     }
 
     /// A new reader like this one whose windows weigh pixels of zones `1 + weight`, and others 1.
     #[must_use]
-    pub fn with_zone_weight(self, weight: f32) -> Self {
+    pub fn with_zones(self, zones: Arc<Zones>, weight: f32) -> Self {
         let depth = self.shared.depth.is_some().then(|| TargetDepth::new(&self.shared.capture));
-        self.with(depth, weight)
+        self.with(depth, Some((zones, weight)))
     }
 
-    fn with(&self, depth: Option<TargetDepth>, zone_weight: f32) -> Self {
+    fn with(&self, depth: Option<TargetDepth>, zones: Option<(Arc<Zones>, f32)>) -> Self {
         let Shared { capture, store, tiles, cache, .. } = &*self.shared;
         let windows = ByteLru::new(lock(cache).windows.limit());
         let shared = Shared {
@@ -143,7 +143,7 @@ impl WindowReader {
             store: store.clone(),
             tiles: Arc::clone(tiles),
             depth,
-            zone_weight,
+            zones,
             cache: Mutex::new(WindowCache { windows, pending: HashSet::new() }),
             finished: Condvar::new(),
             counters: Counters::default(),
@@ -193,7 +193,7 @@ impl WindowReader {
         let queue = self.prefetch_queue.get_or_init(|| start_prefetch_threads(&self.shared));
         let mut cache = self.shared.cache();
         // Colour and mask, and floats of depth and weight.
-        let floats = u64::from(self.shared.depth.is_some()) + u64::from(self.shared.zone_weight > 0.0);
+        let floats = u64::from(self.shared.depth.is_some()) + u64::from(self.shared.zones.is_some());
         let pixel_bytes = 4 + 4 * floats;
         let fits = rect.area().saturating_mul(pixel_bytes * 2 * PREFETCH_QUEUE as u64) <= cache.windows.limit() as u64;
         if !fits || cache.windows.contains(&key) || !cache.pending.insert(key) {
@@ -238,8 +238,8 @@ struct Shared {
     tiles: Arc<SharedTileCache>,
     /// Where windows carry target depths.
     depth: Option<TargetDepth>,
-    /// Additional weight of pixels in zones; 0 gives windows no weights.
-    zone_weight: f32,
+    /// Where windows carry weights: the zones, and the additional weight of their pixels.
+    zones: Option<(Arc<Zones>, f32)>,
     cache: Mutex<WindowCache>,
     /// Notified when a prefetch ends, with or without an error.
     finished: Condvar,
@@ -304,9 +304,9 @@ impl Shared {
             };
             pixels.depth = depth.plane(&self.capture, &self.store, number, mip, rect).map_err(error)?;
         }
-        if self.zone_weight > 0.0 {
-            let zones = self.capture.zones.of(number as usize);
-            zone_weights::weigh(&mut pixels, zones, self.zone_weight, &view.camera.pinhole, &camera, rect);
+        if let Some((zones, weight)) = &self.zones {
+            let zones = zones.of(number as usize);
+            zone_weights::weigh(&mut pixels, zones, *weight, &view.camera.pinhole, &camera, rect);
         }
         self.tiles.insert_tiles((number, mip), missing.into_iter().map(|i| (ranges[i].start, tiles[i].clone())));
         Ok(Arc::new(pixels))

@@ -11,11 +11,13 @@ use scene::{ArtefactId, BadInput, Capture, Pixels, Rect, Zone, Zones};
 use store::BlockingStore;
 
 pub use self::boxes_file::BoxesFile;
-use crate::ingest::{CAPTURE, IngestError, Ingested};
+use crate::ingest::IngestError;
 use crate::windows::WindowReader;
 
+/// The zones of a capture.
+pub const ZONES: Kind = Kind(*b"zone", 1);
 /// What a detector found on a photo.
-const RECORD: Kind = Kind(*b"zone", 1);
+const RECORD: Kind = Kind(*b"seen", 1);
 /// Part of the name of a record. Raise it with each change of what a detector is shown or of what is kept of its boxes.
 const FORMAT: u32 = 1;
 /// Largest share of a zone that may be masked: moving objects, which no model shows, are not its zones.
@@ -29,31 +31,41 @@ pub enum ZoneSource {
     Boxes(BoxesFile),
 }
 
-/// Enters zones into an ingested capture, which gets another id. `progress` is called with (photos done, photos in total).
+/// The zones of an ingested capture's photos, and their artefact, a frame of kind [`ZONES`]. `progress` is called with (photos
+/// done, photos in total).
 ///
 /// What a detector finds on a photo is recorded in the store, so a repeated call only reads records.
 ///
 /// # Errors
 /// A network that cannot be run, boxes that do not fit the photos, or a failing store.
-pub fn enter(
-    ingested: &mut Ingested,
+pub fn find(
+    capture: &Capture,
     from: &ZoneSource,
     store: &BlockingStore,
     progress: &dyn Fn(usize, usize),
-) -> Result<(), IngestError> {
-    let mut capture = std::mem::take(&mut ingested.capture);
-    let zones = match from {
-        ZoneSource::Detector(detector, id) => detected(&capture, detector, *id, store, progress),
-        ZoneSource::Boxes(file) => file.zones(&capture).map_err(IngestError::from),
+) -> Result<(Zones, ArtefactId), IngestError> {
+    let found = match from {
+        ZoneSource::Detector(detector, id) => detected(capture, detector, *id, store, progress)?,
+        ZoneSource::Boxes(file) => file.zones(capture)?,
     };
-    let Zones { classes, of_views } = zones?;
-    let of_views = smoothing::smoothed(&of_views, |view| follows(&capture, view));
-    capture.zones = Zones { classes, of_views };
-    let checked = capture.check();
+    let of_views = smoothing::smoothed(&found.of_views, |view| follows(capture, view));
+    let zones = Zones { of_views, ..found };
+    let checked = zones.check(&capture.views);
     checked.map_err(|error| BadInput::new("the zones", error.to_string(), "correct the file that they come from"))?;
-    ingested.id = store.put(frame::encode(CAPTURE, &capture, &[]))?;
-    ingested.capture = capture;
-    Ok(())
+    let id = store.put(frame::encode(ZONES, &zones, &[]))?;
+    Ok((zones, id))
+}
+
+/// Loads zones of a capture.
+///
+/// # Errors
+/// Not in the store, damaged, or of another capture.
+pub fn load(store: &BlockingStore, id: ArtefactId, capture: &Capture) -> Result<Zones, IngestError> {
+    let bytes = store.get(id)?;
+    let zones =
+        frame::decode(ZONES, &bytes).and_then(|(zones, _): (Zones, _)| zones.check(&capture.views).map(|()| zones));
+    Ok(zones
+        .map_err(|error| BadInput::new(format!("artefact {id}"), error.to_string(), "look for the objects again"))?)
 }
 
 /// Whether a view comes right after the one before it in a sequence: photos of one folder.
@@ -69,7 +81,8 @@ fn detected(
     store: &BlockingStore,
     progress: &dyn Fn(usize, usize),
 ) -> Result<Zones, IngestError> {
-    let reader = WindowReader::new(Arc::new(capture.clone()), store.clone(), 0);
+    let without_points = Capture { views: capture.views.clone(), ..Capture::default() };
+    let reader = WindowReader::new(Arc::new(without_points), store.clone(), 0);
     let mut of_views = Vec::with_capacity(capture.views.len());
     for (number, view) in (0u32..).zip(&capture.views) {
         let key = frame::encode(RECORD, &(FORMAT, id, view.mips.first()), &[]);

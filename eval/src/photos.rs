@@ -7,7 +7,7 @@ use dataset::ingest::{IngestOptions, ingest};
 use dataset::open::Source;
 use dataset::windows::WindowReader;
 use model::Model;
-use scene::{ArtefactId, Capture};
+use scene::{ArtefactId, Capture, Zones};
 use store::{BlockingStore, Store};
 use tempfile::TempDir;
 
@@ -39,6 +39,8 @@ pub struct Photos {
     pub split: Split,
     /// Divisor of the photos' size.
     pub downscale: u32,
+    /// The objects on the photos, if anyone looked for them, and the additional weight of their pixels.
+    pub zones: Option<(Arc<Zones>, f32)>,
     /// A temporary store, deleted with this value.
     _temporary: Option<TempDir>,
 }
@@ -46,7 +48,7 @@ pub struct Photos {
 impl Photos {
     /// Photos that were ingested before.
     pub fn ingested(capture: Capture, store: BlockingStore, split: Split, downscale: u32) -> Self {
-        Self { capture: Arc::new(capture), store, id: None, split, downscale, _temporary: None }
+        Self { capture: Arc::new(capture), store, id: None, split, downscale, zones: None, _temporary: None }
     }
 
     /// Ingests the photos of a capture.
@@ -72,6 +74,7 @@ impl Photos {
             id: Some(ingested.id),
             split,
             downscale,
+            zones: None,
             _temporary: temporary,
         })
     }
@@ -79,6 +82,15 @@ impl Photos {
     /// A reader of the photos that keeps this many bytes of them decoded.
     pub(crate) fn reader(&self, cache_bytes: usize) -> WindowReader {
         WindowReader::new(self.capture.clone(), self.store.clone(), cache_bytes)
+    }
+
+    /// As [`reader`](Self::reader), with the weights of the zones if there are any.
+    pub(crate) fn weighted_reader(&self, cache_bytes: usize) -> WindowReader {
+        let reader = self.reader(cache_bytes);
+        match &self.zones {
+            Some((zones, weight)) => reader.with_zones(zones.clone(), *weight),
+            None => reader,
+        }
     }
 }
 

@@ -21,7 +21,10 @@ const PROGRESS_PARTS: u64 = 1000;
 /// A model and the photos that it is pruned by: the views that are not held out.
 pub struct Pruner<'a> {
     model: &'a Model,
+    /// Without weights, to measure.
     reader: WindowReader,
+    /// With the weights of zones, to prune by.
+    weighted: WindowReader,
     held_in: Vec<TrainView>,
     held_out: Vec<TrainView>,
     /// Of the model, if these are the photos that it was trained on.
@@ -53,7 +56,8 @@ impl<'a> Pruner<'a> {
         };
         let (held_in, held_out) = (views(Part::Trained), views(Part::Test));
         let exposures = model.exposures.as_ref().filter(|_| has_own_photos);
-        Ok(Self { model, reader: photos.reader(CACHE_BYTES), held_in, held_out, exposures })
+        let (reader, weighted) = (photos.reader(CACHE_BYTES), photos.weighted_reader(CACHE_BYTES));
+        Ok(Self { model, reader, weighted, held_in, held_out, exposures })
     }
 
     /// Mean PSNR of these splats over the views that are not held out, dB.
@@ -80,7 +84,8 @@ impl<'a> Pruner<'a> {
     /// # Errors
     /// As [`held_in_psnr`](Self::held_in_psnr).
     pub fn importance(&self, order: Order) -> Result<Vec<f64>, EvalError> {
-        self.measured(&self.held_in).importance(order, &self.model.splats).map_err(no_views)
+        let views = EvaluationViews { source: &self.weighted, ..self.measured(&self.held_in) };
+        views.importance(order, &self.model.splats).map_err(no_views)
     }
 
     fn measured<'v>(&'v self, views: &'v [TrainView]) -> EvaluationViews<'v> {
@@ -121,7 +126,7 @@ impl<'a> Pruner<'a> {
             trains_exposures: false,
             trains_poses: false,
             recipe: &recipe,
-            source: &self.reader,
+            source: &self.weighted,
             backend: &Backend::Cpu,
         };
         let mut report = |now: PruneProgress| {

@@ -21,7 +21,7 @@ pub struct Zone {
 pub struct Zones {
     /// Names of the classes.
     pub classes: Vec<String>,
-    /// Zones of each view, in the order of the capture's views; empty if nobody looked for zones.
+    /// Zones of each view, in the order of the capture's views.
     pub of_views: Vec<Vec<Zone>>,
 }
 
@@ -44,10 +44,12 @@ impl Zones {
         self.of_views.iter().all(Vec::is_empty)
     }
 
+    /// Checks them against a capture's views. They come from files, so every number is untrusted.
+    ///
     /// # Errors
     /// Zones that do not fit the views: in number, place, class or score.
-    pub(crate) fn check(&self, views: &[View]) -> Result<(), CodecError> {
-        if !self.of_views.is_empty() && self.of_views.len() != views.len() {
+    pub fn check(&self, views: &[View]) -> Result<(), CodecError> {
+        if self.of_views.len() != views.len() {
             return Err(CodecError::new("zones are not of as many views as the capture has"));
         }
         for (view, zones) in views.iter().zip(&self.of_views) {
@@ -85,7 +87,7 @@ mod tests {
             of_views: vec![vec![Zone { corners, class, score }]],
         };
         let whole = [0.0, 0.0, 40.0, 30.0];
-        assert!(zones(whole, 0, 1.0).check(&views).is_ok() && Zones::default().check(&views).is_ok());
+        assert!(zones(whole, 0, 1.0).check(&views).is_ok() && Zones::default().check(&[]).is_ok());
         assert_eq!([zones(whole, 0, 1.0).of(0).len(), zones(whole, 0, 1.0).of(1).len()], [1, 0]);
         for bad in [
             zones([-1.0, 0.0, 4.0, 3.0], 0, 0.5),
@@ -94,6 +96,7 @@ mod tests {
             zones([0.0, f32::NAN, 4.0, 3.0], 0, 0.5),
             zones(whole, 1, 0.5),
             zones(whole, 0, f32::NAN),
+            Zones::default(),
             Zones { of_views: vec![Vec::new(); 2], ..zones(whole, 0, 1.0) },
             Zones { of_views: vec![zones(whole, 0, 1.0).of(0).repeat(1001)], ..zones(whole, 0, 1.0) },
         ] {

@@ -217,7 +217,7 @@ mod tests {
             positions,
         };
         // A point behind the cameras, so that the grid reaches there.
-        let mut capture = Capture { views: vec![view(0), view(1)], points, ..Capture::default() };
+        let mut capture = Capture { views: vec![view(0), view(1)], points, geo_origin: None };
         for i in 0..40 {
             capture.points.positions.push(DVec3::new(-5.0, f64::from(i) * 0.5 - 5.0, 5.0));
             capture.points.colours.push([0; 3]);

@@ -18,7 +18,7 @@ use dataset::byte_lru::ByteLru;
 use dataset::ingest::IngestError;
 use dataset::windows::{SharedTileCache, WindowReader};
 use scene::frame::{self, TrainingInfo};
-use scene::{ArtefactId, BlockId, Capture, Exposures, Poses, Splats};
+use scene::{ArtefactId, BlockId, Capture, Exposures, Poses, Splats, Zones};
 use store::BlockingStore;
 use train::Backend;
 
@@ -129,6 +129,13 @@ impl Assignment<'_> {
     }
 }
 
+/// The objects on the photos, if they count more than their surroundings.
+fn zones(plan: &Plan, capture: &Capture, store: &BlockingStore) -> Result<Option<Arc<Zones>>, ExecuteError> {
+    let id = plan.zones.filter(|_| plan.settings.zone_weight > 0.0);
+    let load = |id| dataset::zones::load(store, id, capture).map(Arc::new).map_err(ingest_failure);
+    id.map(load).transpose()
+}
+
 impl PlanExecutor {
     /// Trains a block; the artefact is its splats.
     fn train(
@@ -142,8 +149,10 @@ impl PlanExecutor {
         let TrainerContext { store, shared, options, .. } = &self.context;
         let fetching = job.fetch_span.enter();
         let reader = job.reader(store, options.cache_bytes - 2 * self.remote_bytes);
-        let zone_weight = plan.settings.zone_weight as f32;
-        let reader = if zone_weight > 0.0 { reader.with_zone_weight(zone_weight) } else { reader };
+        let reader = match zones(plan, capture, store)? {
+            Some(zones) => reader.with_zones(zones, plan.settings.zone_weight as f32),
+            None => reader,
+        };
         let reader = if plan.settings.depth_weight > 0.0 { reader.with_depth() } else { reader };
         let (mut results, mut given) = (BTreeMap::new(), TrainingInfo::default());
         self.for_each_input(plan, PlannedTask::Train(task), order, report, |block, splats, training| {

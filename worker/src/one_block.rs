@@ -84,8 +84,6 @@ impl OneBlockTraining<'_> {
         let Self { plan, capture, .. } = self;
         let [task] = &plan.tasks[..] else { return Err(wrong_plan("has several blocks; recipes are compared on one")) };
         let reader = WindowReader::new(capture.clone(), self.store.clone(), self.cache_bytes);
-        let zone_weight = plan.settings.zone_weight as f32;
-        let reader = if zone_weight > 0.0 { reader.with_zone_weight(zone_weight) } else { reader };
         let reader = if plan.settings.depth_weight > 0.0 { reader.with_depth() } else { reader };
         let evaluator = MergedEvaluator::new(plan, &reader, &self.store);
         let mut evaluator = evaluator.ok_or_else(|| wrong_plan("holds out no view, so nothing can be evaluated"))?;

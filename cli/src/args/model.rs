@@ -6,6 +6,7 @@ use clap::{Args, ValueEnum};
 use eval::Levels;
 
 use super::values::{Backend, Size, decibels, levels, metres, share};
+use super::zones::ZoneOptions;
 
 #[derive(Debug, Clone, Default, Args)]
 pub(crate) struct EvalArgs {
@@ -158,6 +159,8 @@ pub(crate) struct PruneCapture {
     /// Store of the photos; by default the model's own if it exists, else a temporary one
     #[arg(long, value_name = "URL")]
     pub(crate) store: Option<String>,
+    #[command(flatten)]
+    pub(crate) zones: ZoneOptions,
 }
 
 /// A format that other programs read.

@@ -8,6 +8,7 @@ use scene::Capture;
 use serde::Serialize;
 
 use super::values::{Auto, decibels, metres, metres_or_none, residual, views_per_step, weight};
+use super::zones::ZoneOptions;
 
 /// How the scene is divided.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum, Serialize)]
@@ -36,9 +37,6 @@ pub(crate) enum DepthKind {
 
 /// Default of `--residual`.
 pub(crate) const RESIDUAL: f64 = 0.4;
-
-/// Default of `--zone-weight`.
-pub(crate) const ZONE_WEIGHT: f64 = 4.0;
 
 /// Options of the plan.
 #[derive(Debug, Clone, Args, Serialize)]
@@ -94,19 +92,9 @@ pub(crate) struct PlanOptions {
     /// keeps splats from floating where few photos overlap; 0 leaves it out
     #[arg(long, value_name = "W", value_parser = weight, default_value_t = 0.0)]
     pub(crate) depth_weight: f64,
-    /// Look for objects on the photos with this detector (ONNX), as `plat eval --detector` does, and let their pixels count more in
-    /// training and in pruning, by --zone-weight
-    #[arg(long = "detector", value_name = "FILE", conflicts_with = "zones")]
-    #[serde(rename = "detector", skip_serializing_if = "Option::is_none")]
-    pub(crate) zone_detector: Option<PathBuf>,
-    /// Boxes of objects instead, as JSON in COCO's layout: images, annotations, categories. They are in pixels of the photos without
-    /// their lens distortion
-    #[arg(long, value_name = "FILE")]
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub(crate) zones: Option<PathBuf>,
-    /// Pixels of objects count 1 + W times, with --detector or --zones
-    #[arg(long, value_name = "W", value_parser = weight, default_value_t = ZONE_WEIGHT)]
-    pub(crate) zone_weight: f64,
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub(crate) zones: ZoneOptions,
     /// Leave out the capture's lidar: its sweeps give neither target depths nor initial points
     #[arg(long)]
     pub(crate) no_lidar: bool,
@@ -139,11 +127,6 @@ pub(crate) struct PlanOptions {
 }
 
 impl PlanOptions {
-    /// Whether objects on the photos are looked for.
-    fn has_zones(&self) -> bool {
-        self.zone_detector.is_some() || self.zones.is_some()
-    }
-
     /// The planner's settings for a capture whose last `lidar` points were measured by lidar.
     ///
     /// Budget and steps grow with points and views, as more would overfit: at a quarter of its size `street_lund` (25 views,
@@ -173,7 +156,7 @@ impl PlanOptions {
             refine_poses: self.refine_poses,
             label_blocks: self.label_blocks,
             depth_weight: self.depth_weight,
-            zone_weight: if self.has_zones() { self.zone_weight } else { 0.0 },
+            zone_weight: self.zones.weight(),
             evaluate: self.evaluate,
             test_stretches: self.test_stretches,
             ..PlanSettings::default()

@@ -11,7 +11,7 @@ use store::Store;
 use worker::one_block::{Evaluation, OneBlockTraining};
 
 use crate::ablation_variants::{DEFAULT, Variant};
-use crate::args::{AblateArgs, Auto, Blocks, DepthKind, PlanOptions, RESIDUAL, ZONE_WEIGHT};
+use crate::args::{AblateArgs, Auto, Blocks, DepthKind, PlanOptions, RESIDUAL, ZoneOptions};
 use crate::backend;
 use crate::captures::{self, ingest_photos};
 use crate::commands::train::CACHE_BYTES;
@@ -57,7 +57,7 @@ pub(crate) fn run(args: &AblateArgs, output: &Output) -> Result<(), Failure> {
     let store = Store::open(&folder.path().display().to_string())?.blocking();
     let (planned_for, plan) = plan_of(&source, &plan_options(args, 0))?;
     check_plan(&plan, &planned_for, output)?;
-    let capture = Arc::new(ingest_photos(&source, &store, args.downscale, None, output)?.capture);
+    let capture = Arc::new(ingest_photos(&source, &store, args.downscale, output)?.capture);
     let mut lines: Vec<Ablation> = Vec::new();
     let runs = args.seeds.len() * variants.len();
     make_folder(&args.results)?;
@@ -138,9 +138,7 @@ fn plan_options(args: &AblateArgs, seed: u64) -> PlanOptions {
         refine_poses: false,
         label_blocks: false,
         depth_weight: 0.0,
-        zone_detector: None,
-        zones: None,
-        zone_weight: ZONE_WEIGHT,
+        zones: ZoneOptions::default(),
         no_lidar: true,
         depths: None,
         depth_kind: DepthKind::Metric,

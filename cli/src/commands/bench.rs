@@ -95,7 +95,7 @@ pub(crate) fn ingest(args: &IngestArgs, output: &Output) -> Result<(), Failure> 
     let store = Store::open(&folder.path().display().to_string())?;
     let clock = Stopwatch::start();
     let source = captures::open(&args.capture, output)?;
-    ingest_photos(&source, &store.blocking(), args.downscale, None, output)?;
+    ingest_photos(&source, &store.blocking(), args.downscale, output)?;
     let line = Ingest {
         commit: commit().to_owned(),
         machine: ::bench::machine(),

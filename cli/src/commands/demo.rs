@@ -13,7 +13,7 @@ use scene::Capture;
 use serde::Serialize;
 use store::Store;
 
-use crate::args::{Auto, Backend, Blocks, DemoArgs, DepthKind, PlanOptions, TrainArgs, ZONE_WEIGHT};
+use crate::args::{Auto, Backend, Blocks, DemoArgs, DepthKind, PlanOptions, TrainArgs, ZoneOptions};
 use crate::commands::eval::{Further, measure_trained};
 use crate::commands::train::{Report, train};
 use crate::dashboard::Dashboard;
@@ -142,9 +142,7 @@ pub(crate) fn settings(args: &DemoArgs) -> (Settings, TrainArgs) {
             refine_poses: false,
             label_blocks: false,
             depth_weight: 0.0,
-            zone_detector: None,
-            zones: None,
-            zone_weight: ZONE_WEIGHT,
+            zones: ZoneOptions::default(),
             no_lidar: true,
             depths: None,
             depth_kind: DepthKind::Metric,

@@ -1,6 +1,7 @@
 //! `plat prune` removes splats within a tolerance or down to a share; `plat bench prune` compares the orders to prune by.
 
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use ::bench::parts::Prune;
 use ::bench::{PartLine, append_part};
@@ -78,10 +79,16 @@ pub(crate) fn run(args: &PruneArgs, output: &Output) -> Result<(), Failure> {
 
 fn photos(model: &Model, capture: &Path, options: &PruneCapture, output: &Output) -> Result<Photos, Failure> {
     let source = captures::open(capture, output)?;
-    let PruneCapture { test_every, downscale, store } = options;
+    let PruneCapture { test_every, downscale, store, zones } = options;
+    let from = captures::zone_source(zones)?;
     let options =
         PhotoOptions { store: store.as_deref(), downscale: *downscale, test_every: *test_every, test_stretches: None };
-    captures::photos_of(model, &source, &options, output)
+    let mut photos = captures::photos_of(model, &source, &options, output)?;
+    if let Some(from) = from {
+        let (found, _) = captures::find_zones(&photos.capture, &from, &photos.store, output)?;
+        photos.zones = Some((Arc::new(found), zones.zone_weight as f32));
+    }
+    Ok(photos)
 }
 
 fn finish(

@@ -17,7 +17,7 @@ use telemetry::traced;
 use tracing::field::Empty;
 
 use crate::args::{Backend, SubmitArgs};
-use crate::captures::{self, ingest_photos, zone_source};
+use crate::captures::{self, find_zones, ingest_photos, zone_source};
 use crate::clock::Stopwatch;
 use crate::eval_results;
 use crate::failure::{Failure, make_folder};
@@ -61,10 +61,10 @@ pub(crate) fn run(args: &SubmitArgs, output: &Output) -> Result<(), Failure> {
         make_folder(out)?;
     }
     let store = remote.store(&about)?;
-    let zones = zone_source(&args.plan)?;
-    let Ingested { capture, id, .. } =
-        ingest_photos(&source, &store.blocking(), args.plan.downscale, zones.as_ref(), output)?;
-    let plan = Plan { capture: id, ..plan };
+    let zones = zone_source(&args.plan.zones)?;
+    let Ingested { capture, id, .. } = ingest_photos(&source, &store.blocking(), args.plan.downscale, output)?;
+    let zones = zones.map(|from| find_zones(&capture, &from, &store.blocking(), output)).transpose()?;
+    let plan = Plan { capture: id, zones: zones.map(|(_, id)| id), ..plan };
     let plan_id = store.blocking().put(plan.to_frame())?;
     let request = proto::SubmitRequest { plan: plan_id.0.to_vec(), store_url: store.url().into() };
     let job = remote.call(async |client: &mut Client| client.submit(traced(request)).await)?;

@@ -25,7 +25,7 @@ use worker::time_limit::TimeLimit;
 use worker::{PlanExecutor, Shared, TrainerOptions};
 
 use crate::args::TrainArgs;
-use crate::captures::{ingest_photos, zone_source};
+use crate::captures::{find_zones, ingest_photos, zone_source};
 use crate::clock::Stopwatch;
 use crate::dashboard::Dashboard;
 use crate::eval_results;
@@ -195,12 +195,13 @@ fn prepare(args: &TrainArgs, clock: &Stopwatch, output: &Output) -> Result<Prepa
     check_plan(&plan, &planned_for, output)?;
     make_folder(&args.out)?;
     let store = Store::open(&store_url(args))?;
-    let zones = zone_source(&args.plan)?;
-    let ingested = ingest_photos(&source, &store.blocking(), args.plan.downscale, zones.as_ref(), output)?;
+    let zones = zone_source(&args.plan.zones)?;
+    let ingested = ingest_photos(&source, &store.blocking(), args.plan.downscale, output)?;
     let ingest_cpu_seconds = clock.cpu_seconds();
 
     let Ingested { capture, id: capture_id, .. } = ingested;
-    let plan = Plan { capture: capture_id, ..plan };
+    let zones = zones.map(|from| find_zones(&capture, &from, &store.blocking(), output)).transpose()?;
+    let plan = Plan { capture: capture_id, zones: zones.map(|(_, id)| id), ..plan };
     let (config_text, config_hash) = resolved(args, &plan);
     save(&args.out.join("config.toml"), config_text.as_bytes())?;
     save_json(&args.out.join("plan.json"), &plan)?;

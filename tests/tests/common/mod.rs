@@ -40,6 +40,7 @@ pub(crate) fn plan_of(levels: u8, tasks: Vec<Task>) -> Plan {
     Plan {
         version: blocks::plan::VERSION,
         capture: ArtefactId([1; 32]),
+        zones: None,
         settings: PlanSettings::default(),
         backend: BACKEND.into(),
         ground: Ground {
