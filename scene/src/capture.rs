@@ -26,6 +26,11 @@ const FLATTENING: f64 = 1.0 / 298.257_223_563;
 const NEAR_EARTH: f64 = 100_000.0;
 
 impl GeoOrigin {
+    /// True if the numbers are in range.
+    pub fn is_sane(&self) -> bool {
+        self.latitude_degrees.abs() <= 90.0 && self.longitude_degrees.abs() <= 360.0 && self.altitude_metres.abs() < 1e6
+    }
+
     /// Takes the local east-north-up frame to the Earth's (ECEF: x to the equator at Greenwich, z to the north pole), metres.
     pub fn ecef_from_local(&self) -> DMat4 {
         let (sin_lat, cos_lat) = self.latitude_degrees.to_radians().sin_cos();
