@@ -145,7 +145,8 @@ fn a_city_is_trained_measured_and_exported_reproducibly() {
     assert_eq!(at.join("tree").read_dir().unwrap().count(), 1, "scratch files are removed");
 
     // What was exported is read as it is, and imported as a file.
-    for (from, format) in [("streamed", "streamed SOG"), ("tree/one.rad", "RAD")] {
+    done(at, &["export", "one", "--to", "tiles", "--out", "tiles"]);
+    for (from, format) in [("streamed", "streamed SOG"), ("tree/one.rad", "RAD"), ("tiles", "3D Tiles")] {
         let back = done(at, &["import", from, "--out", "back.ply"]);
         assert_eq!((&back["splats"], &back["format"]), (&merged.into(), &format.into()));
         assert_eq!(back["antialiased"], antialiased);

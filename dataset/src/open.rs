@@ -364,13 +364,17 @@ fn geo_origin(root: &CaptureRoot) -> Result<Option<GeoOrigin>, BadInput> {
     } else {
         return Ok(None);
     };
-    match origin {
-        [Some(latitude_degrees), Some(longitude_degrees), Some(altitude_metres)]
-            if latitude_degrees.abs() <= 90.0 && longitude_degrees.abs() <= 360.0 && altitude_metres.abs() < 1e6 =>
-        {
-            Ok(Some(GeoOrigin { latitude_degrees, longitude_degrees, altitude_metres }))
+    let origin = match origin {
+        [Some(latitude_degrees), Some(longitude_degrees), Some(altitude_metres)] => {
+            Some(GeoOrigin { latitude_degrees, longitude_degrees, altitude_metres }).filter(GeoOrigin::is_sane)
         }
-        _ => Err(BadInput::new(file, "has no latitude, longitude and altitude in range", "correct or remove the file")),
+        _ => None,
+    };
+    match origin {
+        Some(origin) => Ok(Some(origin)),
+        None => {
+            Err(BadInput::new(file, "has no latitude, longitude and altitude in range", "correct or remove the file"))
+        }
     }
 }
 

@@ -150,7 +150,7 @@ mod tests {
             splats.push(&Splat::round(place, -1.0, glam::Vec3::splat(0.4), 0.9));
         }
         splats.set_attribute("block", (0..splats.len() as u32).collect());
-        let model = Model { splats, antialiased: true, exposures: None, poses: None, trained: None };
+        let model = Model::of(splats, true);
         std::fs::write(at("a.ply"), model.to_ply()).unwrap();
         let ply = write_ply(&at("a.ply"), &at("b.ply"), &mut |_, _| ()).unwrap();
         let spz = write_spz(&at("a.ply"), &at("b.spz"), &mut |_, _| ()).unwrap();

@@ -1,19 +1,21 @@
-//! Reads models that other programs wrote, and what `plat export` wrote: SOG, streamed SOG, RAD. PLY and SPZ are codecs of
-//! [`scene`].
+//! Reads models that other programs wrote, and what `plat export` wrote: SOG, streamed SOG, RAD, 3D Tiles. PLY and SPZ are codecs
+//! of [`scene`].
 //!
 //! The kind of a file is told by its content. All of it is of hostile origin: the codecs check sizes before they take memory, and no
 //! name in a file leads out of the folder that it lies in ([`Folder`]). The finest splats are read and nothing coarser; they lie where
 //! the model had them, as far as the file says where that is.
 
 mod folder;
+mod gathered;
 mod rad;
 mod sog;
+mod tiles;
 
 use std::fs::File;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
-use scene::{BadInput, CodecError, Splats, ply, spz};
+use scene::{BadInput, CodecError, GeoOrigin, Splats, ply, spz};
 use serde::Deserialize;
 use serde::de::IgnoredAny;
 
@@ -36,6 +38,8 @@ pub enum Kind {
     StreamedSog,
     /// RAD.
     Rad,
+    /// The `tileset.json` of 3D Tiles.
+    Tiles,
 }
 
 impl Kind {
@@ -48,19 +52,31 @@ impl Kind {
             Self::Sog => "SOG",
             Self::StreamedSog => "streamed SOG",
             Self::Rad => "RAD",
+            Self::Tiles => "3D Tiles",
         }
     }
 }
 
 /// What a model can be, for advice.
 pub(crate) const ADVICE: &str =
-    "give a folder that plat train wrote, or a model as PLY, SPZ, SOG, streamed SOG (lod-meta.json) or RAD";
+    "give a folder that plat train wrote, or a model as PLY, SPZ, SOG, streamed SOG, RAD or 3D Tiles (tileset.json)";
 
 /// What tells kinds of JSON apart.
 #[derive(Deserialize)]
 struct Keys {
     filenames: Option<IgnoredAny>,
     means: Option<IgnoredAny>,
+    root: Option<IgnoredAny>,
+}
+
+/// A model as one set of splats.
+#[derive(Debug)]
+pub(crate) struct Imported {
+    pub(crate) splats: Splats,
+    /// Whether they are rendered anti-aliased.
+    pub(crate) antialiased: bool,
+    /// Where on Earth their origin lies, if the file says it.
+    pub(crate) geo_origin: Option<GeoOrigin>,
 }
 
 /// What the model at `path` is, and the file that it starts with: `path` itself, or the one in that folder.
@@ -74,8 +90,9 @@ pub fn kind(path: &Path) -> Result<(Kind, PathBuf), BadInput> {
         if let Some(manifest) = of("model/model.json").or_else(|| of(MANIFEST_FILE)) {
             return Ok((Kind::Trained, manifest));
         }
-        let first = [sog::LOD_META, scene::sog::META].into_iter().find_map(of);
-        return kind(&first.ok_or_else(|| bad("holds no model/model.json, lod-meta.json or meta.json"))?);
+        let first = [sog::LOD_META, scene::sog::META, tiles::TILESET].into_iter().find_map(of);
+        let problem = "holds no model/model.json, lod-meta.json, meta.json or tileset.json";
+        return kind(&first.ok_or_else(|| bad(problem))?);
     }
     if !path.exists() {
         return Err(bad("does not exist"));
@@ -91,6 +108,7 @@ pub fn kind(path: &Path) -> Result<(Kind, PathBuf), BadInput> {
         [b'{' | b' ' | b'\n' | b'\r' | b'\t' | 0xef, ..] => match serde_json::from_slice(&load(path)?) {
             Ok(Keys { filenames: Some(_), .. }) => Kind::StreamedSog,
             Ok(Keys { means: Some(_), .. }) => Kind::Sog,
+            Ok(Keys { root: Some(_), .. }) => Kind::Tiles,
             Ok(_) => return Err(bad("is JSON, but no model's")),
             Err(error) => return Err(bad(&format!("is no JSON of a model ({error})"))),
         },
@@ -99,21 +117,23 @@ pub fn kind(path: &Path) -> Result<(Kind, PathBuf), BadInput> {
     Ok((found, path.to_path_buf()))
 }
 
-/// The splats of the file that [`kind`] found, and whether they are rendered anti-aliased.
-pub(crate) fn read(kind: Kind, path: &Path) -> Result<(Splats, bool), BadInput> {
+/// The model of the file that [`kind`] found.
+pub(crate) fn read(kind: Kind, path: &Path) -> Result<Imported, BadInput> {
     let codec = |error: CodecError| unreadable(path, &error);
-    let (splats, antialiased) = match kind {
-        Kind::Spz => spz::read(&load(path)?).map_err(codec)?,
-        Kind::Sog => sog::read(path)?,
-        Kind::StreamedSog => sog::read_streamed(path)?,
-        Kind::Rad => rad::read(&load(path)?).map_err(codec)?,
+    let plain = |(splats, antialiased)| Imported { splats, antialiased, geo_origin: None };
+    let imported = match kind {
+        Kind::Spz => spz::read(&load(path)?).map(plain).map_err(codec),
+        Kind::Sog => sog::read(path).map(plain),
+        Kind::StreamedSog => sog::read_streamed(path),
+        Kind::Rad => rad::read(&load(path)?).map_err(codec),
+        Kind::Tiles => tiles::read(path),
         Kind::Trained | Kind::Ply => {
             let bytes = load(path)?;
             let splats = ply::read(&bytes).map_err(codec)?;
-            (splats, ply::comments(&bytes).iter().any(|comment| comment.trim() == ANTIALIASED))
+            Ok(plain((splats, ply::comments(&bytes).iter().any(|comment| comment.trim() == ANTIALIASED))))
         }
-    };
-    Ok((splats, antialiased))
+    }?;
+    Ok(Imported { geo_origin: imported.geo_origin.filter(GeoOrigin::is_sane), ..imported })
 }
 
 #[cfg(test)]

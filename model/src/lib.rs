@@ -1,5 +1,5 @@
-//! Reads and writes models: the folder that `plat train` writes, PLY (INRIA's, and reads PlayCanvas' compressed), SPZ, SOG, RAD; writes
-//! 3D Tiles.
+//! Reads and writes models: the folder that `plat train` writes, PLY (INRIA's, and reads PlayCanvas' compressed), SPZ, SOG, RAD, 3D
+//! Tiles.
 //!
 //! ```text
 //! OUT/model/model.json          the manifest; written last, so a folder without it holds no model
@@ -30,7 +30,7 @@ mod write;
 use std::path::{Path, PathBuf};
 
 use blocks::{Ground, Split};
-use scene::{BadInput, Capture, Exposures, Poses, Splats, ply, spz};
+use scene::{BadInput, Capture, Exposures, GeoOrigin, Poses, Splats, ply, spz};
 
 pub use error::ModelError;
 pub use export::Exported;
@@ -57,6 +57,8 @@ pub struct Model {
     pub splats: Splats,
     /// Whether opacity is compensated for the screen-space dilation (Mip-Splatting's 2D filter).
     pub antialiased: bool,
+    /// Where on Earth the origin lies, if known; x is east, y north, z up there.
+    pub geo_origin: Option<GeoOrigin>,
     /// Exposures of the training views, by view of the plan's capture. Views are rendered without them.
     pub exposures: Option<Exposures>,
     /// Refined poses of the training views, by view of the plan's capture.
@@ -66,6 +68,11 @@ pub struct Model {
 }
 
 impl Model {
+    /// Splats of which no more is known.
+    pub(crate) fn of(splats: Splats, antialiased: bool) -> Self {
+        Self { splats, antialiased, geo_origin: None, exposures: None, poses: None, trained: None }
+    }
+
     /// The options to render it with.
     pub fn options(&self) -> render::Options {
         render::Options { antialiased: self.antialiased, sh_degree: self.splats.sh_degree(), ..Default::default() }

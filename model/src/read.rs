@@ -11,7 +11,7 @@ use scene::{BLOCK_ATTRIBUTE, BadInput, BlockId, CodecError, Exposures, GeoOrigin
 
 use crate::Model;
 use crate::files::{EXPOSURES_FILE, MANIFEST_FILE, PLAN_FILE, POSES_FILE, block_file, damaged, load};
-use crate::import::{self, Kind};
+use crate::import::{self, Imported, Kind};
 use crate::manifest::{Manifest, VERSION};
 
 /// Reads a model: a folder that `plat train` wrote, its `model` folder, or any file or folder that [`kind`](crate::kind) knows. A
@@ -24,8 +24,8 @@ pub fn read(path: &Path) -> Result<Model, BadInput> {
     if kind == Kind::Trained {
         return read_trained(first.parent().unwrap_or(path));
     }
-    let (splats, antialiased) = import::read(kind, &first)?;
-    Ok(Model { splats, antialiased, exposures: None, poses: None, trained: None })
+    let Imported { splats, antialiased, geo_origin } = import::read(kind, &first)?;
+    Ok(Model { geo_origin, ..Model::of(splats, antialiased) })
 }
 
 fn read_trained(folder: &Path) -> Result<Model, BadInput> {
@@ -47,8 +47,8 @@ fn read_trained(folder: &Path) -> Result<Model, BadInput> {
         }
         None => None,
     };
-    let antialiased = manifest.antialiased;
-    Ok(Model { splats, antialiased, exposures, poses, trained: Some((manifest, out.to_path_buf())) })
+    let Manifest { antialiased, geo_origin, .. } = manifest;
+    Ok(Model { splats, antialiased, geo_origin, exposures, poses, trained: Some((manifest, out.to_path_buf())) })
 }
 
 /// A model whose blocks are read one at a time. A file is one block.
@@ -131,7 +131,7 @@ impl Opened {
     pub(crate) fn geo_origin(&self) -> Option<GeoOrigin> {
         match self {
             Self::Trained { manifest, .. } => manifest.geo_origin,
-            Self::File { .. } => None,
+            Self::File { model, .. } => model.geo_origin,
         }
     }
 }
@@ -219,7 +219,7 @@ mod tests {
     fn model(antialiased: bool) -> Model {
         let mut splats = Splats::new(0);
         splats.push(&Splat::round(Vec3::new(1.0, 2.0, 3.0), -1.0, Vec3::splat(0.5), 0.9));
-        Model { splats, antialiased, exposures: None, poses: None, trained: None }
+        Model::of(splats, antialiased)
     }
 
     #[test]

@@ -9,8 +9,8 @@
 //! A block is a tile, its children replace it. Where a block has some children only, the missing quarters are copies cut
 //! from it, so that replacing leaves no hole. What no block replaces is quartered until a tile is small.
 //!
-//! The tileset's axes are those of the ground, z up: east, north and up if the capture says where it lies. A tile's splats
-//! are stored about the middle of its square. Source: OGC 22-025r4 (3D Tiles 1.1), and [`splat_glb`].
+//! The tileset's axes are those of the ground, z up: east, north and up if the capture says where it lies. Extras say how the
+//! world was turned to them. A tile's splats are stored about the middle of its square. Source: OGC 22-025r4 (3D Tiles 1.1), and [`splat_glb`].
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
@@ -235,7 +235,7 @@ impl<'a> Writer<'a> {
         };
         let extensions = [splat_glb::SPLATTING, splat_glb::COMPRESSION];
         let tileset = json!({
-            "asset": { "version": "1.1", "extras": { "generator": concat!("plat ", env!("CARGO_PKG_VERSION")) } },
+            "asset": { "version": "1.1", "extras": { "generator": concat!("plat ", env!("CARGO_PKG_VERSION")), "groundFromWorld": turn } },
             "extensionsUsed": [CONTENT],
             "extensionsRequired": [CONTENT],
             "extensions": { CONTENT: { "extensionsUsed": extensions, "extensionsRequired": extensions } },

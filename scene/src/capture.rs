@@ -18,24 +18,51 @@ pub struct GeoOrigin {
     pub altitude_metres: f64,
 }
 
+/// WGS84: the radius at the equator, metres, and the square of the eccentricity.
+const RADIUS: f64 = 6_378_137.0;
+const ECCENTRICITY: f64 = FLATTENING * (2.0 - FLATTENING);
+const FLATTENING: f64 = 1.0 / 298.257_223_563;
+/// Metres from the ellipsoid within which a place is one on Earth.
+const NEAR_EARTH: f64 = 100_000.0;
+
 impl GeoOrigin {
+    /// True if the numbers are in range.
+    pub fn is_sane(&self) -> bool {
+        self.latitude_degrees.abs() <= 90.0 && self.longitude_degrees.abs() <= 360.0 && self.altitude_metres.abs() < 1e6
+    }
+
     /// Takes the local east-north-up frame to the Earth's (ECEF: x to the equator at Greenwich, z to the north pole), metres.
     pub fn ecef_from_local(&self) -> DMat4 {
-        // WGS84: the radius at the equator, metres, and the flattening.
-        const RADIUS: f64 = 6_378_137.0;
-        const FLATTENING: f64 = 1.0 / 298.257_223_563;
         let (sin_lat, cos_lat) = self.latitude_degrees.to_radians().sin_cos();
         let (sin_lon, cos_lon) = self.longitude_degrees.to_radians().sin_cos();
-        let eccentricity = FLATTENING * (2.0 - FLATTENING);
-        let normal = RADIUS / (1.0 - eccentricity * sin_lat * sin_lat).sqrt();
+        let normal = RADIUS / (1.0 - ECCENTRICITY * sin_lat * sin_lat).sqrt();
         let across = (normal + self.altitude_metres) * cos_lat;
-        let up = ((1.0 - eccentricity) * normal + self.altitude_metres) * sin_lat;
+        let up = ((1.0 - ECCENTRICITY) * normal + self.altitude_metres) * sin_lat;
         DMat4::from_cols(
             DVec4::new(-sin_lon, cos_lon, 0.0, 0.0),
             DVec4::new(-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat, 0.0),
             DVec4::new(cos_lat * cos_lon, cos_lat * sin_lon, sin_lat, 0.0),
             DVec4::new(across * cos_lon, across * sin_lon, up, 1.0),
         )
+    }
+
+    /// The frame whose origin is this place of the Earth's frame, metres; `None` for one that is not within 100 km of the ellipsoid.
+    pub fn at_ecef(place: DVec3) -> Option<Self> {
+        let across = place.truncate().length();
+        let mut latitude = place.z.atan2(across * (1.0 - ECCENTRICITY));
+        // Each step leaves less than a hundredth of the error.
+        for _ in 0..8 {
+            let sin = latitude.sin();
+            let normal = RADIUS / (1.0 - ECCENTRICITY * sin * sin).sqrt();
+            latitude = (place.z + ECCENTRICITY * normal * sin).atan2(across);
+        }
+        let (sin, cos) = latitude.sin_cos();
+        let altitude_metres = across * cos + place.z * sin - RADIUS * (1.0 - ECCENTRICITY * sin * sin).sqrt();
+        (altitude_metres.abs() < NEAR_EARTH).then(|| Self {
+            latitude_degrees: latitude.to_degrees(),
+            longitude_degrees: place.y.atan2(place.x).to_degrees(),
+            altitude_metres,
+        })
     }
 }
 
@@ -222,5 +249,23 @@ mod tests {
         // 45° north, 90° east: the normal has 6,388,838.29 m.
         let middle = DVec3::new(0.0, 4_517_590.879, 4_487_348.409);
         is_near(at(45.0, 90.0, 0.0).transform_point3(DVec3::ZERO), middle);
+    }
+
+    #[test]
+    fn places_on_earth_are_found_again() {
+        for latitude_degrees in [-90.0, -89.999, -45.0, -1e-9, 0.0, 12.5, 48.137, 90.0] {
+            for (longitude_degrees, altitude_metres) in [(0.0, 0.0), (11.575, 519.0), (-179.9, -400.0), (91.0, 9000.0)]
+            {
+                let origin = GeoOrigin { latitude_degrees, longitude_degrees, altitude_metres };
+                let found = GeoOrigin::at_ecef(origin.ecef_from_local().w_axis.truncate()).unwrap();
+                assert!((found.latitude_degrees - latitude_degrees).abs() < 1e-12, "{found:?}");
+                assert!((found.altitude_metres - altitude_metres).abs() < 1e-8, "{found:?}");
+                let is_pole = latitude_degrees.abs() == 90.0;
+                assert!(is_pole || (found.longitude_degrees - longitude_degrees).abs() < 1e-9, "{found:?}");
+            }
+        }
+        for place in [DVec3::ZERO, DVec3::X * 6e6, DVec3::Z * 7e6, DVec3::NAN, DVec3::splat(f64::MAX)] {
+            assert_eq!(GeoOrigin::at_ecef(place), None, "{place}");
+        }
     }
 }

@@ -1,7 +1,9 @@
-//! Writes splats as binary glTF, compressed as SPZ: what a tile of 3D Tiles holds.
+//! Writes splats as binary glTF, compressed as SPZ: what a tile of 3D Tiles holds. Reads them, compressed or not.
 //!
 //! Source: glTF 2.0 with the extensions `KHR_gaussian_splatting` and `KHR_gaussian_splatting_compression_spz_2`. The latter says
 //! that SPZ's axes are converted on reading, and CesiumJS (1.145), its first reader, takes them as stored. The matrix follows CesiumJS.
+
+mod read;
 
 use glam::{DMat4, DVec3};
 use serde_json::{Map, Value, json};
@@ -9,6 +11,8 @@ use serde_json::{Map, Value, json};
 use crate::error::CodecError;
 use crate::splats::{Splats, sh_coefficients};
 use crate::spz::{self, Version};
+
+pub use self::read::{Part, read};
 
 /// The extension of splats.
 pub const SPLATTING: &str = "KHR_gaussian_splatting";
@@ -100,40 +104,4 @@ fn document(splats: &Splats, length: usize, place: DMat4) -> Value {
 }
 
 #[cfg(test)]
-mod tests {
-    use glam::Vec3;
-
-    use super::*;
-    use crate::Splat;
-
-    #[test]
-    fn the_file_has_its_chunks_and_the_splats_in_them() {
-        for sh_degree in 0..=3 {
-            let mut splats = Splats::new(sh_degree);
-            for i in 0..37 {
-                splats.push(&Splat::round(Vec3::new(i as f32, 2.0, -3.0), -1.0, Vec3::splat(0.4), 0.7));
-            }
-            let bytes = write(&splats, true, DMat4::from_translation(DVec3::X)).unwrap();
-            let word = |at: usize| u32::from_le_bytes(bytes[at..at + 4].try_into().unwrap()) as usize;
-            assert_eq!((&bytes[..4], word(4), word(8)), (&b"glTF"[..], 2, bytes.len()));
-            let text = word(12);
-            assert_eq!((text % 4, &bytes[16..20]), (0, &b"JSON"[..]));
-            let document: Value = serde_json::from_slice(&bytes[20..20 + text]).unwrap();
-            assert_eq!((word(20 + text), &bytes[24 + text..28 + text]), (bytes.len() - 28 - text, &b"BIN\0"[..]));
-            let length = document["bufferViews"][0]["byteLength"].as_u64().unwrap() as usize;
-            let (back, antialiased) = spz::read(&bytes[28 + text..28 + text + length]).unwrap();
-            assert!(back.len() == 37 && back.sh_degree() == sh_degree && antialiased);
-            let primitive = &document["meshes"][0]["primitives"][0];
-            let attributes = primitive["attributes"].as_object().unwrap();
-            let coefficients = attributes.keys().filter(|name| name.contains("SH_DEGREE")).count();
-            assert_eq!(coefficients, [0, 3, 8, 15][usize::from(sh_degree)]);
-            let positions = &document["accessors"][attributes["POSITION"].as_u64().unwrap() as usize];
-            assert_eq!(positions["min"], json!([0.0, -2.0, 3.0]));
-            // The node undoes what SPZ stored: (1, 2, -3) stored as (1, -2, 3), and one further by `place`.
-            let matrix: Vec<f64> = serde_json::from_value(document["nodes"][0]["matrix"].clone()).unwrap();
-            let matrix = DMat4::from_cols_slice(&matrix);
-            assert_eq!(matrix.transform_point3(DVec3::new(1.0, -2.0, 3.0)), DVec3::new(2.0, 2.0, -3.0));
-        }
-        assert!(write(&Splats::new(1), false, DMat4::IDENTITY).is_err());
-    }
-}
+mod tests;

@@ -25,6 +25,22 @@ pub const fn sh_coefficients(degree: u8) -> usize {
     (degree as usize + 1) * (degree as usize + 1)
 }
 
+/// Opacities nearer to 0 or 1 than this have no logit that is kept.
+pub(crate) const LEAST_OPACITY: f32 = 1e-6;
+/// Standard deviations below it have no logarithm that is kept, metres.
+pub(crate) const LEAST_SCALE: f32 = 1e-30;
+
+/// The logit of an opacity, which is kept within (0, 1).
+pub(crate) fn logit(opacity: f32) -> f32 {
+    let opacity = opacity.clamp(LEAST_OPACITY, 1.0 - LEAST_OPACITY);
+    (opacity / (1.0 - opacity)).ln()
+}
+
+/// The logarithm of a standard deviation, which is kept above 0.
+pub(crate) fn log_scale(scale: f32) -> f32 {
+    scale.max(LEAST_SCALE).ln()
+}
+
 /// One 3D Gaussian, as a row.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Splat {

@@ -29,8 +29,8 @@ const ANTIALIASED: u8 = 1;
 const EXTENSIONS: u8 = 2;
 /// Largest decoded size: this many bytes plus this factor times the file's size. Trained splats take at most 12 times
 /// the file's size; more is a decompression bomb.
-const MEMORY_BYTES: u64 = 32 << 20;
-const MEMORY_FACTOR: u64 = 20;
+pub(crate) const MEMORY_BYTES: u64 = 32 << 20;
+pub(crate) const MEMORY_FACTOR: u64 = 20;
 /// Largest SH degree of the format. Coefficients above degree 3 are dropped.
 const MAX_DEGREE: u8 = 4;
 

@@ -77,7 +77,7 @@ pub(crate) struct IngestArgs {
 
 #[derive(Debug, Clone, Args)]
 pub(crate) struct BenchPruneArgs {
-    /// Folder that `plat train` wrote, or a model as PLY, SPZ, SOG, streamed SOG or RAD
+    /// Folder that `plat train` wrote, or a model as PLY, SPZ, SOG, streamed SOG, RAD or 3D Tiles
     pub(crate) model: PathBuf,
     /// Folder of the capture
     pub(crate) capture: PathBuf,

@@ -10,7 +10,7 @@ use super::zones::ZoneOptions;
 
 #[derive(Debug, Clone, Default, Args)]
 pub(crate) struct EvalArgs {
-    /// Folder that `plat train` wrote, or a model as PLY, SPZ, SOG, streamed SOG or RAD
+    /// Folder that `plat train` wrote, or a model as PLY, SPZ, SOG, streamed SOG, RAD or 3D Tiles
     pub(crate) model: PathBuf,
     /// Folder of the capture
     pub(crate) capture: PathBuf,
@@ -98,7 +98,7 @@ values in -1..1, one output, a number. The Python package lpips exports one (net
 
 #[derive(Debug, Clone, Args)]
 pub(crate) struct RenderArgs {
-    /// Folder that `plat train` wrote, or a model as PLY, SPZ, SOG, streamed SOG or RAD
+    /// Folder that `plat train` wrote, or a model as PLY, SPZ, SOG, streamed SOG, RAD or 3D Tiles
     pub(crate) model: PathBuf,
     /// Cameras to render from: the folder of a capture, whose photos need not exist, or a transforms.json
     #[arg(long, value_name = "CAPTURE|FILE")]
@@ -129,7 +129,7 @@ pub(crate) struct RenderArgs {
 
 #[derive(Debug, Clone, Args)]
 pub(crate) struct PruneArgs {
-    /// Folder that `plat train` wrote, or a model as PLY, SPZ, SOG, streamed SOG or RAD
+    /// Folder that `plat train` wrote, or a model as PLY, SPZ, SOG, streamed SOG, RAD or 3D Tiles
     pub(crate) model: PathBuf,
     /// Path of the pruned model: a folder if `plat train` wrote the model, else a file of the same format; .ply or .spz for others
     #[arg(long, value_name = "MODEL2")]
@@ -180,7 +180,7 @@ pub(crate) enum Format {
 
 #[derive(Debug, Clone, Args)]
 pub(crate) struct ExportArgs {
-    /// Folder that `plat train` wrote, or a model as PLY, SPZ, SOG, streamed SOG or RAD
+    /// Folder that `plat train` wrote, or a model as PLY, SPZ, SOG, streamed SOG, RAD or 3D Tiles
     pub(crate) model: PathBuf,
     /// Format
     #[arg(long, value_enum)]
@@ -192,7 +192,8 @@ pub(crate) struct ExportArgs {
 
 #[derive(Debug, Clone, Args)]
 pub(crate) struct ImportArgs {
-    /// Model as PLY, SPZ, SOG (.sog or meta.json), streamed SOG (lod-meta.json) or RAD, or the folder that it lies in
+    /// Model as PLY, SPZ, SOG (.sog or meta.json), streamed SOG (lod-meta.json), RAD or 3D Tiles (tileset.json), or the folder that it
+    /// lies in
     pub(crate) model: PathBuf,
     /// File to write: .ply, or .spz, which rounds
     #[arg(long, value_name = "FILE")]

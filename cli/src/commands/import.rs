@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use scene::BadInput;
+use scene::{BadInput, GeoOrigin};
 use serde::Serialize;
 use store::file::save;
 
@@ -20,6 +20,8 @@ struct Imported<'a> {
     splats: usize,
     sh_degree: u8,
     antialiased: bool,
+    /// Where on Earth the origin lies, which neither PLY nor SPZ can say.
+    geo_origin: Option<GeoOrigin>,
     bytes: usize,
 }
 
@@ -41,6 +43,7 @@ pub(crate) fn run(args: &ImportArgs, output: &Output) -> Result<(), Failure> {
         splats: model.splats.len(),
         sh_degree: model.splats.sh_degree(),
         antialiased: model.antialiased,
+        geo_origin: model.geo_origin,
         bytes: bytes.len(),
     };
     let text =

@@ -9,13 +9,13 @@ use dataset::ingest;
 use dataset::mip_tiles;
 use dataset::open::{self, OpenOptions};
 use dataset::synth::{self, Settings};
-use glam::{DVec3, Vec3};
+use glam::{DMat4, DVec3, Vec3};
 use image::{DynamicImage, ImageFormat, Luma, Rgb, RgbImage, Rgba, RgbaImage};
 use scene::frame;
 use scene::parquet::{Cells, Writer};
 use scene::transforms::{Frame, Intrinsics, Transforms};
 use scene::{CameraModel, Exposure, Exposures, Pixels, Splat, Splats};
-use scene::{npy, ply, rad, sog, spz, transforms};
+use scene::{npy, ply, rad, sog, splat_glb, spz, transforms};
 
 use crate::readers::*;
 
@@ -256,6 +256,8 @@ impl Corpus {
                 let bytes = spz::write(&splats, degree == 0, version).expect("they are finite");
                 self.put("splats.spz", bytes, &spz_codec(), Seal::Gzip, COMPRESSED);
             }
+            let bytes = splat_glb::write(&splats, true, DMat4::from_rotation_x(1.0)).expect("they are finite");
+            self.put("splats.glb", bytes, &splat_glb_codec(), Seal::None, COMPRESSED);
             let bytes = rad::write(&splats, DVec3::ZERO, None).expect("they are finite");
             self.put("splats.rad", bytes, &rad_codec(), Seal::None, COMPRESSED);
             let files = sog::write(&splats, true).expect("they are finite");
@@ -270,6 +272,7 @@ impl Corpus {
         let exposures: Exposures = (0..40).map(|view| (3 * view, Exposure::IDENTITY)).collect();
         self.put("exposures", exposures.to_frame(), &exposures_codec(), Seal::Frame, PLAIN);
         self.plain("packed.compressed.ply", packed(), &ply_codec());
+        self.put("plain.glb", plain_glb(), &splat_glb_codec(), Seal::None, COMPRESSED);
         self.plain("cloud.ply", CLOUD, &cloud_codec());
         let [shape, data] = [vec![7, 3], vec![]];
         let numbers: Vec<f32> = (0..21).map(|i| i as f32).collect();
@@ -350,6 +353,26 @@ fn packed() -> Vec<u8> {
     bytes.extend((0..300u32 * 4).flat_map(|i| i.wrapping_mul(2_654_435_761).to_le_bytes()));
     bytes.extend((0..300 * 9).map(|i| i as u8));
     bytes
+}
+
+/// Two splats as binary glTF without compression; all attributes share their numbers.
+fn plain_glb() -> Vec<u8> {
+    let mut text = r#"{"asset": {"version": "2.0"}, "scenes": [{"nodes": [0]}], "nodes": [
+        {"children": [1], "rotation": [0, 0, 1, 0]}, {"mesh": 0, "scale": [2, 2, 2], "translation": [1, 0, 0]}],
+        "meshes": [{"primitives": [{"mode": 0, "extensions": {"KHR_gaussian_splatting": {"kernel": "ellipse"}}, "attributes": {
+            "POSITION": 0, "KHR_gaussian_splatting:SCALE": 0, "KHR_gaussian_splatting:ROTATION": 1,
+            "KHR_gaussian_splatting:OPACITY": 2, "KHR_gaussian_splatting:SH_DEGREE_0_COEF_0": 0}}]}], "accessors": [
+        {"bufferView": 0, "componentType": 5126, "count": 2, "type": "VEC3"},
+        {"bufferView": 0, "byteOffset": 4, "componentType": 5122, "normalized": true, "count": 2, "type": "VEC4"},
+        {"bufferView": 0, "byteOffset": 8, "componentType": 5121, "normalized": true, "count": 2, "type": "SCALAR"}],
+        "bufferViews": [{"buffer": 0, "byteLength": 24, "byteStride": 12}], "buffers": [{"byteLength": 24}]}"#
+        .to_owned();
+    text += &" ".repeat(text.len().next_multiple_of(4) - text.len());
+    let numbers = [0.5f32, 2.0, 0.25, 1.5, 0.125, 3.0].map(f32::to_le_bytes).concat();
+    let [glb, json, bin] = [*b"glTF", *b"JSON", *b"BIN\0"];
+    let word = |value: usize| (value as u32).to_le_bytes();
+    let head = [glb, word(2), word(28 + text.len() + numbers.len()), word(text.len()), json].concat();
+    [head, text.into_bytes(), [word(numbers.len()), bin].concat(), numbers].concat()
 }
 
 pub(crate) const CLOUD: &str = "ply\nformat ascii 1.0\ncomment a cloud\nelement vertex 3\nproperty float x\nproperty double y\n\

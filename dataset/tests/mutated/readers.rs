@@ -16,7 +16,7 @@ use scene::frame::{self, Kind};
 use scene::parquet::Table;
 use scene::transforms::{Frame, Intrinsics, Transforms};
 use scene::{CameraModel, Capture, CodecError, Exposures, Rect, Rigid};
-use scene::{colmap, kitti_raw, kitti360, npy, nuscenes, opensfm, ply, rad, sog, spz, transforms, waymo};
+use scene::{colmap, kitti_raw, kitti360, npy, nuscenes, opensfm, ply, rad, sog, splat_glb, spz, transforms, waymo};
 use store::Store;
 
 use crate::corpus::{CLOUD, PHOTO_SIZE, encoded};
@@ -228,6 +228,12 @@ pub(crate) fn cloud_codec() -> Read {
 
 pub(crate) fn spz_codec() -> Read {
     codec("spz", spz::read, |(splats, _)| (0..splats.len()).all(|i| splats.is_finite(i)))
+}
+
+pub(crate) fn splat_glb_codec() -> Read {
+    codec("splat_glb", splat_glb::read, |parts| {
+        parts.iter().all(|part| (0..part.splats.len()).all(|i| part.splats.is_finite(i)))
+    })
 }
 
 pub(crate) fn rad_codec() -> Read {

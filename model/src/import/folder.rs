@@ -1,36 +1,52 @@
 //! Files that other files name.
 
+use std::collections::BTreeSet;
 use std::fs;
 use std::path::{Component, Path, PathBuf};
 
 use scene::{BadInput, CodecError};
 
 /// A folder that no name leads out of.
-pub(super) struct Folder(PathBuf);
+pub(super) struct Folder {
+    path: PathBuf,
+    /// Files that were taken once.
+    taken: BTreeSet<PathBuf>,
+}
 
 impl Folder {
     /// The folder of a file.
     pub(super) fn of(file: &Path) -> Self {
         let folder = file.parent().filter(|folder| !folder.as_os_str().is_empty());
-        Self(folder.unwrap_or(Path::new(".")).to_path_buf())
+        Self { path: folder.unwrap_or(Path::new(".")).to_path_buf(), taken: BTreeSet::new() }
     }
 
     /// The path of a file in it, as another file names it.
     ///
     /// # Errors
-    /// A name that leads elsewhere, by its parts or by a link, and one of no file.
+    /// A name that leads elsewhere, by its parts, a scheme or a link, and one of no file.
     pub(super) fn path(&self, name: &str) -> Result<PathBuf, CodecError> {
         let wrong = |what: String| CodecError::new(format!("{name:?} {what}"));
         let mut parts = Path::new(name).components().filter(|part| *part != Component::CurDir).peekable();
-        if parts.peek().is_none() || parts.any(|part| !matches!(part, Component::Normal(_))) {
+        let is_elsewhere = name.contains("://") || parts.peek().is_none();
+        if is_elsewhere || parts.any(|part| !matches!(part, Component::Normal(_))) {
             return Err(wrong("leads out of the folder".into()));
         }
-        let path = self.0.join(name);
+        let path = self.path.join(name);
         let real = |path: &Path| path.canonicalize().map_err(|error| wrong(format!("cannot be read ({error})")));
-        match real(&path)?.starts_with(real(&self.0)?) && path.is_file() {
+        match real(&path)?.starts_with(real(&self.path)?) && path.is_file() {
             true => Ok(path),
             false => Err(wrong("is no file in the folder".into())),
         }
+    }
+
+    /// As [`Folder::path`], once for each file: else few names could ask for the same splats again and again.
+    ///
+    /// # Errors
+    /// As [`Folder::path`], or a file that was taken before, by whatever name.
+    pub(super) fn take(&mut self, name: &str) -> Result<PathBuf, CodecError> {
+        let path = self.path(name)?;
+        let is_new = path.canonicalize().is_ok_and(|real| self.taken.insert(real));
+        if is_new { Ok(path) } else { Err(CodecError::new(format!("names {name:?} twice"))) }
     }
 
     /// The bytes of a file in it.

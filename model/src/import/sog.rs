@@ -2,13 +2,15 @@
 //!
 //! Source: as of [`scene::sog`] and of [`crate::write_streamed_sog`].
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::path::Path;
 
-use scene::{BadInput, CodecError, Splats, sog};
+use scene::{BadInput, CodecError, GeoOrigin, Splats, sog};
 use serde::Deserialize;
 
+use super::Imported;
 use super::folder::{Folder, unreadable};
+use super::gathered::Gathered;
 use crate::files::load;
 
 /// Name of the file with the tree.
@@ -17,9 +19,18 @@ pub(super) const LOD_META: &str = "lod-meta.json";
 #[derive(Deserialize)]
 struct LodMeta {
     #[serde(default)]
+    asset: Asset,
+    #[serde(default)]
     environment: Option<String>,
     filenames: Vec<String>,
     tree: Node,
+}
+
+/// What `plat export` says of the model.
+#[derive(Default, Deserialize)]
+#[serde(rename_all = "camelCase")]
+struct Asset {
+    geo_origin: Option<GeoOrigin>,
 }
 
 #[derive(Deserialize)]
@@ -53,7 +64,7 @@ pub(super) fn read(path: &Path) -> Result<(Splats, bool), BadInput> {
 }
 
 /// Reads the finest level of every leaf and the environment.
-pub(super) fn read_streamed(path: &Path) -> Result<(Splats, bool), BadInput> {
+pub(super) fn read_streamed(path: &Path) -> Result<Imported, BadInput> {
     let wrong = |problem: String| unreadable(path, &CodecError::new(problem));
     let meta: LodMeta = serde_json::from_slice(&load(path)?).map_err(|error| wrong(error.to_string()))?;
     let mut runs = Vec::new();
@@ -67,33 +78,26 @@ pub(super) fn read_streamed(path: &Path) -> Result<(Splats, bool), BadInput> {
         let file = meta.filenames.get(pair[0].file).map_or("", String::as_str);
         return Err(wrong(format!("has two leaves with the same splats of {file:?}")));
     }
-    let folder = Folder::of(path);
-    let (mut all, mut antialiased, mut paths) = (Splats::new(0), None, BTreeSet::new());
-    let mut load = |name: &str| -> Result<Splats, BadInput> {
-        let path = folder.path(name).map_err(|error| wrong(error.to_string()))?;
-        if !paths.insert(path.clone()) {
-            return Err(wrong(format!("names {name:?} twice")));
-        }
-        let (splats, flag) = read(&path)?;
-        antialiased = Some(flag && antialiased.unwrap_or(true));
-        Ok(splats)
-    };
+    let (mut folder, mut all) = (Folder::of(path), Gathered::new());
+    let mut load = |name: &str| read(&folder.take(name).map_err(|error| wrong(error.to_string()))?);
     for of_file in runs.chunk_by(|a, b| a.file == b.file) {
         let index = of_file[0].file;
         let name = meta.filenames.get(index).ok_or_else(|| wrong(format!("has no name for file {index}")))?;
-        let splats = load(name)?;
+        let (splats, antialiased) = load(name)?;
         let mut rows = Vec::new();
         for run in of_file {
             let end = run.offset.checked_add(run.count).filter(|&end| end <= splats.len());
             let end = end.ok_or_else(|| wrong(format!("has a leaf beyond the {} splats of {name:?}", splats.len())))?;
             rows.extend(run.offset as u32..end as u32);
         }
-        append(&mut all, &splats.select(&rows));
+        all.add(&splats.select(&rows), antialiased);
     }
     if let Some(name) = &meta.environment {
-        append(&mut all, &load(name)?);
+        let (splats, antialiased) = load(name)?;
+        all.add(&splats, antialiased);
     }
-    Ok((all, antialiased.unwrap_or(false)))
+    let (splats, antialiased) = all.finish();
+    Ok(Imported { splats, antialiased, geo_origin: meta.asset.geo_origin })
 }
 
 /// The finest run of every leaf.
@@ -102,12 +106,4 @@ fn finest(node: &Node, runs: &mut Vec<Run>) {
     if node.children.is_empty() {
         runs.extend(node.lods.values().next().filter(|run| run.count > 0));
     }
-}
-
-/// Appends splats, with the higher degree of both.
-fn append(all: &mut Splats, part: &Splats) {
-    if part.sh_degree() > all.sh_degree() {
-        *all = all.with_sh_degree(part.sh_degree());
-    }
-    all.append(part);
 }

@@ -5,7 +5,7 @@ use glam::Vec3;
 use scene::{Splat, Splats, column, ply, rad, sog};
 
 use super::*;
-use crate::{Model, write_rad, write_streamed_sog};
+use crate::{Model, write_rad, write_streamed_sog, write_tiles};
 
 /// A street of splats with a place that SPZ, SOG and RAD can round, and colours that vary with it.
 fn street(count: usize) -> Splats {
@@ -22,7 +22,7 @@ fn street(count: usize) -> Splats {
 }
 
 fn model(splats: Splats) -> Model {
-    Model { splats, antialiased: true, exposures: None, poses: None, trained: None }
+    Model::of(splats, true)
 }
 
 /// Both have the same splats, in any order, within these steps of place (metres), log scale, colour, opacity and direction.
@@ -58,6 +58,7 @@ fn what_export_writes_is_read_back_within_the_steps_of_the_format() {
     fs::write(at("a.spz"), model.to_spz().unwrap()).unwrap();
     write_streamed_sog(&at("a.ply"), &at("streamed"), &mut |_, _| ()).unwrap();
     write_rad(&at("a.ply"), &at("a.rad"), &mut |_, _| ()).unwrap();
+    write_tiles(&at("a.ply"), &at("tiles"), &mut |_, _| ()).unwrap();
     let files = sog::write(&model.splats, true).unwrap();
     fs::write(at("a.sog"), sog::bundle(&files).unwrap()).unwrap();
     fs::create_dir(at("files")).unwrap();
@@ -65,10 +66,13 @@ fn what_export_writes_is_read_back_within_the_steps_of_the_format() {
     // By content, whatever the name.
     fs::rename(at("a.rad"), at("model.bin")).unwrap();
 
+    let spz_steps = [0.001, 0.032, 0.04, 0.003, 1e-5];
     let sog_steps = [0.02, 0.03, 0.02, 0.003, 1e-4];
     for (name, wanted, steps) in [
         ("a.ply", Kind::Ply, [0.0, 0.0, 0.0, 0.0, 1e-6]),
-        ("a.spz", Kind::Spz, [0.001, 0.032, 0.04, 0.003, 1e-5]),
+        ("a.spz", Kind::Spz, spz_steps),
+        ("tiles", Kind::Tiles, spz_steps),
+        ("tiles/tileset.json", Kind::Tiles, spz_steps),
         ("a.sog", Kind::Sog, sog_steps),
         ("files", Kind::Sog, sog_steps),
         ("files/meta.json", Kind::Sog, sog_steps),
@@ -121,6 +125,7 @@ fn the_finest_level_of_every_leaf_is_read() {
     for (name, wanted) in [
         ("../fine.sog", "leads out"),
         ("/etc/passwd", "leads out"),
+        ("http://a.b/fine.sog", "leads out"),
         ("", "leads out"),
         ("none.sog", "cannot be read"),
         ("link.sog", "is no file in the folder"),
@@ -159,9 +164,10 @@ fn files_that_are_no_model_are_named() {
 fn origins_of_rad_that_leave_the_numbers_are_refused() {
     let splats = street(3);
     let written = |comment: &str| rad::write(&splats, glam::DVec3::ZERO, Some(comment)).unwrap();
-    let (moved, flag) = super::rad::read(&written(r#"{"origin": [1000, 0, 0.5], "antialiased": true}"#)).unwrap();
-    assert!(flag && moved.col(column::MEAN).iter().all(|&x| x >= 1300.0));
-    assert!(super::rad::read(&written("made by hand")).is_ok_and(|(splats, flag)| splats.len() == 3 && !flag));
+    let moved = super::rad::read(&written(r#"{"origin": [1000, 0, 0.5], "antialiased": true}"#)).unwrap();
+    assert!(moved.antialiased && moved.splats.col(column::MEAN).iter().all(|&x| x >= 1300.0));
+    let plain = super::rad::read(&written("made by hand")).unwrap();
+    assert!(plain.splats.len() == 3 && !plain.antialiased && plain.geo_origin.is_none());
     assert!(super::rad::read(&written(r#"{"origin": [1e300, 0, 0]}"#)).is_err());
 }
 

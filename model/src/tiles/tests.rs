@@ -138,6 +138,38 @@ fn every_cut_of_the_tiles_covers_the_ground_once() {
 }
 
 #[test]
+fn the_finest_tiles_are_read_where_the_model_had_them() {
+    let folder = tempfile::tempdir().unwrap();
+    let exported = write(folder.path(), true, &TREE, 4.0);
+    let back = crate::read(folder.path()).unwrap();
+    assert_eq!((back.splats.len() as u64, back.splats.sh_degree(), back.antialiased), (exported.splats, 1, false));
+    let found = back.geo_origin.unwrap();
+    assert!((found.latitude_degrees - 48.0).abs() < 1e-9 && (found.longitude_degrees - 11.0).abs() < 1e-9, "{found:?}");
+    assert!((found.altitude_metres - 500.0).abs() < 1e-6, "{found:?}");
+
+    let place = |at: DVec3| (at * 100.0).round().to_array().map(|v| v as i64);
+    let sorted = |mut places: Vec<_>| {
+        places.sort_unstable();
+        places
+    };
+    // What viewers show, in the axes of the ground, and what is read, in those of the world, which was y down.
+    let shown = shown(folder.path(), &tileset(folder.path())["root"], 0.0);
+    let shown = shown.into_iter().map(|(at, red)| (place(ground().to_world(at)), red.to_bits())).collect();
+    let read = |i: usize| (place(back.splats.mean(i).as_dvec3()), back.splats.col(column::SH)[i].to_bits());
+    assert!(sorted((0..back.splats.len()).map(read).collect()) == sorted(shown));
+
+    // Another export keeps the place on Earth.
+    let again = tempfile::tempdir().unwrap();
+    write_tiles(folder.path(), &again.path().join("tiles"), &mut |_, _| ()).unwrap();
+    crate::write_rad(folder.path(), &again.path().join("a.rad"), &mut |_, _| ()).unwrap();
+    crate::write_streamed_sog(folder.path(), &again.path().join("sog"), &mut |_, _| ()).unwrap();
+    for name in ["tiles", "a.rad", "sog"] {
+        let origin = crate::read(&again.path().join(name)).unwrap().geo_origin.unwrap();
+        assert!((origin.latitude_degrees - 48.0).abs() < 1e-9, "{name}: {origin:?}");
+    }
+}
+
+#[test]
 fn crowded_tiles_are_quartered() {
     let folder = tempfile::tempdir().unwrap();
     let exported = write(folder.path(), false, &[BlockId::ROOT], 0.1);

@@ -8,16 +8,12 @@ use std::f64::consts::PI;
 
 use glam::{DMat3, DVec3, Mat3, Quat, Vec3};
 
-use crate::splats::{SH_C0, Splat, Splats};
+use crate::splats::{LEAST_OPACITY, LEAST_SCALE, SH_C0, Splat, Splats, log_scale, logit};
 
 /// Opacity at most of a merged splat.
 const MAX_OPACITY: f32 = 1000.0;
-/// Opacity at least of a merged splat, and of one that is read.
-const LEAST_OPACITY: f32 = 1e-6;
 /// Weight and area at least, square metres: nothing is divided by zero.
 const LEAST_WEIGHT: f64 = 1e-30;
-/// Standard deviation at least of a merged splat, and of one that is read, metres.
-const LEAST_SCALE: f32 = 1e-30;
 /// Standard deviation at most, metres: areas stay finite.
 const MOST_SCALE: f32 = 1e18;
 /// Standard deviation at least, as a share of the longest, where two splats are compared.
@@ -175,12 +171,11 @@ fn eigen(mut matrix: DMat3) -> (DVec3, DMat3) {
 /// Appends a splat, with its place relative to the file's origin. An opacity above 1 becomes nearly 1.
 pub(super) fn push(splats: &mut Splats, gaussian: &Gaussian) {
     let Gaussian { mean, scale, quat, opacity, sh } = *gaussian;
-    let opacity = opacity.clamp(LEAST_OPACITY, 1.0 - LEAST_OPACITY);
     splats.push(&Splat {
         mean,
-        log_scale: scale.map(|scale| scale.max(LEAST_SCALE).ln()),
+        log_scale: scale.map(log_scale),
         quat: [quat.w, quat.x, quat.y, quat.z],
-        opacity_logit: (opacity / (1.0 - opacity)).ln(),
+        opacity_logit: logit(opacity),
         sh,
     });
 }

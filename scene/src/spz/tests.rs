@@ -5,6 +5,7 @@ use glam::{Quat, Vec3};
 use proptest::prelude::*;
 
 use super::*;
+use crate::similarity::harmonics;
 use crate::splats::Splat;
 
 /// Pseudo-random numbers in -1..1.
@@ -97,28 +98,12 @@ fn codes_are_fixed_points() {
     }
 }
 
-/// The real spherical harmonics up to degree 3, without constants.
-fn basis([x, y, z]: [f32; 3]) -> [f32; 16] {
-    let (xx, yy, zz) = (x * x, y * y, z * z);
-    let third = [
-        y * (3.0 * xx - yy),
-        x * y * z,
-        y * (4.0 * zz - xx - yy),
-        z * (2.0 * zz - 3.0 * xx - 3.0 * yy),
-        x * (4.0 * zz - xx - yy),
-        z * (xx - yy),
-        x * (xx - 3.0 * yy),
-    ];
-    let lower = [1.0, y, z, x, x * y, y * z, 2.0 * zz - xx - yy, x * z, xx - yy];
-    std::array::from_fn(|k| if k < 9 { lower[k] } else { third[k - 9] })
-}
-
 #[test]
 fn sh_signs_match_the_axis_flip() {
-    let at = [0.3, -0.7, 0.5];
-    let turned = basis([0, 1, 2].map(|k| quantise::FLIP[k] * at[k]));
-    for (k, (a, b)) in basis(at).into_iter().zip(turned).enumerate() {
-        assert_eq!(sh_sign(k) * a, b, "{k}");
+    let at = Vec3::new(0.3, -0.7, 0.5);
+    let [here, turned] = [at, Vec3::from_array(quantise::FLIP) * at].map(|at| harmonics(at.as_dvec3()));
+    for (k, (a, b)) in here.into_iter().zip(turned).enumerate() {
+        assert_eq!(f64::from(sh_sign(k)) * a, b, "{k}");
     }
     // Rotations are conjugated with the flip of the axes.
     let q = [0.5, -0.1, 0.8, 0.3];
