@@ -11,6 +11,7 @@ pub mod boxes;
 pub mod card;
 mod coco;
 mod detector;
+pub mod gradient;
 mod letterbox;
 pub mod network;
 mod yolox;
