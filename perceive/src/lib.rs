@@ -12,14 +12,16 @@ pub mod card;
 mod coco;
 mod detector;
 pub mod gradient;
-mod letterbox;
+mod heads;
 pub mod network;
-mod yolox;
+mod placed;
+pub mod precision;
 
 pub use agreement::{Agreement, Counts, agreement};
 pub use boxes::{Detection, iou};
 pub use card::Card;
-pub use detector::{Detector, SCORE};
+pub use detector::Detector;
+pub use precision::{Boxes, Precision, TrueBox, precision};
 
 /// A picture: rows from the top, three bytes a pixel, red first.
 #[derive(Debug, Clone, Copy)]

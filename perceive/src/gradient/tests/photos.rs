@@ -5,9 +5,9 @@ use std::time::Instant;
 
 use super::graphs::{dot, noise, rten};
 use crate::Picture;
-use crate::card::{Card, Channels, Written};
+use crate::card::{Card, Head, Written};
 use crate::gradient::{Activations, Network};
-use crate::letterbox::letterbox;
+use crate::placed::place;
 
 fn shared(name: &str) -> Option<PathBuf> {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/data").join(name);
@@ -23,8 +23,8 @@ fn detector(name: &str, side: usize, white: f32) -> Option<(Vec<u8>, Vec<f32>)> 
     let bytes = std::fs::read(shared(name)?).unwrap();
     let photo = image::open(shared("images_street/kitti_object/image_2/000001.png")?).unwrap().to_rgb8();
     let picture = Picture { rgb: &photo, width: photo.width() as usize, height: photo.height() as usize };
-    let written = Written { white, channels: Channels::Bgr, ..Written::default() };
-    Some((bytes, letterbox(&picture, &Card { input: [side, side], written }).0))
+    let card = Card { input: [side, side], std: [255.0 / white; 3], ..Card::new(Head::Yolox, &Written::default()) };
+    Some((bytes, place(&picture, &card).0))
 }
 
 const DETECTORS: [(&str, usize, f32); 2] =
