@@ -7,6 +7,7 @@
 //! Architecture invariant: functions of bytes and pixels; no files, no network, no clock. The caller reads the files.
 
 pub mod agreement;
+pub mod aligned;
 pub mod boxes;
 pub mod card;
 mod coco;
