@@ -210,7 +210,11 @@ fn objects(anchors: &Anchors, output: &[f32], card: &Card) -> Vec<Object> {
         let (best, score) = classes.reduce(|best, next| if next.1 > best.1 { next } else { best })?;
         let is_finite = anchor.corners.iter().chain(&anchor.scores).all(|number| number.is_finite());
         let class = card.class_of[best];
-        (is_finite && score >= f64::from(card.score)).then_some(Found { number, class, score, anchor })
+        let is_there = (0..2).all(|i| {
+            let [start, end] = [anchor.corners[i], anchor.corners[i + 2]];
+            start.max(0.0) < end.min(anchors.size()[i])
+        });
+        (is_finite && is_there && score >= f64::from(card.score)).then_some(Found { number, class, score, anchor })
     };
     let mut all: Vec<Found> = (0..anchors.count()).filter_map(found).collect();
     all.sort_by(|a, b| b.score.total_cmp(&a.score));

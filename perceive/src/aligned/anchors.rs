@@ -35,6 +35,11 @@ impl<'a> Anchors<'a> {
         self.cells.len()
     }
 
+    /// Width and height of the picture.
+    pub(super) fn size(&self) -> [f64; 2] {
+        self.placed.size.map(f64::from)
+    }
+
     /// Place in the output of number `i` of an anchor.
     fn place(&self, anchor: usize, i: usize) -> usize {
         let classes = self.card.outputs.len();

@@ -70,43 +70,63 @@ fn the_photo_has_no_loss_and_the_gradient_leads_back_to_it() {
     }
 }
 
+/// Compares the gradient at a noisy picture with differences along noise, along the gradient and between.
+fn check_gradient(name: &str, aligned: &Aligned, photo: &[f32], width: usize, height: usize) {
+    let mut memory = Activations::default();
+    let targets = aligned.targets(photo, width, height, &mut memory).unwrap();
+    let render = noisy(photo, 0.05, 1);
+    let loss = aligned.loss(&render, width, height, &targets, &mut memory).unwrap();
+    let norm = dot(&loss.gradient, &loss.gradient).sqrt();
+    let (boxes, classes) = (loss.boxes, loss.classes);
+    println!("{name}: {} objects, boxes {boxes:.4}, classes {classes:.4}, |gradient| {norm:.4}", targets.len());
+    assert!(!targets.is_empty() && norm > 0.0);
+    let mut slope = |direction: &[f32], h: f64| {
+        let mut at = |h: f64| {
+            let moved: Vec<f32> = render.iter().zip(direction).map(|(x, d)| x + h as f32 * d).collect();
+            aligned.loss(&moved, width, height, &targets, &mut memory).unwrap().total
+        };
+        (at(h) - at(-h)) / (2.0 * h)
+    };
+    let unit = |direction: &[f32]| -> Vec<f32> {
+        let length = dot(direction, direction).sqrt() as f32;
+        direction.iter().map(|d| d / length).collect()
+    };
+    let along = unit(&loss.gradient);
+    // Noise alone is nearly orthogonal to the gradient.
+    let random: Vec<Vec<f32>> = (2..5).map(|seed| unit(&noise(render.len(), seed))).collect();
+    let half = unit(&along.iter().zip(&random[0]).map(|(a, b)| a + b).collect::<Vec<f32>>());
+    for direction in random.iter().chain([&half, &along]) {
+        let exact = dot(&loss.gradient, direction);
+        let by_steps = [1e-1, 1e-2, 1e-3].map(|h| slope(direction, h));
+        println!("  {exact:+.6}, by differences {by_steps:.6?}");
+        let off = by_steps.iter().map(|slope| (slope - exact).abs()).fold(f64::INFINITY, f64::min);
+        assert!(off < 0.01 * norm, "{off} of {norm}");
+    }
+}
+
 #[test]
 fn the_gradient_is_that_of_differences() {
     for name in DETECTORS {
         let (Some(aligned), Some((photo, width, height))) = (detector(name), photo("000002")) else { return };
-        let mut memory = Activations::default();
-        let targets = aligned.targets(&photo, width, height, &mut memory).unwrap();
-        let render = noisy(&photo, 0.05, 1);
-        let loss = aligned.loss(&render, width, height, &targets, &mut memory).unwrap();
-        let norm = dot(&loss.gradient, &loss.gradient).sqrt();
-        println!(
-            "{name}: {} objects, boxes {:.4}, classes {:.4}, |gradient| {norm:.4}",
-            targets.len(),
-            loss.boxes,
-            loss.classes
-        );
-        let mut slope = |direction: &[f32], h: f64| {
-            let mut at = |h: f64| {
-                let moved: Vec<f32> = render.iter().zip(direction).map(|(x, d)| x + h as f32 * d).collect();
-                aligned.loss(&moved, width, height, &targets, &mut memory).unwrap().total
-            };
-            (at(h) - at(-h)) / (2.0 * h)
-        };
-        let mut directions: Vec<Vec<f32>> = (2..5).map(|seed| noise(render.len(), seed)).collect();
-        // Noise that is half the gradient: noise alone is nearly orthogonal to it.
-        let half = directions[0].iter().zip(&loss.gradient);
-        let noise_norm = dot(&directions[0], &directions[0]).sqrt();
-        directions.push(half.map(|(d, g)| d / noise_norm as f32 + g / norm as f32).collect());
-        directions.push(loss.gradient.clone());
-        for direction in &directions {
-            let length = dot(direction, direction).sqrt();
-            let unit: Vec<f32> = direction.iter().map(|d| d / length as f32).collect();
-            let exact = dot(&loss.gradient, &unit);
-            let by_steps = [1e-1, 1e-2, 1e-3].map(|h| slope(&unit, h));
-            println!("  {exact:+.6}, by differences {by_steps:.6?}");
-            let off = by_steps.iter().map(|slope| (slope - exact).abs()).fold(f64::INFINITY, f64::min);
-            assert!(off < 0.01 * norm, "{off} of {norm}");
-        }
+        check_gradient(name, &aligned, &photo, width, height);
+    }
+}
+
+#[test]
+fn so_is_that_of_small_networks_with_the_other_heads() {
+    let networks: [(&str, &[u8]); 2] = [
+        ("yolov8_tiny", include_bytes!("../../tests/yolov8_tiny.onnx")),
+        ("nanodet_tiny", include_bytes!("../../tests/nanodet_tiny.onnx")),
+    ];
+    for (name, bytes) in networks {
+        let card = Some("classes = ['a', 'b', 'c']\nscore = 0.2");
+        let aligned = Aligned::new(name, bytes, card, Weights::default()).unwrap();
+        let (width, height) = (90, 70);
+        // Waves, so that the cells differ.
+        let photo: Vec<f32> = (0..3 * width * height)
+            .map(|i| 0.5 + 0.4 * ((i % width) as f32 * 0.11 + (i / width) as f32 * 0.07).sin())
+            .collect();
+        check_gradient(name, &aligned, &photo, width, height);
     }
 }
 

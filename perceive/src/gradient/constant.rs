@@ -22,7 +22,7 @@ pub(super) const INT32: i64 = 6;
 pub(super) const INT64: i64 = 7;
 
 /// Most sides of a tensor.
-const MAX_SIDES: usize = 8;
+pub(super) const MAX_SIDES: usize = 8;
 
 /// Number of elements of a tensor; `None` if it has more than 2³¹, or more sides than any picture needs.
 pub(super) fn elements(shape: &[usize]) -> Option<usize> {

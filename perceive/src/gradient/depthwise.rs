@@ -75,9 +75,8 @@ impl Depthwise {
     /// Overwrites the output.
     pub(super) fn forward(&self, input: &[f32], output: &mut [f32]) {
         let ([height, width], [rows, columns]) = self.sides();
-        let kernels = self.weights.chunks_exact(self.taps.len()).zip(&self.bias);
         let planes = output.par_chunks_mut(rows * columns).zip(input.par_chunks(height * width));
-        let kernels: Vec<_> = kernels.collect();
+        let kernels = self.weights.par_chunks(self.taps.len()).zip(&self.bias);
         planes.zip(kernels).for_each_init(Room::default, |room, ((output, input), (kernel, &bias))| {
             room.phases.clear();
             room.phases.resize(self.axes[0].stride * self.axes[1].stride * self.places() + STEP, 0.0);

@@ -170,6 +170,11 @@ impl Node {
         self.get(name).map_or(default, |attribute| std::str::from_utf8(&attribute.s).unwrap_or("?"))
     }
 
+    /// The error that this node has something which is not known here.
+    pub(super) fn unknown(&self, what: &str) -> String {
+        format!("has a {} with {what}, whose gradient plat does not know", self.op_type)
+    }
+
     /// Whole numbers of at least 0, `N` of them: as given, or the default `N` times.
     pub(super) fn sizes<const N: usize>(&self, name: &str, default: usize) -> Result<[usize; N], String> {
         let Some(attribute) = self.get(name) else { return Ok([default; N]) };

@@ -115,7 +115,6 @@ pub(super) fn resize(side: &mut Side, node: &Node, scale: f64, length: usize) ->
     let coordinates = node
         .text("coordinate_transformation_mode", if node.op_type == "Upsample" { "asymmetric" } else { "half_pixel" });
     let rounding = node.text("nearest_mode", if node.op_type == "Upsample" { "floor" } else { "round_prefer_floor" });
-    let no = |what: &str| format!("has a {} with {what}, whose gradient plat does not know", node.op_type);
     let from = side.length as f64;
     let to = length as f64;
     let position: Box<dyn Fn(f64) -> f64> = match coordinates {
@@ -124,14 +123,14 @@ pub(super) fn resize(side: &mut Side, node: &Node, scale: f64, length: usize) ->
         "half_pixel" | "pytorch_half_pixel" => Box::new(move |x| (x + 0.5) / scale - 0.5),
         "align_corners" if length == 1 => Box::new(|_| 0.0),
         "align_corners" => Box::new(move |x| x * (from - 1.0) / (to - 1.0)),
-        other => return Err(no(other)),
+        other => return Err(node.unknown(other)),
     };
     let round: fn(f64) -> f64 = match rounding {
         "floor" => f64::floor,
         "ceil" => f64::ceil,
         "round_prefer_floor" => |x| (x - 0.5).ceil(),
         "round_prefer_ceil" => |x| (x + 0.5).floor(),
-        other => return Err(no(other)),
+        other => return Err(node.unknown(other)),
     };
     side.length = length;
     side.reads = Box::new(move |place| round(position(place as f64)).clamp(0.0, from - 1.0) as u32);

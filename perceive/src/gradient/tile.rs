@@ -66,3 +66,25 @@ fn part<const LEVEL: usize>(
         out[column..column + 16].copy_from_slice(&sums);
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::gradient::vectorised::{AVX2, BASE};
+
+    #[test]
+    fn every_level_multiplies() {
+        let depth = 5;
+        let weights: Vec<[f32; ROWS]> = (0..depth).map(|k| std::array::from_fn(|r| (3 * k + r) as f32 - 7.0)).collect();
+        let panel: Vec<[f32; COLUMNS]> = (0..depth).map(|k| std::array::from_fn(|c| (k * c % 11) as f32)).collect();
+        // Whole numbers, so that every order of sums is exact.
+        let sum = |r: usize, c: usize| (0..depth).map(|k| weights[k][r] * panel[k][c]).sum();
+        let expected: Tile = std::array::from_fn(|r| std::array::from_fn(|c| sum(r, c)));
+        let levels = [multiply_level::<BASE>, multiply_level::<AVX2>, multiply_level::<AVX512>, multiply];
+        for level in levels {
+            let mut tile = [[f32::NAN; COLUMNS]; ROWS];
+            level(&weights, &panel, &mut tile);
+            assert_eq!(tile, expected);
+        }
+    }
+}

@@ -56,6 +56,14 @@ fn what_is_too_large_is_refused_before_it_is_allocated() {
     }
     conv(vec![int("group", 0)]);
     conv(vec![int("group", 3)]);
+    let unsqueeze = vec![node("Unsqueeze", "x axes", "y", vec![])];
+    assert!(refused(&[1], unsqueeze, vec![whole("axes", &[0; 1000])]).contains("1001 sides"));
+    // Empty constants, alone and beside the input.
+    for (operator, inputs) in [("Concat", "none none"), ("Softmax", "none"), ("Add", "x none")] {
+        let nodes =
+            vec![node(operator, inputs, "c", vec![int("axis", 0)]), node("Concat", "x c", "y", vec![int("axis", 0)])];
+        let _ = Network::load(&file(13, &[2], nodes, vec![floats("none", &[0])]));
+    }
     // Many nodes that each take a little.
     let doubled = |i: usize| node("Concat", &format!("x{i} x{i}"), &format!("x{}", i + 1), vec![int("axis", 0)]);
     let mut nodes = vec![node("Relu", "x", "x0", vec![])];
