@@ -39,7 +39,8 @@ fn convolutions() {
     conv([4, 9, 8], [4, 1, 3, 3], 4, [2, 2], [1; 4], [1, 1]);
     conv([3, 40, 45], [3, 1, 3, 3], 3, [2, 2], [1; 4], [1, 1]);
     conv([2, 12, 13], [2, 1, 3, 2], 2, [2, 3], [0, 1, 2, 0], [2, 1]);
-    let plain = vec![ints("strides", &[1, 1]), ints("dilations", &[1, 1])];
+    // Without a bias; rten wants the rest.
+    let plain = vec![ints("strides", &[1, 1]), ints("dilations", &[1, 1]), ints("pads", &[0; 4])];
     one("Conv", "x w", plain, &[1, 2, 4, 4], vec![floats("w", &[3, 2, 3, 3])]);
 }
 

@@ -63,12 +63,10 @@ fn detectors_agree_with_rten_and_with_differences() {
         let random: Vec<f32> = random.iter().map(|r| (f64::from(*r) / length) as f32).collect();
         for (kind, direction) in [("its own direction", unit), ("noise", random)] {
             let exact = dot(&gradient, &direction);
-            for h in [0.1, 0.01, 0.001].map(|h| h * white) {
-                println!("  along {kind}: {exact:.6}, by differences of {h}: {:.6}", slope(&direction, h));
-            }
-            let h = 0.001 * white;
-            let off = (exact - slope(&direction, h)).abs();
-            assert!(off < 0.01 * norm, "{off} of {norm}");
+            let by_steps = [0.01, 0.001].map(|h| slope(&direction, h * white));
+            println!("  along {kind}: {exact:.6}, by differences {by_steps:.6?}");
+            let off = by_steps.iter().map(|slope| (slope - exact).abs()).fold(f64::INFINITY, f64::min);
+            assert!(off < 0.01 * exact.abs() + 1e-4 * norm, "{off} of {exact}");
         }
     }
 }
