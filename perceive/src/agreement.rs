@@ -12,7 +12,7 @@ use crate::boxes::{Detection, iou};
 
 /// Least overlap of a box on the render with that on the photo.
 const MATCHES: f32 = 0.5;
-const VEHICLES: [&str; 3] = ["car", "bus", "truck"];
+const VEHICLES: [&str; 4] = ["car", "bus", "truck", "vehicle"];
 const PEOPLE: [&str; 1] = ["person"];
 
 /// Numbers of detections. The field names are keys of `eval/report.json`.
@@ -110,7 +110,7 @@ pub fn agreement(photo: &[Detection], render: &[Detection], classes: &[String]) 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::card::Written;
+    use crate::coco;
 
     const PERSON: usize = 0;
     const CAR: usize = 2;
@@ -122,7 +122,7 @@ mod tests {
     }
 
     fn compared(photo: &[Detection], render: &[Detection]) -> Agreement {
-        agreement(photo, render, &Written::default().classes)
+        agreement(photo, render, &coco::NAMES.map(str::to_owned))
     }
 
     fn counts(photos: u64, renders: u64, kept: u64) -> Counts {

@@ -13,7 +13,13 @@ pub struct Detection {
 
 /// Intersection over union of two boxes; 0 where they do not overlap.
 pub fn iou(a: [f32; 4], b: [f32; 4]) -> f32 {
-    let area = |[left, top, right, bottom]: [f32; 4]| (right - left).max(0.0) * (bottom - top).max(0.0);
+    overlap(a, b) as f32
+}
+
+/// As [`iou`], in double precision.
+pub(crate) fn overlap(a: [f32; 4], b: [f32; 4]) -> f64 {
+    let [a, b] = [a, b].map(|corners| corners.map(f64::from));
+    let area = |[left, top, right, bottom]: [f64; 4]| (right - left).max(0.0) * (bottom - top).max(0.0);
     let common = area([a[0].max(b[0]), a[1].max(b[1]), a[2].min(b[2]), a[3].min(b[3])]);
     let union = area(a) + area(b) - common;
     if union > 0.0 { common / union } else { 0.0 }
@@ -46,7 +52,7 @@ mod tests {
 
     #[test]
     fn overlap_is_that_of_areas() {
-        assert_eq!(iou([0.0, 0.0, 4.0, 2.0], [2.0, 0.0, 6.0, 2.0]), 4.0 / 12.0);
+        assert_eq!(overlap([0.0, 0.0, 4.0, 2.0], [2.0, 0.0, 6.0, 2.0]), 4.0 / 12.0);
         assert_eq!(iou([0.0, 0.0, 4.0, 2.0], [0.0, 0.0, 4.0, 2.0]), 1.0);
         // Apart, touching, empty, inside out.
         for other in [[5.0, 0.0, 6.0, 2.0], [4.0, 0.0, 6.0, 2.0], [1.0, 1.0, 1.0, 1.0], [3.0, 2.0, 1.0, 0.0]] {

@@ -7,20 +7,24 @@
 //! Architecture invariant: functions of bytes and pixels; no files, no network, no clock. The caller reads the files.
 
 pub mod agreement;
+pub mod aligned;
 pub mod boxes;
 pub mod card;
 mod coco;
 mod detector;
-mod letterbox;
+pub mod gradient;
+mod heads;
 mod masked;
 pub mod network;
-mod yolox;
+mod placed;
+pub mod precision;
 
 pub use agreement::{Agreement, Counts, agreement};
 pub use boxes::{Detection, iou};
 pub use card::Card;
-pub use detector::{Detector, SCORE};
+pub use detector::Detector;
 pub use masked::masked_share;
+pub use precision::{Boxes, Precision, TrueBox, precision};
 
 /// A picture: rows from the top, three bytes a pixel, red first.
 #[derive(Debug, Clone, Copy)]
