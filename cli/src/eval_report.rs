@@ -4,8 +4,11 @@ use std::path::PathBuf;
 
 use eval::cuts::CutFigures;
 use eval::seams::SeamReport;
-use eval::{BudgetFigures, ByKind, DepthReport, DetectionReport, Group, Summary, ViewFigures, mean};
-use perceive::Counts;
+use eval::{
+    AgainstTruth, BudgetFigures, ByKind, Correlation, Correlations, DepthReport, DetectionReport, Group, Summary,
+    ViewFigures, mean,
+};
+use perceive::{Counts, Precision};
 use serde::Serialize;
 
 use crate::run_record::Record;
@@ -39,8 +42,8 @@ pub(crate) struct Evaluated {
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) depth: Option<DepthReport>,
     /// With `--detector`.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub(crate) detections: Option<DetectionReport>,
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub(crate) detections: Vec<DetectionReport>,
     /// With `--level`.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub(crate) cuts: Vec<CutFigures>,
@@ -67,7 +70,7 @@ impl Evaluated {
             stretches: None,
             trained_on: None,
             depth: None,
-            detections: None,
+            detections: Vec::new(),
             cuts: Vec::new(),
             budgets: Vec::new(),
             seams: None,
@@ -120,7 +123,7 @@ pub(crate) fn text(evaluated: &Evaluated) -> String {
     if let Some(report) = &evaluated.depth {
         text += &format!("\n{}", depth(report));
     }
-    if let Some(report) = &evaluated.detections {
+    for report in &evaluated.detections {
         text += &format!("\n{}", detections(report));
     }
     if !evaluated.cuts.is_empty() {
@@ -164,12 +167,33 @@ fn depth(report: &DepthReport) -> String {
 }
 
 fn detections(report: &DetectionReport) -> String {
-    let mut text = String::from(" photos  renders     kept    extra  detections with a score of ");
-    text += &format!("{} or more\n", report.score);
+    let mut text = String::from(" photos  renders     kept    extra  ");
+    text += &format!("{}: detections with a score of {} or more\n", report.detector, report.score);
     for (name, of) in report.groups.named() {
         for (classes, Counts { photos, renders, kept, extra }) in of.counts.named() {
             let views = of.views;
             text += &format!("{photos:>7} {renders:>8} {kept:>8} {extra:>8}  {classes}, {name}: {views} views\n");
+        }
+    }
+    let [map, map50, iou, psnr, ssim] = ["mAP", "mAP50", "mean IoU", "zone PSNR", "zone SSIM"];
+    text += &format!("{map:>7} {map50:>8} {iou:>8} {psnr:>10} {ssim:>10}  renders against photos\n");
+    for (name, of) in report.groups.named() {
+        let [map, map50, iou, ssim] =
+            [of.precision.map, of.precision.map50, of.mean_iou, of.zones.zone_ssim].map(|value| figure(value, 3));
+        let (psnr, extra) = (figure(of.zones.zone_psnr, 2), of.extra);
+        text +=
+            &format!("{map:>7} {map50:>8} {iou:>8} {psnr:>10} {ssim:>10}  {name}: {} missed, {extra} extra", of.misses);
+        let Correlations { views, psnr, ssim, lpips } = of.correlations;
+        for (with, Correlation { r, p }) in
+            [("PSNR", psnr), ("SSIM", ssim), ("LPIPS", lpips)].into_iter().filter_map(|(with, of)| Some((with, of?)))
+        {
+            text += &format!("\n{:>48} with {with}: r = {r:+.3}, p = {p:.2e} ({views} views)", "mAP");
+        }
+        text.push('\n');
+        let Some(AgainstTruth { boxes, left_out, photos, renders }) = of.truth else { continue };
+        for (of, Precision { map, map50 }) in [("photos", photos), ("renders", renders)] {
+            let [map, map50] = [map, map50].map(|value| figure(value, 3));
+            text += &format!("{map:>7} {map50:>8} {:>30}  {of} against {boxes} true boxes, {left_out} left out\n", "");
         }
     }
     text

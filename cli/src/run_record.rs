@@ -65,7 +65,7 @@ impl Record {
     pub(crate) fn set_quality(&mut self, by: &Self) {
         (self.psnr, self.ssim, self.perceptual) = (by.psnr, by.ssim, by.perceptual);
         (self.lpips, self.fps, self.cc_psnr) = (by.lpips, by.fps, by.cc_psnr);
-        self.detections_kept = by.detections_kept;
+        (self.detections_kept, self.zone_psnr) = (by.detections_kept, by.zone_psnr);
     }
 
     /// A line of bench/results; `invoked` is the command line.

@@ -85,7 +85,7 @@ fn depth_is_compared_with_the_truth_and_with_lidar() {
 }
 
 #[test]
-fn a_detector_is_run_on_photos_and_renders() {
+fn detectors_are_run_on_photos_and_renders() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
     common::city(at, 16, 96, 64);
@@ -94,25 +94,65 @@ fn a_detector_is_run_on_photos_and_renders() {
     fs::write(at.join("text.onnx"), "no network").unwrap();
     refused(at, &words("text.onnx"), "text.onnx: is not an ONNX graph");
     refused(at, &words("missing.onnx"), "missing.onnx");
-    let [Some(other), Some(yolox)] =
-        ["fastestdet_352.onnx", "yolox_nano_416.onnx"].map(|n| shared(&format!("detectors/{n}")))
-    else {
-        return;
-    };
-    fs::copy(other, at.join("other.onnx")).unwrap();
-    refused(at, &words("other.onnx"), "1×85×22×22 out");
-    fs::copy(yolox, at.join("yolox.onnx")).unwrap();
-    let said = done(at, &words("yolox.onnx"));
-    let found = &said["detections"];
-    assert_eq!((&found["views"], found["by_view"].as_array().unwrap().len()), (&2.into(), 2));
-    for group in ["vehicles", "people", "all"] {
-        let count = |key: &str| found[group][key].as_u64().unwrap();
-        assert!(count("kept") <= count("photos") && count("kept") + count("extra") == count("renders"), "{found}");
+
+    // A network of random weights, which takes a card.
+    let tiny = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../perceive/tests/yolov8_tiny.onnx");
+    fs::copy(tiny, at.join("tiny.onnx")).unwrap();
+    refused(at, &words("tiny.onnx"), "1×7×126 out, and a detector has");
+    let card = |text: &str| fs::write(at.join("tiny.toml"), text).unwrap();
+    card("classes = ['car']");
+    refused(at, &words("tiny.onnx"), "yolov8 of 1 classes");
+    card("classes = ['car', 'person', 'bench']\ncolour = 'rgb'");
+    refused(at, &words("tiny.onnx"), "unknown field `colour`");
+    card("classes = ['car', 'person', 'bench']\n[map]\nlion = 'cat'");
+    refused(at, &words("tiny.onnx"), "lion");
+    fs::write(at.join("tiny.toml"), [0xff, 0xfe]).unwrap();
+    refused(at, &words("tiny.onnx"), "tiny.toml");
+    card("classes = ['car', 'person', 'bench']\nscore = 0.9\n[map]\nbench = 'seat'");
+    let said = done(at, &words("tiny.onnx"));
+    let [found] = &said["detections"].as_array().unwrap()[..] else { panic!("{said}") };
+    assert_eq!((&found["detector"], &found["views"]), (&"tiny.onnx".into(), &2.into()));
+    assert!(found["map"].as_f64().is_some_and(|map| (0.0..=1.0).contains(&map)), "{found}");
+    assert!(
+        found["mean_iou"].is_number() && found["zone_psnr"].is_number() && found["zone_ssim"].is_number(),
+        "{found}"
+    );
+    assert_eq!(
+        found["misses"].as_u64(),
+        found["all"]["photos"].as_u64().zip(found["all"]["kept"].as_u64()).map(|(a, b)| a - b)
+    );
+    // Two views have no correlation; the city tells what is there.
+    assert!(found["correlations"]["psnr"].is_null() && found["correlations"]["views"] == 2, "{found}");
+    let truth = &found["truth"];
+    assert!(
+        truth["boxes"].is_u64() && truth["left_out"].as_u64().unwrap() > 0 && truth["photos"].is_object(),
+        "{truth}"
+    );
+    assert_eq!((&said["detections_kept"], &said["zone_psnr"]), (&found["share_kept"], &found["zone_psnr"]));
+    // Nothing at all is found: figures are null.
+    card("classes = ['car', 'person', 'bench']\nscore = 1.0");
+    let said = done(at, &words("tiny.onnx"));
+    let found = &said["detections"][0];
+    for key in ["share_kept", "map", "map50", "mean_iou", "zone_psnr", "zone_ssim"] {
+        assert!(found.get(key).is_some_and(Value::is_null), "{found}");
     }
-    assert_eq!(said["detections_kept"], found["share_kept"]);
-    // A card beside it is read.
-    fs::write(at.join("yolox.toml"), "classes = ['car']").unwrap();
-    refused(at, &words("yolox.onnx"), "YOLOX of 1 classes");
-    fs::write(at.join("yolox.toml"), [0xff, 0xfe]).unwrap();
-    refused(at, &words("yolox.onnx"), "yolox.toml");
+    let text = String::from_utf8(plat(at, &words("tiny.onnx")).stdout).unwrap();
+    assert!(text.contains("tiny.onnx: detections with a score of 1") && text.contains("0 missed"), "{text}");
+    fs::remove_dir_all(at.join("city/truth")).unwrap();
+    assert!(done(at, &words("tiny.onnx"))["detections"][0].get("truth").is_none());
+
+    let networks = ["yolox_nano_416.onnx", "fastestdet_352.onnx"];
+    let [Some(yolox), Some(fastestdet)] = networks.map(|name| shared(&format!("detectors/{name}"))) else { return };
+    let [yolox, fastestdet] = [yolox, fastestdet].map(|path| path.display().to_string());
+    let both = ["eval", "out", "city", "--quiet", "--detector", &yolox, "--detector", &fastestdet];
+    let said = done(at, &both);
+    let found = said["detections"].as_array().unwrap();
+    assert_eq!((found.len(), &found[0]["score"], &found[1]["score"]), (2, &0.3.into(), &0.65.into()));
+    for (found, name) in found.iter().zip(networks) {
+        assert_eq!((&found["detector"], found["by_view"].as_array().unwrap().len()), (&name.into(), 2));
+        for group in ["vehicles", "people", "all"] {
+            let count = |key: &str| found[group][key].as_u64().unwrap();
+            assert!(count("kept") <= count("photos") && count("kept") + count("extra") == count("renders"), "{found}");
+        }
+    }
 }

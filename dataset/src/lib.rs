@@ -17,6 +17,7 @@ pub mod open;
 mod photo;
 pub mod synth;
 mod tables;
+pub mod true_boxes;
 pub mod undistortion;
 pub mod windows;
 pub mod zones;

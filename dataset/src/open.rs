@@ -36,7 +36,7 @@ use scene::{BadInput, Camera, CameraModel, Capture, GeoOrigin, Pinhole, View};
 use self::files::{CaptureRoot, Found};
 pub use self::parsed::OpenOptions;
 use self::parsed::{ParsedCapture, PosedImage};
-pub(crate) use self::truth::truth_folder;
+pub(crate) use self::truth::{truth_boxes, truth_folder};
 use crate::depth_maps::DepthFile;
 use crate::lidar::Sweep;
 use crate::lidar::seeds::{Seeds, seeds};

@@ -5,7 +5,7 @@ mod smoothing;
 
 use std::sync::Arc;
 
-use perceive::{Detector, Picture, SCORE, masked_share};
+use perceive::{Detector, Picture, masked_share};
 use scene::frame::{self, Kind};
 use scene::{ArtefactId, BadInput, Capture, Pixels, Rect, Zone, Zones};
 use store::BlockingStore;
@@ -104,14 +104,14 @@ fn detected(
         of_views.push(zones);
         progress(of_views.len(), capture.views.len());
     }
-    Ok(Zones { classes: detector.card().written.classes.clone(), of_views })
+    Ok(Zones { classes: detector.card().classes.clone(), of_views })
 }
 
 /// What a detector finds on a photo outside its mask, surest first.
 fn found(detector: &Detector, photo: &Pixels) -> Result<Vec<Zone>, BadInput> {
     let (width, height, area) = (photo.width as usize, photo.height as usize, photo.area());
     let rgb: Vec<u8> = (0..area).flat_map(|i| [photo.rgb[i], photo.rgb[area + i], photo.rgb[2 * area + i]]).collect();
-    let found = detector.detect(&Picture { rgb: &rgb, width, height }, SCORE)?;
+    let found = detector.detect(&Picture { rgb: &rgb, width, height }, detector.card().score)?;
     let zones = found.into_iter().filter_map(|of| {
         let [left, top, right, bottom] = of.corners;
         let (w, h) = (width as f32, height as f32);

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 
 use blocks::{Part, view_kinds};
 use dataset::ingest::TrueDepth;
+use dataset::true_boxes::TrueBoxes;
 use model::{Model, Tree};
 use perceive::Detector;
 use render::{Frame, Options};
@@ -46,7 +47,9 @@ pub struct Request<'a> {
     /// True depths to compare with.
     pub depth: Option<&'a TrueDepth>,
     /// What finds objects on photos and renders.
-    pub detector: Option<&'a Detector>,
+    pub detectors: &'a [Detector],
+    /// The objects that are there, to compare detections with.
+    pub true_boxes: Option<&'a TrueBoxes>,
     /// Folder for contact sheets and pictures; created if need be.
     pub out: &'a Path,
     /// How many views that were trained on to measure as well, evenly chosen.
@@ -70,8 +73,8 @@ pub struct Evaluation {
     pub trained_on: Option<Group>,
     /// Depth errors.
     pub depth: Option<DepthReport>,
-    /// Detections on photos and renders.
-    pub detections: Option<DetectionReport>,
+    /// Detections on photos and renders, by detector.
+    pub detections: Vec<DetectionReport>,
     /// The contact sheet.
     pub sheet: PathBuf,
     /// In the order of the request.
@@ -96,7 +99,8 @@ pub fn evaluate(request: &Request, observer: &dyn Observer) -> Result<Evaluation
         return Err(BadInput::new("--test-every", "holds out no view", advice).into());
     }
     let of_photos = |&index: &u32| &photos.capture.views[index as usize];
-    let mut judges = Judges::new(request.depth, request.detector, photos.downscale, held_out.iter().map(of_photos))?;
+    let Request { depth, detectors, true_boxes, .. } = *request;
+    let mut judges = Judges::new(depth, detectors, true_boxes, photos.downscale, held_out.iter().map(of_photos))?;
     let extras = judges.need_depth();
     let options = Options { extras, inverse_depth: extras, ..model.options() };
     std::fs::create_dir_all(out).map_err(|error| EvalError::Folder { path: out.to_path_buf(), error })?;
@@ -129,9 +133,9 @@ pub fn evaluate(request: &Request, observer: &dyn Observer) -> Result<Evaluation
         let frame = renderer.render(&splats, &view.camera, &options)?;
         render_seconds.add(began, observer.now());
         let part = if i < test.len() { Part::Test } else { Part::Stretch };
-        judges.add((part, index), view, &photo, frame)?;
         let compared = Comparison::new(&view.name, &frame.colour, &photo);
         let mut figures = compared.figures(lpips)?;
+        judges.add((part, index), view, &photo, frame, (&compared, &figures))?;
         let rendering = (&mut renderer, &splats, &model.options());
         fitter.add(&mut figures, (index, &photo), &compared, rendering, &photos.capture)?;
         if i.is_multiple_of(shown_every) {
@@ -171,8 +175,10 @@ pub fn evaluate(request: &Request, observer: &dyn Observer) -> Result<Evaluation
         let view = &photos.capture.views[index as usize];
         let photo = reader.window(index, 0, view.camera.full())?;
         let frame = renderer.render(&splats, &view.camera, &options)?;
-        judges.add((Part::Trained, index), view, &photo, frame)?;
-        trained_figures.push(Comparison::new(&view.name, &frame.colour, &photo).figures(lpips)?);
+        let compared = Comparison::new(&view.name, &frame.colour, &photo);
+        let figures = compared.figures(lpips)?;
+        judges.add((Part::Trained, index), view, &photo, frame, (&compared, &figures))?;
+        trained_figures.push(figures);
         observer.progress("evaluating", (held_out.len() + i) as u64 + 1, total, "");
     }
 

@@ -76,14 +76,7 @@ impl<'a> Comparison<'a> {
         let Self { truth, width, height, .. } = self;
         let psnr = metrics::psnr(&self.render, truth, self.mask);
         let cc_psnr = metrics::colour_corrected_psnr(&self.render, truth, self.mask);
-        let mut render = self.render.clone();
-        if let Some(mask) = self.mask {
-            for (i, value) in render.iter_mut().enumerate() {
-                if mask[i % mask.len()] < 128 {
-                    *value = truth[i];
-                }
-            }
-        }
+        let render = self.filled();
         Ok(ViewFigures {
             view: self.name.to_owned(),
             psnr,
@@ -94,6 +87,18 @@ impl<'a> Comparison<'a> {
             psnr_refined: None,
             psnr_fitted: None,
         })
+    }
+}
+
+impl Comparison<'_> {
+    /// The render with the photo's pixels where it is masked.
+    pub(crate) fn filled(&self) -> Vec<f32> {
+        let mut render = self.render.clone();
+        if let Some(mask) = self.mask {
+            let pixels = render.iter_mut().zip(&self.truth).enumerate();
+            pixels.filter(|(i, _)| mask[i % mask.len()] < 128).for_each(|(_, (render, truth))| *render = *truth);
+        }
+        render
     }
 }
 

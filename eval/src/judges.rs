@@ -1,14 +1,18 @@
-//! Further measures of each rendered view, on request: errors of its depth, and what a detector finds on it.
+//! Further measures of each rendered view, on request: errors of its depth, and what detectors find on it.
+
+use std::path::Path;
 
 use blocks::{Part, ViewKind};
 use dataset::ingest::{TrueDepth, ViewDepths};
-use perceive::{Detector, SCORE};
+use dataset::true_boxes::TrueBoxes;
+use perceive::Detector;
 use render::Frame;
 use scene::{BadInput, Pixels, View};
 use serde::Serialize;
 
 use crate::depth::{DepthFigures, DepthSummary};
-use crate::detections::{DetectionFigures, DetectionSummary};
+use crate::detections::{DetectionFigures, DetectionSummary, Sight};
+use crate::figures::{Comparison, ViewFigures};
 use crate::groups::Groups;
 
 /// Depth errors of a model.
@@ -26,6 +30,8 @@ pub struct DepthReport {
 /// Detections on photos and renders.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct DetectionReport {
+    /// The network's file, without its folder.
+    pub detector: String,
     /// Least score of a detection.
     pub score: f32,
     /// By use and kind of the views.
@@ -38,8 +44,13 @@ pub struct DetectionReport {
 /// The judges of an evaluation, and their figures so far.
 pub(crate) struct Judges<'a> {
     depth: Option<DepthJudge<'a>>,
-    detector: Option<&'a Detector>,
-    detections: Vec<(Part, u32, DetectionFigures)>,
+    detectors: Vec<DetectionJudge<'a>>,
+    true_boxes: Option<&'a TrueBoxes>,
+}
+
+struct DetectionJudge<'a> {
+    detector: &'a Detector,
+    figures: Vec<(Part, u32, DetectionFigures)>,
 }
 
 struct DepthJudge<'a> {
@@ -51,7 +62,7 @@ struct DepthJudge<'a> {
 /// What the judges found.
 pub(crate) struct Judged {
     pub(crate) depth: Option<DepthReport>,
-    pub(crate) detections: Option<DetectionReport>,
+    pub(crate) detections: Vec<DetectionReport>,
 }
 
 impl<'a> Judges<'a> {
@@ -59,7 +70,8 @@ impl<'a> Judges<'a> {
     /// True depths of none of these views.
     pub(crate) fn new<'v>(
         depth: Option<&'a TrueDepth>,
-        detector: Option<&'a Detector>,
+        detectors: &'a [Detector],
+        true_boxes: Option<&'a TrueBoxes>,
         downscale: u32,
         mut views: impl Iterator<Item = &'v View>,
     ) -> Result<Self, BadInput> {
@@ -69,7 +81,8 @@ impl<'a> Judges<'a> {
             let advice = "hold out other views with --test-every, or leave --depth";
             return Err(BadInput::new("--depth", "finds no depths of any held-out view", advice));
         }
-        Ok(Self { depth, detector, detections: Vec::new() })
+        let detectors = detectors.iter().map(|detector| DetectionJudge { detector, figures: Vec::new() }).collect();
+        Ok(Self { depth, detectors, true_boxes })
     }
 
     /// Whether frames need a depth.
@@ -77,7 +90,7 @@ impl<'a> Judges<'a> {
         self.depth.is_some()
     }
 
-    /// Measures a frame of a view of this number.
+    /// Measures a frame of a view of this number, whose other figures are known.
     ///
     /// # Errors
     /// Depths that cannot be read, or a detector that cannot be run.
@@ -87,14 +100,19 @@ impl<'a> Judges<'a> {
         view: &View,
         photo: &Pixels,
         frame: &Frame,
+        (compared, figures): (&Comparison, &ViewFigures),
     ) -> Result<(), BadInput> {
         if let Some(depth) = &mut self.depth {
             let truth = depth.views.of_view(view, photo.mask.as_deref())?;
             depth.figures.push((part, index, DepthFigures::new(&view.name, frame, &truth)));
         }
-        if let Some(detector) = self.detector {
-            let figures = DetectionFigures::new(&view.name, detector, photo, &frame.colour)?;
-            self.detections.push((part, index, figures));
+        if self.detectors.is_empty() {
+            return Ok(());
+        }
+        let objects = self.true_boxes.and_then(|boxes| boxes.of_view(view));
+        let sight = Sight::new(photo, compared, figures, objects);
+        for judge in &mut self.detectors {
+            judge.figures.push((part, index, DetectionFigures::new(judge.detector, &sight)?));
         }
         Ok(())
     }
@@ -106,11 +124,13 @@ impl<'a> Judges<'a> {
             groups: Groups::of(&figures, kinds, DepthSummary::of),
             by_view: figures.into_iter().map(|(_, _, figures)| figures).collect(),
         });
-        let detections = self.detector.map(|_| DetectionReport {
-            score: SCORE,
-            groups: Groups::of(&self.detections, kinds, DetectionSummary::of),
-            by_view: self.detections.into_iter().map(|(_, _, figures)| figures).collect(),
-        });
+        let report = |DetectionJudge { detector, figures }: DetectionJudge| DetectionReport {
+            detector: Path::new(detector.file()).file_name().unwrap_or_default().to_string_lossy().into_owned(),
+            score: detector.card().score,
+            groups: Groups::of(&figures, kinds, DetectionSummary::of),
+            by_view: figures.into_iter().map(|(_, _, figures)| figures).collect(),
+        };
+        let detections = self.detectors.into_iter().map(report).collect();
         Judged { depth, detections }
     }
 }

@@ -7,8 +7,10 @@
 //!
 //! Architecture invariant: no command line, no terminal, no clock. Progress and time come from the caller's [`Observer`].
 
+mod against_truth;
 mod birdseye;
 mod budgets;
+mod correlation;
 mod depth;
 mod details;
 mod detections;
@@ -31,15 +33,18 @@ mod renderer;
 mod sheet;
 mod summary;
 mod surface;
+mod zones;
 
 pub mod cuts;
 pub mod seams;
 
+pub use against_truth::AgainstTruth;
 pub use birdseye::{birdseye_camera, oblique_camera};
 pub use budgets::BudgetFigures;
+pub use correlation::Correlation;
 pub use depth::{DepthFigures, DepthSummary};
 pub use details::{DetailOptions, Details, Levels};
-pub use detections::{DetectionFigures, DetectionSummary};
+pub use detections::{Correlations, DetectionFigures, DetectionSummary};
 pub use error::EvalError;
 pub use evaluate::{Evaluation, Request, evaluate};
 pub use figures::{FIGURES, Means, ViewFigures, figures_from_frame, figures_to_frame, mean};
@@ -56,3 +61,4 @@ pub use photos::{PhotoOptions, Photos};
 pub use pruning::Pruner;
 pub use renderer::{Renderer, Uploaded};
 pub use summary::{ByKind, Group, Summary};
+pub use zones::ZoneFigures;

@@ -29,7 +29,7 @@ pub struct Counts {
 }
 
 /// Detections on photos and renders by groups of classes. The field names are keys of `eval/report.json`.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
 pub struct Agreement {
     /// Cars, buses and trucks.
     pub vehicles: Counts,
@@ -37,12 +37,21 @@ pub struct Agreement {
     pub people: Counts,
     /// All classes.
     pub all: Counts,
+    /// Sum of the overlaps (intersection over union) of all that are kept with what keeps them.
+    #[serde(skip)]
+    pub overlaps: f64,
 }
 
 impl Agreement {
     /// The groups with their names.
     pub fn named(&self) -> [(&'static str, Counts); 3] {
         [("vehicles", self.vehicles), ("people", self.people), ("all classes", self.all)]
+    }
+
+    /// Mean over the detections on photos of the overlap with what keeps them; 0 for those that are not kept. `None`
+    /// without detections.
+    pub fn mean_overlap(&self) -> Option<f64> {
+        (self.all.photos > 0).then(|| self.overlaps / self.all.photos as f64)
     }
 }
 
@@ -60,6 +69,7 @@ impl AddAssign for Agreement {
         self.vehicles += more.vehicles;
         self.people += more.people;
         self.all += more.all;
+        self.overlaps += more.overlaps;
     }
 }
 
@@ -84,7 +94,7 @@ pub fn agreement(photo: &[Detection], render: &[Detection], classes: &[String]) 
     let mut taken = vec![false; photo.len()];
     let mut by_score: Vec<&Detection> = render.iter().collect();
     by_score.sort_by(|a, b| b.score.total_cmp(&a.score));
-    let mut agreement = Agreement::default();
+    let (mut agreement, mut overlaps) = (Agreement::default(), 0.0);
     let mut add = |of: &Detection, counts: Counts| {
         agreement.all += counts;
         match group(of) {
@@ -96,15 +106,16 @@ pub fn agreement(photo: &[Detection], render: &[Detection], classes: &[String]) 
     photo.iter().for_each(|of| add(of, Counts { photos: 1, ..Counts::default() }));
     for of in by_score {
         let free = (0..photo.len()).filter(|&i| !taken[i] && group(&photo[i]) == group(of));
-        let overlaps = free.map(|i| (i, iou(photo[i].corners, of.corners))).filter(|(_, overlap)| *overlap >= MATCHES);
-        let best = overlaps.reduce(|best, next| if next.1 > best.1 { next } else { best });
+        let matches = free.map(|i| (i, iou(photo[i].corners, of.corners))).filter(|(_, overlap)| *overlap >= MATCHES);
+        let best = matches.reduce(|best, next| if next.1 > best.1 { next } else { best });
         let (kept, extra) = if best.is_some() { (1, 0) } else { (0, 1) };
-        if let Some((i, _)) = best {
+        if let Some((i, overlap)) = best {
             taken[i] = true;
+            overlaps += f64::from(overlap);
         }
         add(of, Counts { photos: 0, renders: 1, kept, extra });
     }
-    agreement
+    Agreement { overlaps, ..agreement }
 }
 
 #[cfg(test)]
@@ -140,6 +151,9 @@ mod tests {
         assert_eq!(compared(&[at(PERSON, 0.9, 0.0)], &[at(BENCH, 0.9, 0.0)]).all, counts(1, 1, 0));
         assert_eq!(compared(&photo, &photo).all, counts(3, 3, 3));
         assert_eq!(compared(&[], &[]), Agreement::default());
+        // The truck overlaps the car by 8 of 12, the bench is where it was, the person is lost.
+        assert!((found.mean_overlap().unwrap() - (2.0 / 3.0 + 1.0) / 3.0).abs() < 1e-6);
+        assert_eq!(compared(&[], &render).mean_overlap(), None);
         let mut sum = found;
         sum += found;
         assert_eq!(sum.all, counts(6, 8, 4));

@@ -35,6 +35,11 @@ impl Detector {
         Ok(Self { file: file.to_owned(), model, card })
     }
 
+    /// The file that it was loaded from.
+    pub fn file(&self) -> &str {
+        &self.file
+    }
+
     /// How pictures go in and what comes out.
     pub fn card(&self) -> &Card {
         &self.card

@@ -51,9 +51,9 @@ pub(crate) struct EvalArgs {
     /// capture's lidar and metric depth maps
     #[arg(long)]
     pub(crate) depth: bool,
-    /// Also count what this detector (ONNX) finds on photos, on renders, and on both
+    /// Also measure how far what this detector (ONNX) finds on renders is what it finds on photos. Repeatable
     #[arg(long, value_name = "FILE", long_help = DETECTOR_HELP)]
-    pub(crate) detector: Option<PathBuf>,
+    pub(crate) detector: Vec<PathBuf>,
     /// Also measure the tree cut at level L, or at every level, against the finest model
     #[arg(long, value_name = "L|all", value_parser = levels)]
     pub(crate) level: Option<Levels>,
@@ -73,16 +73,25 @@ pub(crate) struct EvalArgs {
 }
 
 pub(super) const DETECTOR_HELP: &str = "\
-Also count what this detector finds on photos, on renders, and on both: a YOLOX network as an ONNX file of fixed sizes
-with undecoded boxes, such as YOLOX's tools/export_onnx.py writes. A file of the same name that ends in .toml, beside
-it, can change how pictures go in and what comes out; these are the defaults:
+Also measure how far what this detector finds on renders is what it finds on photos: mean average precision, mean IoU,
+misses and extra detections, figures of the zones where it finds something, and how these go with PSNR, SSIM and LPIPS.
+For captures of plat synth also the precision against the true boxes. Repeatable.
 
-    head = 'yolox'
+An ONNX file of fixed sizes, as YOLOX (undecoded), YOLOv8, FastestDet or NanoDet export it. A file of the same name that
+ends in .toml, beside it, can change how pictures go in and what comes out; these are the defaults of YOLOX:
+
+    head = 'yolox'           # or 'yolov8', 'fastestdet', 'nanodet'; by default as the shapes tell
     strides = [8, 16, 32]
+    resize = 'corner'        # or 'centre', both with grey around the picture; or 'stretch'
     channels = 'bgr'         # or 'rgb'
-    white = 255.0            # value of a white pixel
-    pad = 114                # grey level beside the picture, of 255
+    mean = [0, 0, 0]         # the input is (level - mean) / std, levels of 255
+    std = [1, 1, 1]
+    pad = 114                # grey level around the picture, of 255
+    score = 0.3              # of detections that count
+    overlap = 0.45           # of boxes of a class, of which the best stays
     classes = ['person', 'bicycle', ...]  # those of COCO
+    [map]                    # new names for classes; those with the same name become one
+    bus = 'vehicle'
 ";
 
 const LPIPS_HELP: &str = "\

@@ -5,6 +5,7 @@
 use std::path::Path;
 
 use dataset::ingest::TrueDepth;
+use dataset::true_boxes::TrueBoxes;
 use eval::{DetailOptions, Details, Evaluation, Fits, Lpips, PhotoOptions, Photos, Request, load_detector};
 use model::{Model, save_json};
 use perceive::Detector;
@@ -26,7 +27,7 @@ pub(crate) fn run(args: &EvalArgs, output: &Output) -> Result<(), Failure> {
 pub(crate) fn measure(args: &EvalArgs, output: &Output) -> Result<Evaluated, Failure> {
     let backend = backend::open(args.backend)?;
     let lpips = args.lpips.as_deref().map(Lpips::load).transpose()?;
-    let detector = args.detector.as_deref().map(load_detector).transpose()?;
+    let detectors: Vec<Detector> = args.detector.iter().map(|file| load_detector(file)).collect::<Result<_, _>>()?;
     let model = model::read(&args.model)?;
     let options = DetailOptions {
         levels: args.level,
@@ -44,6 +45,7 @@ pub(crate) fn measure(args: &EvalArgs, output: &Output) -> Result<Evaluated, Fai
         test_stretches: args.test_stretches,
     };
     let depth = args.depth.then(|| TrueDepth::open(&args.capture)).transpose()?;
+    let true_boxes = true_boxes(&detectors, &args.capture)?;
     let photos = captures::photos_of(&model, &source, &photos, output)?;
     let out = args.out.clone().unwrap_or_else(|| model.report_folder(&args.model, "eval"));
     let request = Request {
@@ -57,7 +59,8 @@ pub(crate) fn measure(args: &EvalArgs, output: &Output) -> Result<Evaluated, Fai
             exposure: args.fit_exposure || model.exposures.is_some(),
         },
         depth: depth.as_ref(),
-        detector: detector.as_ref(),
+        detectors: &detectors,
+        true_boxes: true_boxes.as_ref(),
         out: &out,
         trained: args.trained as usize,
     };
@@ -73,7 +76,13 @@ pub(crate) fn measure(args: &EvalArgs, output: &Output) -> Result<Evaluated, Fai
 pub(crate) struct Further<'a> {
     pub(crate) lpips: Option<&'a Lpips>,
     pub(crate) depth: Option<&'a TrueDepth>,
-    pub(crate) detector: Option<&'a Detector>,
+    pub(crate) detectors: &'a [Detector],
+    pub(crate) true_boxes: Option<&'a TrueBoxes>,
+}
+
+/// The true boxes of a capture, if there are detectors to compare with them and the capture has some.
+pub(crate) fn true_boxes(detectors: &[Detector], capture: &Path) -> Result<Option<TrueBoxes>, Failure> {
+    Ok(if detectors.is_empty() { None } else { TrueBoxes::open(capture)? })
 }
 
 /// Measures a model that was just trained on the CPU or a GPU and writes `report.json`. Renders on the CPU.
@@ -86,9 +95,10 @@ pub(crate) fn measure_trained(
 ) -> Result<Evaluated, Failure> {
     let (details, backend) = (Details::default(), train::Backend::Cpu);
     let fits = Fits { pose: model.poses.is_some(), exposure: model.exposures.is_some() };
-    let Further { lpips, depth, detector } = *further;
+    let Further { lpips, depth, detectors, true_boxes } = *further;
     let (details, backend) = (&details, &backend);
-    let request = Request { model, details, photos, backend, lpips, fits, depth, detector, out, trained: 0 };
+    let request =
+        Request { model, details, photos, backend, lpips, fits, depth, detectors, true_boxes, out, trained: 0 };
     let evaluated = evaluated(&request, output)?;
     save_json(&out.join("report.json"), &evaluated)?;
     Ok(evaluated)
@@ -110,7 +120,9 @@ fn evaluated(request: &Request, output: &Output) -> Result<Evaluated, Failure> {
         ..Record::new("eval")
     };
     record.set_figures(&evaluation.views);
-    record.detections_kept = evaluation.detections.as_ref().and_then(|found| found.groups.held_out.all.share_kept);
+    if let Some(found) = evaluation.detections.first().map(|found| &found.groups.held_out.all) {
+        (record.detections_kept, record.zone_psnr) = (found.share_kept, found.zones.zone_psnr);
+    }
     let Evaluation { views, by_kind, stretches, trained_on, depth, detections, sheet, cuts, budgets, seams, .. } =
         evaluation;
     let evaluated = Evaluated::new(record, views);

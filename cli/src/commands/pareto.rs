@@ -17,7 +17,7 @@ use train::random;
 use crate::args::{Auto, Backend, Named, ParetoArgs, PlanOptions, TrainArgs};
 use crate::captures;
 use crate::clock;
-use crate::commands::eval::{Further, measure_trained};
+use crate::commands::eval::{Further, measure_trained, true_boxes};
 use crate::commands::train::{Trained, resolved, store_url, train};
 use crate::eval_report::{Evaluated, text};
 use crate::failure::{Failure, cannot};
@@ -49,7 +49,7 @@ pub(crate) fn run(args: &ParetoArgs, output: &Output) -> Result<(), Failure> {
     if args.sweep.train.plan.evaluate {
         return Err(BadInput::new("--evaluate", "measures what each run is measured on anyway", "leave it").into());
     }
-    let further = Further { lpips: lpips.as_ref(), detector: detector.as_ref(), depth: None };
+    let further = Further { lpips: lpips.as_ref(), detectors: detector.as_slice(), ..Further::default() };
     let runs = runs(args)?;
     let file = args.results.join(RUNS);
     let mut existing = if file.exists() { read(&file)? } else { Vec::new() };
@@ -182,6 +182,7 @@ fn train_and_measure(
     output: &Output,
 ) -> Result<(ResultLine, String), Failure> {
     let depth = depth.then(|| TrueDepth::open(&run.train.capture)).transpose()?;
+    let true_boxes = true_boxes(further.detectors, &run.train.capture)?;
     clock::reset_peak_memory();
     let Trained { capture, report, curve, .. } = train(&run.train, output)?;
     let model = model::read(&run.train.out)?;
@@ -191,7 +192,8 @@ fn train_and_measure(
     let plan = &run.train.plan;
     let split = model.split(&capture, None, None);
     let photos = Photos::ingested(capture, store, split, plan.downscale);
-    let evaluated = measure_trained(&model, &photos, &Further { depth: depth.as_ref(), ..*further }, &out, output)?;
+    let further = Further { depth: depth.as_ref(), true_boxes: true_boxes.as_ref(), ..*further };
+    let evaluated = measure_trained(&model, &photos, &further, &out, output)?;
     record.scene.clone_from(&run.scene);
     record.set_quality(&evaluated.record);
     let depth = evaluated.depth.as_ref().map(|report| report.groups.held_out.all);
@@ -210,7 +212,7 @@ fn train_and_measure(
 fn by_kind(evaluated: &Evaluated) -> [Option<KindFigures>; 2] {
     let held_out = &evaluated.by_kind;
     let depth = evaluated.depth.as_ref().map(|report| &report.groups.held_out);
-    let found = evaluated.detections.as_ref().map(|found| &found.groups.held_out);
+    let found = evaluated.detections.first().map(|found| &found.groups.held_out);
     let of = |figures: Option<Summary>, depth: Option<DepthSummary>, kept: Option<f64>| {
         let figures = figures?;
         Some(KindFigures {

@@ -1,4 +1,4 @@
-//! Finds the true depths of captures that `plat synth --truth` wrote.
+//! Finds the true depths and boxes of captures that `plat synth --truth` wrote.
 
 use std::fs::File;
 use std::io::Read;
@@ -15,6 +15,18 @@ const MANIFEST: &str = "manifest.json";
 const MANIFEST_BYTES: u64 = 1 << 20;
 /// The folder of true depths.
 const DEPTH: &str = "depth";
+/// The objects of each photo, and the cameras as they were.
+const BOXES: [&str; 2] = ["boxes3d.json", "truth/transforms.json"];
+
+/// The manifest of a synthetic capture; `None` of other captures, whose manifests are no error.
+fn manifest_of(root: &CaptureRoot) -> Result<Option<Value>, BadInput> {
+    let Some(manifest) = root.file(MANIFEST) else { return Ok(None) };
+    let mut bytes = Vec::new();
+    let read = File::open(&manifest).and_then(|file| file.take(MANIFEST_BYTES).read_to_end(&mut bytes));
+    read.map_err(|error| BadInput::new(show(&manifest), format!("cannot be read ({error})"), "check the file"))?;
+    let manifest = serde_json::from_slice::<Value>(&bytes).ok();
+    Ok(manifest.filter(|of| of["made_by"].as_str().is_some_and(|by| by.starts_with("plat "))))
+}
 
 /// The folder of the capture's true depths; `None` unless its manifest says that it has them.
 ///
@@ -22,14 +34,7 @@ const DEPTH: &str = "depth";
 /// A path that is no capture, or a manifest that promises depths that are not there.
 pub(crate) fn truth_folder(path: &Path) -> Result<Option<PathBuf>, BadInput> {
     let root = CaptureRoot::new(path)?;
-    let Some(manifest) = root.file(MANIFEST) else { return Ok(None) };
-    let mut bytes = Vec::new();
-    let read = File::open(&manifest).and_then(|file| file.take(MANIFEST_BYTES).read_to_end(&mut bytes));
-    read.map_err(|error| BadInput::new(show(&manifest), format!("cannot be read ({error})"), "check the file"))?;
-    // Manifests of other programs are no error.
-    let Ok(manifest) = serde_json::from_slice::<Value>(&bytes) else { return Ok(None) };
-    let is_ours = manifest["made_by"].as_str().is_some_and(|by| by.starts_with("plat "));
-    if !is_ours || manifest["settings"]["truth"] != Value::Bool(true) {
+    if manifest_of(&root)?.is_none_or(|manifest| manifest["settings"]["truth"] != Value::Bool(true)) {
         return Ok(None);
     }
     let folder = root.path(DEPTH).canonicalize().ok().filter(|folder| folder.is_dir());
@@ -37,4 +42,18 @@ pub(crate) fn truth_folder(path: &Path) -> Result<Option<PathBuf>, BadInput> {
         let problem = format!("has no folder {DEPTH}, which its {MANIFEST} says it has");
         BadInput::new(show(path), problem, "write the capture again with plat synth --truth")
     })
+}
+
+/// The files of the capture's true boxes and true cameras; `None` unless it is a complete synthetic capture that has
+/// them.
+///
+/// # Errors
+/// A path that is no capture.
+pub(crate) fn truth_boxes(path: &Path) -> Result<Option<[PathBuf; 2]>, BadInput> {
+    let root = CaptureRoot::new(path)?;
+    if manifest_of(&root)?.is_none_or(|manifest| manifest["complete"] != Value::Bool(true)) {
+        return Ok(None);
+    }
+    let [boxes, cameras] = BOXES.map(|name| root.file(name));
+    Ok(boxes.zip(cameras).map(|(boxes, cameras)| [boxes, cameras]))
 }
