@@ -6,7 +6,9 @@
 
 use std::cell::OnceCell;
 
-use perceive::{Agreement, Boxes, Counts, Detection, Detector, Picture, Precision, TrueBox, agreement, precision, masked_share};
+use perceive::{
+    Agreement, Boxes, Counts, Detection, Detector, Picture, Precision, TrueBox, agreement, masked_share, precision,
+};
 use scene::{BadInput, Pixels};
 use serde::Serialize;
 
@@ -15,7 +17,7 @@ use crate::correlation::{Correlation, correlation};
 use crate::figures::{Comparison, ViewFigures, mean};
 use crate::images::{colour_image, photo_image};
 use crate::metric_maps;
-use crate::zones::{ZoneFigures, pixels};
+use crate::zones::ZoneFigures;
 
 /// Largest share of a detection that may be masked.
 const MAX_MASKED: f64 = 0.5;
