@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use clap::Args;
+use clap::{ArgGroup, Args};
 use serde::Serialize;
 
 use super::values::weight;
@@ -12,10 +12,11 @@ const ZONE_WEIGHT: f64 = 4.0;
 
 #[derive(Debug, Clone, PartialEq, Args, Serialize)]
 #[serde(rename_all = "kebab-case")]
+#[command(group = ArgGroup::new("zone_source").args(["zone_detector", "zones"]))]
 pub(crate) struct ZoneOptions {
     /// Look for objects on the photos with this detector (ONNX), as `plat eval --detector` does, and let their pixels count more in
     /// training and in pruning, by --zone-weight
-    #[arg(long = "detector", value_name = "FILE", conflicts_with = "zones")]
+    #[arg(long = "detector", value_name = "FILE")]
     #[serde(rename = "detector", skip_serializing_if = "Option::is_none")]
     pub(crate) zone_detector: Option<PathBuf>,
     /// Boxes of objects instead, as JSON in COCO's layout: images, annotations, categories. They are in pixels of the photos without
@@ -24,7 +25,7 @@ pub(crate) struct ZoneOptions {
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) zones: Option<PathBuf>,
     /// Pixels of objects count 1 + W times, with --detector or --zones
-    #[arg(long, value_name = "W", value_parser = weight, default_value_t = ZONE_WEIGHT)]
+    #[arg(long, value_name = "W", value_parser = weight, default_value_t = ZONE_WEIGHT, requires = "zone_source")]
     pub(crate) zone_weight: f64,
 }
 
@@ -37,6 +38,11 @@ impl Default for ZoneOptions {
 impl ZoneOptions {
     /// The additional weight of objects' pixels; 0 if nobody looks for objects.
     pub(crate) fn weight(&self) -> f64 {
-        if self.zone_detector.is_some() || self.zones.is_some() { self.zone_weight } else { 0.0 }
+        if self.is_given() { self.zone_weight } else { 0.0 }
+    }
+
+    /// Whether anybody looks for objects.
+    pub(crate) fn is_given(&self) -> bool {
+        self.zone_detector.is_some() || self.zones.is_some()
     }
 }

@@ -47,6 +47,10 @@ pub(crate) fn run(args: &PruneArgs, output: &Output) -> Result<(), Failure> {
     let clock = Stopwatch::start();
     let tolerance_db = if args.keep.is_none() { Some(args.tolerance_db.unwrap_or(TOLERANCE_DB)) } else { None };
     let Some(capture) = &args.capture else {
+        if args.photos.zones.is_given() {
+            let advice = "name the capture with --capture";
+            return Err(BadInput::new("--detector and --zones", "need photos to look at", advice).into());
+        }
         let Some(share) = args.keep else {
             let advice = "name the capture with --capture, or give the share to keep with --keep";
             return Err(BadInput::new("--tolerance-db", "needs photos to be measured on", advice).into());

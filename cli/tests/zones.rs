@@ -1,0 +1,114 @@
+//! Objects on photos that count more, as scripts use them.
+
+mod common;
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use common::{city, done, refused};
+use serde_json::{Value, json};
+
+const TRAIN: [&str; 8] = ["train", "city", "--steps", "60", "--budget", "600", "--levels", "1"];
+
+fn names(at: &Path) -> Vec<String> {
+    let transforms: Value = serde_json::from_slice(&fs::read(at.join("city/transforms.json")).unwrap()).unwrap();
+    let frames = transforms["frames"].as_array().unwrap();
+    let name = |frame: &Value| frame["file_path"].as_str().unwrap().trim_start_matches("images/").to_owned();
+    frames.iter().map(name).collect()
+}
+
+/// Boxes of one class, in COCO's layout: of each photo of 96×64 pixels this one.
+fn boxes(at: &Path, bbox: [f64; 4]) -> Value {
+    let names = names(at);
+    let image = |(id, name): (usize, &String)| json!({"id": id, "file_name": name, "width": 96, "height": 64});
+    let annotation = |id: usize| json!({"image_id": id, "category_id": 3, "bbox": bbox, "score": 0.5});
+    json!({
+        "images": names.iter().enumerate().map(image).collect::<Vec<_>>(),
+        "annotations": (0..names.len()).map(annotation).collect::<Vec<_>>(),
+        "categories": [{"id": 3, "name": "car"}],
+    })
+}
+
+fn write(at: &Path, name: &str, boxes: &Value) {
+    fs::write(at.join(name), boxes.to_string()).unwrap();
+}
+
+#[test]
+fn pixels_of_zones_change_training_and_pruning_reproducibly() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    city(at, 16, 96, 64);
+    write(at, "boxes.json", &boxes(at, [20.0, 10.0, 40.0, 30.0]));
+    let train = |out: &str, more: &[&str]| {
+        let said = done(at, &[&TRAIN[..], &["--out", out, "--quiet"], more].concat());
+        let plan: Value = serde_json::from_slice(&fs::read(at.join(out).join("plan.json")).unwrap()).unwrap();
+        (said["capture"].clone(), plan["zones"].clone(), fs::read(at.join(out).join("merged.ply")).unwrap())
+    };
+    let (capture, none, plain) = train("plain", &[]);
+    let (same, zones, weighed) = train("weighed", &["--zones", "boxes.json"]);
+    assert!(none.is_null() && !zones.is_null() && capture == same && plain != weighed);
+    let (_, again, other_threads) = train("again", &["--zones", "boxes.json", "--threads", "1", "--workers", "2"]);
+    assert!(again == zones && other_threads == weighed, "the same zones give another model");
+    let (_, zones, unweighed) = train("unweighed", &["--zones", "boxes.json", "--zone-weight", "0"]);
+    assert!(!zones.is_null() && unweighed == plain, "zones of no weight change the model");
+
+    let prune = |out: &str, more: &[&str]| {
+        let words = ["prune", "plain", "--capture", "city", "--keep", "0.5", "--out", out];
+        done(at, &[&words[..], more].concat());
+        fs::read(at.join(out).join("merged.ply")).unwrap()
+    };
+    assert!(prune("half", &[]) != prune("half-weighed", &["--zones", "boxes.json"]));
+    refused(
+        at,
+        &["prune", "plain/merged.ply", "--keep", "0.5", "--out", "o.ply", "--zones", "boxes.json"],
+        "--capture",
+    );
+
+    // A network of random weights finds something; the second run reads what the first one recorded.
+    let tiny = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../perceive/tests/yolov8_tiny.onnx");
+    fs::copy(tiny, at.join("tiny.onnx")).unwrap();
+    fs::write(at.join("tiny.toml"), "classes = ['car', 'person', 'bench']\nscore = 0.5").unwrap();
+    let detector = ["--detector", "tiny.onnx", "--zone-weight", "2"];
+    let (_, zones, found) = train("detected", &detector);
+    let recorded = fs::read_dir(at.join("detected/store/names/zones")).map_or(0, Iterator::count);
+    assert!(!zones.is_null() && recorded == names(at).len(), "{recorded} records");
+    assert_eq!(
+        train("detected-again", &[&detector[..], &["--store", "detected/store"]].concat()),
+        (capture, zones, found)
+    );
+}
+
+#[test]
+fn boxes_that_do_not_fit_are_refused_in_one_line() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    city(at, 16, 96, 64);
+    let good = boxes(at, [20.0, 10.0, 40.0, 30.0]);
+    let change = |name: &'static str, change: &dyn Fn(&mut Value), says: &str| {
+        let mut bad = good.clone();
+        change(&mut bad);
+        write(at, name, &bad);
+        refused(at, &[&TRAIN[..], &["--out", "out", "--zones", name]].concat(), says);
+    };
+    change("outside.json", &|b| b["annotations"][0]["bbox"] = json!([90.0, 10.0, 40.0, 30.0]), "outside");
+    change("flat.json", &|b| b["annotations"][0]["bbox"] = json!([20.0, 10.0, 0.0, 30.0]), "outside");
+    change("score.json", &|b| b["annotations"][0]["score"] = json!(2.0), "outside");
+    change("image.json", &|b| b["annotations"][0]["image_id"] = json!(99), "image 99");
+    change("class.json", &|b| b["annotations"][0]["category_id"] = json!(4), "category 4");
+    change(
+        "others.json",
+        &|b| b["images"] = json!([{"id": 0, "file_name": "x.png", "width": 9, "height": 9}]),
+        "x.png",
+    );
+    change("bbox.json", &|b| b["annotations"][0]["bbox"] = json!([1, 2, 3]), "bbox.json");
+    let many = |b: &mut Value| b["annotations"] = vec![b["annotations"][0].clone(); 10_000].into();
+    change("many.json", &many, "more than 1000 boxes");
+    fs::write(at.join("text.json"), "no boxes").unwrap();
+    for (name, says) in [("text.json", "text.json"), ("missing.json", "missing.json")] {
+        refused(at, &[&TRAIN[..], &["--out", "out", "--zones", name]].concat(), says);
+    }
+    refused(at, &[&TRAIN[..], &["--out", "out", "--zone-weight", "3"]].concat(), "--detector");
+    refused(at, &[&TRAIN[..], &["--out", "out", "--zones", "good", "--detector", "x.onnx"]].concat(), "--detector");
+    fs::write(at.join("text.onnx"), "no network").unwrap();
+    refused(at, &[&TRAIN[..], &["--out", "out", "--detector", "text.onnx"]].concat(), "is not an ONNX graph");
+}
