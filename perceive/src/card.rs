@@ -137,13 +137,21 @@ impl Head {
         }
     }
 
-    /// The output's sides after the first, which is 1, as text; `classes` is the number of classes.
-    fn sides(self, classes: usize, bins: usize) -> String {
+    /// How many numbers an anchor has; `classes` is the number of classes.
+    pub(crate) fn numbers(self, classes: usize, bins: usize) -> usize {
         match self {
-            Self::Yolox => format!("anchors×{}", 5 + classes),
-            Self::Yolov8 => format!("{}×anchors", 4 + classes),
-            Self::Fastestdet => format!("{}×rows×columns", 5 + classes),
-            Self::Nanodet => format!("anchors×{}", classes + 4 * bins),
+            Self::Yolox | Self::Fastestdet => 5 + classes,
+            Self::Yolov8 => 4 + classes,
+            Self::Nanodet => classes + 4 * bins,
+        }
+    }
+
+    /// The output's sides after the first, which is 1, as text.
+    fn sides(self, numbers: usize) -> String {
+        match self {
+            Self::Yolox | Self::Nanodet => format!("anchors×{numbers}"),
+            Self::Yolov8 => format!("{numbers}×anchors"),
+            Self::Fastestdet => format!("{numbers}×rows×columns"),
         }
     }
 }
@@ -172,7 +180,8 @@ impl Card {
             }
             let (classes, name) = (card.outputs.len(), head.name());
             let or = if i > 0 { ", or" } else { "" };
-            let _ = write!(wanted, "{or} 1×{} ({name} of {classes} classes)", head.sides(classes, card.bins));
+            let _ =
+                write!(wanted, "{or} 1×{} ({name} of {classes} classes)", head.sides(head.numbers(classes, card.bins)));
         }
         Err(wanted)
     }
@@ -253,15 +262,12 @@ impl Card {
         let input = [width, height];
         let grids: Vec<_> = Self { input, ..self.clone() }.grids().collect();
         let anchors = grids.iter().map(|(_, [columns, rows])| columns * rows).sum();
-        let classes = self.outputs.len();
-        let expected = match self.head {
-            Head::Yolox => vec![1, anchors, 5 + classes],
-            Head::Yolov8 => vec![1, 4 + classes, anchors],
-            Head::Fastestdet => match grids[..] {
-                [(_, [columns, rows])] => vec![1, 5 + classes, rows, columns],
-                _ => return None,
-            },
-            Head::Nanodet => vec![1, anchors, classes + 4 * self.bins],
+        let numbers = self.head.numbers(self.outputs.len(), self.bins);
+        let expected = match (self.head, &grids[..]) {
+            (Head::Yolox | Head::Nanodet, _) => vec![1, anchors, numbers],
+            (Head::Yolov8, _) => vec![1, numbers, anchors],
+            (Head::Fastestdet, &[(_, [columns, rows])]) => vec![1, numbers, rows, columns],
+            (Head::Fastestdet, _) => return None,
         };
         output.iter().copied().eq(expected.into_iter().map(Some)).then_some(input)
     }

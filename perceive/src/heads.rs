@@ -31,16 +31,19 @@ struct Cell {
     row: f32,
 }
 
+/// An anchor's likeliest class of the network, its score, and corners in pixels of the input.
+type Found = (usize, f32, [f32; 4]);
+
 /// The detections in a network's output whose score is at least `threshold`, in the order of the anchors: grids from
 /// the finest on, each by rows. Boxes that are not finite or empty are left out.
 pub(crate) fn decode(output: &[f32], card: &Card, placed: &Placed, threshold: f32) -> Vec<Detection> {
-    let classes = card.outputs.len();
+    let size = card.head.numbers(card.outputs.len(), card.bins);
     let cells: Vec<Cell> = card.grids().flat_map(|(stride, grid)| cells(stride, grid)).collect();
-    let (head, size): (fn(&Numbers, Cell, &Card) -> (usize, f32, [f32; 4]), usize) = match card.head {
-        Head::Yolox => (yolox, 5 + classes),
-        Head::Yolov8 => (yolov8, 4 + classes),
-        Head::Fastestdet => (fastestdet, 5 + classes),
-        Head::Nanodet => (nanodet, classes + 4 * card.bins),
+    let head: fn(&Numbers, Cell, &Card) -> Found = match card.head {
+        Head::Yolox => yolox,
+        Head::Yolov8 => yolov8,
+        Head::Fastestdet => fastestdet,
+        Head::Nanodet => nanodet,
     };
     let in_planes = matches!(card.head, Head::Yolov8 | Head::Fastestdet);
     let detection = |(i, cell): (usize, &Cell)| {
@@ -70,20 +73,20 @@ fn around([x, y]: [f32; 2], [width, height]: [f32; 2]) -> [f32; 4] {
 }
 
 /// Score: objectness times class.
-fn yolox(of: &Numbers, Cell { stride, column, row }: Cell, card: &Card) -> (usize, f32, [f32; 4]) {
+fn yolox(of: &Numbers, Cell { stride, column, row }: Cell, card: &Card) -> Found {
     let (class, likely) = of.largest(5, card.outputs.len());
     let centre = [(of.at(0) + column) * stride, (of.at(1) + row) * stride];
     (class, of.at(4) * likely, around(centre, [2, 3].map(|i| stride * of.at(i).exp())))
 }
 
 /// Score: class.
-fn yolov8(of: &Numbers, _: Cell, card: &Card) -> (usize, f32, [f32; 4]) {
+fn yolov8(of: &Numbers, _: Cell, card: &Card) -> Found {
     let (class, likely) = of.largest(4, card.outputs.len());
     (class, likely, around([of.at(0), of.at(1)], [of.at(2), of.at(3)]))
 }
 
 /// Score: objectness^0.6 times class^0.4.
-fn fastestdet(of: &Numbers, Cell { stride, column, row }: Cell, card: &Card) -> (usize, f32, [f32; 4]) {
+fn fastestdet(of: &Numbers, Cell { stride, column, row }: Cell, card: &Card) -> Found {
     let (class, likely) = of.largest(5, card.outputs.len());
     let centre = [(of.at(1).tanh() + column) * stride, (of.at(2).tanh() + row) * stride];
     let share = |i: usize| 1.0 / (1.0 + (-of.at(i)).exp());
@@ -92,7 +95,7 @@ fn fastestdet(of: &Numbers, Cell { stride, column, row }: Cell, card: &Card) -> 
 }
 
 /// Score: class. The box's sides lie at the mean distances of their distributions.
-fn nanodet(of: &Numbers, Cell { stride, column, row }: Cell, card: &Card) -> (usize, f32, [f32; 4]) {
+fn nanodet(of: &Numbers, Cell { stride, column, row }: Cell, card: &Card) -> Found {
     let (classes, bins) = (card.outputs.len(), card.bins);
     let (class, likely) = of.largest(0, classes);
     let distance = |side: usize| {
