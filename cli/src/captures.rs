@@ -88,17 +88,22 @@ pub(crate) fn name_of(path: &Path) -> String {
     path.file_name().unwrap_or_default().to_string_lossy().into_owned()
 }
 
-/// Where the options say that objects on the photos come from.
+/// Where the options say that objects on the photos of a capture come from.
 ///
 /// # Errors
-/// A file that is no detector, or has no boxes.
-pub(crate) fn zone_source(options: &ZoneOptions) -> Result<Option<ZoneSource>, BadInput> {
+/// A file that is no detector, or has no boxes that fit the photos.
+pub(crate) fn zone_source(options: &ZoneOptions, capture: &Capture) -> Result<Option<ZoneSource>, BadInput> {
     match (&options.zone_detector, &options.zones) {
         (Some(path), _) => {
             let (detector, id) = load_identified_detector(path)?;
             Ok(Some(ZoneSource::Detector(Box::new(detector), id)))
         }
-        (None, Some(path)) => Ok(Some(ZoneSource::Boxes(BoxesFile::read(path)?))),
+        (None, Some(path)) => {
+            let file = BoxesFile::read(path)?;
+            // Before any photo is read.
+            file.zones(capture)?;
+            Ok(Some(ZoneSource::Boxes(file)))
+        }
         (None, None) => Ok(None),
     }
 }

@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use common::{city, done, refused};
 use serde_json::{Value, json};
 
-const TRAIN: [&str; 8] = ["train", "city", "--steps", "60", "--budget", "600", "--levels", "1"];
+const TRAIN: [&str; 9] = ["train", "city", "--steps", "60", "--budget", "600", "--levels", "1", "--quiet"];
 
 fn names(at: &Path) -> Vec<String> {
     let transforms: Value = serde_json::from_slice(&fs::read(at.join("city/transforms.json")).unwrap()).unwrap();
@@ -40,7 +40,7 @@ fn pixels_of_zones_change_training_and_pruning_reproducibly() {
     city(at, 16, 96, 64);
     write(at, "boxes.json", &boxes(at, [20.0, 10.0, 40.0, 30.0]));
     let train = |out: &str, more: &[&str]| {
-        let said = done(at, &[&TRAIN[..], &["--out", out, "--quiet"], more].concat());
+        let said = done(at, &[&TRAIN[..], &["--out", out], more].concat());
         let plan: Value = serde_json::from_slice(&fs::read(at.join(out).join("plan.json")).unwrap()).unwrap();
         (said["capture"].clone(), plan["zones"].clone(), fs::read(at.join(out).join("merged.ply")).unwrap())
     };

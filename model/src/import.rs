@@ -7,6 +7,7 @@
 
 mod folder;
 mod gathered;
+mod imported;
 mod rad;
 mod sog;
 mod tiles;
@@ -15,11 +16,12 @@ use std::fs::File;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
-use scene::{BadInput, CodecError, GeoOrigin, Splats, ply, spz};
+use scene::{BadInput, CodecError, GeoOrigin, ply, spz};
 use serde::Deserialize;
 use serde::de::IgnoredAny;
 
 use self::folder::unreadable;
+pub(crate) use self::imported::Imported;
 use crate::ANTIALIASED;
 use crate::files::{MANIFEST_FILE, load};
 
@@ -67,16 +69,6 @@ struct Keys {
     filenames: Option<IgnoredAny>,
     means: Option<IgnoredAny>,
     root: Option<IgnoredAny>,
-}
-
-/// A model as one set of splats.
-#[derive(Debug)]
-pub(crate) struct Imported {
-    pub(crate) splats: Splats,
-    /// Whether they are rendered anti-aliased.
-    pub(crate) antialiased: bool,
-    /// Where on Earth their origin lies, if the file says it.
-    pub(crate) geo_origin: Option<GeoOrigin>,
 }
 
 /// What the model at `path` is, and the file that it starts with: `path` itself, or the one in that folder.

@@ -59,8 +59,8 @@ impl Zones {
             }
             let size = [view.camera.pinhole.width as f32, view.camera.pinhole.height as f32];
             for Zone { corners: [left, top, right, bottom], class, score } in zones {
-                let inside = *left >= 0.0 && left < right && *right <= size[0];
-                if !inside || !(*top >= 0.0 && top < bottom && *bottom <= size[1]) {
+                let inside = |from: f32, to: f32, side: f32| from >= 0.0 && from < to && to <= side;
+                if !inside(*left, *right, size[0]) || !inside(*top, *bottom, size[1]) {
                     return bad(format!("has a zone from {left}, {top} to {right}, {bottom}, not inside the photo"));
                 }
                 if usize::from(*class) >= self.classes.len() || !(0.0..=1.0).contains(score) {

@@ -7,10 +7,10 @@ use serde::Serialize;
 
 use super::values::weight;
 
-/// Default of `--zone-weight`.
+/// The weight where `--zone-weight` is not given.
 const ZONE_WEIGHT: f64 = 4.0;
 
-#[derive(Debug, Clone, PartialEq, Args, Serialize)]
+#[derive(Debug, Clone, Default, PartialEq, Args, Serialize)]
 #[serde(rename_all = "kebab-case")]
 #[command(group = ArgGroup::new("zone_source").args(["zone_detector", "zones"]))]
 pub(crate) struct ZoneOptions {
@@ -24,21 +24,16 @@ pub(crate) struct ZoneOptions {
     #[arg(long, value_name = "FILE")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) zones: Option<PathBuf>,
-    /// Pixels of objects count 1 + W times, with --detector or --zones
-    #[arg(long, value_name = "W", value_parser = weight, default_value_t = ZONE_WEIGHT, requires = "zone_source")]
-    pub(crate) zone_weight: f64,
-}
-
-impl Default for ZoneOptions {
-    fn default() -> Self {
-        Self { zone_detector: None, zones: None, zone_weight: ZONE_WEIGHT }
-    }
+    /// Pixels of objects count 1 + W times, with --detector or --zones; 4 if it is not given
+    #[arg(long, value_name = "W", value_parser = weight, requires = "zone_source")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(crate) zone_weight: Option<f64>,
 }
 
 impl ZoneOptions {
     /// The additional weight of objects' pixels; 0 if nobody looks for objects.
     pub(crate) fn weight(&self) -> f64 {
-        if self.is_given() { self.zone_weight } else { 0.0 }
+        if self.is_given() { self.zone_weight.unwrap_or(ZONE_WEIGHT) } else { 0.0 }
     }
 
     /// Whether anybody looks for objects.

@@ -84,13 +84,13 @@ pub(crate) fn run(args: &PruneArgs, output: &Output) -> Result<(), Failure> {
 fn photos(model: &Model, capture: &Path, options: &PruneCapture, output: &Output) -> Result<Photos, Failure> {
     let source = captures::open(capture, output)?;
     let PruneCapture { test_every, downscale, store, zones } = options;
-    let from = captures::zone_source(zones)?;
+    let from = captures::zone_source(zones, &source.capture)?;
     let options =
         PhotoOptions { store: store.as_deref(), downscale: *downscale, test_every: *test_every, test_stretches: None };
     let mut photos = captures::photos_of(model, &source, &options, output)?;
     if let Some(from) = from {
         let (found, _) = captures::find_zones(&photos.capture, &from, &photos.store, output)?;
-        photos.zones = Some((Arc::new(found), zones.zone_weight as f32));
+        photos.zones = Some((Arc::new(found), zones.weight() as f32));
     }
     Ok(photos)
 }

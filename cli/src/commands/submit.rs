@@ -52,6 +52,7 @@ pub(crate) fn run(args: &SubmitArgs, output: &Output) -> Result<(), Failure> {
     let source = captures::open_to_plan(&args.capture, &args.plan, output)?;
     // Plan and coordinator are checked before any photo is read.
     let (planned_for, plan) = plan_of(&source, &args.plan)?;
+    let zones = zone_source(&args.plan.zones, &planned_for)?;
     let mut remote = Remote::open(&args.connection)?;
     let about = remote.call(async |client: &mut Client| client.about(proto::AboutRequest {}).await)?;
     let backend = backend_of(args, &about, output)?;
@@ -61,7 +62,6 @@ pub(crate) fn run(args: &SubmitArgs, output: &Output) -> Result<(), Failure> {
         make_folder(out)?;
     }
     let store = remote.store(&about)?;
-    let zones = zone_source(&args.plan.zones)?;
     let Ingested { capture, id, .. } = ingest_photos(&source, &store.blocking(), args.plan.downscale, output)?;
     let zones = zones.map(|from| find_zones(&capture, &from, &store.blocking(), output)).transpose()?;
     let plan = Plan { capture: id, zones: zones.map(|(_, id)| id), ..plan };

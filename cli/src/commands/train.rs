@@ -190,12 +190,12 @@ fn prepare(args: &TrainArgs, clock: &Stopwatch, output: &Output) -> Result<Prepa
     let source = captures::open_to_plan(&args.capture, &args.plan, output)?;
     // The plan is checked before any photo is read.
     let (planned_for, plan) = plan_of(&source, &args.plan)?;
+    let zones = zone_source(&args.plan.zones, &planned_for)?;
     let backend = backend::open(args.backend)?;
     let plan = Plan { backend: backend.name(), ..plan };
     check_plan(&plan, &planned_for, output)?;
     make_folder(&args.out)?;
     let store = Store::open(&store_url(args))?;
-    let zones = zone_source(&args.plan.zones)?;
     let ingested = ingest_photos(&source, &store.blocking(), args.plan.downscale, output)?;
     let ingest_cpu_seconds = clock.cpu_seconds();
 

@@ -4,7 +4,7 @@ use glam::DVec3;
 use scene::{CodecError, GeoOrigin, column, rad};
 use serde::Deserialize;
 
-use super::Imported;
+use super::imported::Imported;
 
 /// What `plat export` says in the file's comment; other programs say other things.
 #[derive(Default, Deserialize)]

@@ -8,9 +8,9 @@ use std::path::Path;
 use scene::{BadInput, CodecError, GeoOrigin, Splats, sog};
 use serde::Deserialize;
 
-use super::Imported;
 use super::folder::{Folder, unreadable};
 use super::gathered::Gathered;
+use super::imported::Imported;
 use crate::files::load;
 
 /// Name of the file with the tree.

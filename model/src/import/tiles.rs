@@ -9,9 +9,9 @@ use scene::{BadInput, CodecError, GeoOrigin, Similarity, splat_glb};
 use serde::Deserialize;
 use serde::de::IgnoredAny;
 
-use super::Imported;
 use super::folder::{Folder, unreadable};
 use super::gathered::Gathered;
+use super::imported::Imported;
 use crate::files::load;
 
 /// Name of the file with the tiles.
