@@ -2,7 +2,6 @@
 import { useEffect, useRef } from 'preact/hooks';
 import { useSignal } from '@preact/signals';
 import { get, type Download, type ModelView, type View as Photo } from '../api';
-import { askFirst } from '../first';
 import { bytes, count, fixed } from '../format';
 import { job, jobId } from '../live';
 import { href, route, setQuery } from '../route';
@@ -11,12 +10,10 @@ import { Command, Empty, Panel, useGet, Waiting } from '../widgets/boundary';
 import type { Look, Stage, Stats } from '../viewer/stage';
 
 const FORMATS = ['rad', 'spz'] as const;
-/** Splats at first: about as many as a picture has places for. Each further hundred thousand is 4 to 8 MB to load. */
-const BUDGET = 250000;
 
 export function View() {
   const asked = useGet<ModelView>(job.value!.model ? `/api/jobs/${jobId.value}/model` : null, job.value!.counts.done);
-  const missing = useSignal('');
+  const missing = useSignal(webgl2Missing());
   if (missing.value) return <NoWebGl reason={missing.value} />;
   if (!job.value!.model) return <div class="panel"><Empty><h3>No block is finished yet</h3>The model appears with its first block, and grows as others finish. <a href={href('blocks')}>The blocks so far</a></Empty></div>;
   if (!asked.value) return <Waiting error={asked.error} what="the model" />;
@@ -39,13 +36,9 @@ function Scene({ model, onLost }: { model: ModelView; onLost: (reason: string) =
 
   useEffect(() => {
     let live = true;
-    const format = FORMATS.find((f) => f === query.get('format')) ?? null;
-    if (format !== 'spz') askFirst(jobId.value!, model);
     void import('../viewer/stage').then(({ Stage }) => {
       if (!live || !canvas.current) return;
-      // Not before: to start a context takes a while, in which no answer of the server would be looked at.
-      const reason = webgl2Missing(canvas.current);
-      if (reason) { onLost(reason); return; }
+      const format = FORMATS.find((f) => f === query.get('format')) ?? null;
       try {
         stage.current = new Stage(canvas.current, jobId.value!, model, look.value, format);
       } catch (e) { onLost((e as Error).message); return; }
@@ -175,14 +168,15 @@ function NoWebGl({ reason }: { reason: string }) {
   );
 }
 
-/** Why the canvas cannot draw; otherwise it has the context that the viewer will draw with. */
-function webgl2Missing(canvas: HTMLCanvasElement): string {
+function webgl2Missing(): string {
   if (typeof WebGL2RenderingContext === 'undefined') return 'This browser has no WebGL2';
-  if (canvas.getContext('webgl2', { antialias: false, powerPreference: 'high-performance' })) return '';
-  return 'This browser knows WebGL2 but could not start it (no graphics driver, or it is switched off)';
+  const context = document.createElement('canvas').getContext('webgl2');
+  if (!context) return 'This browser knows WebGL2 but could not start it (no graphics driver, or it is switched off)';
+  context.getExtension('WEBGL_lose_context')?.loseContext();
+  return '';
 }
 
 function budgetOf(query: URLSearchParams): number {
-  const asked = Number(query.get('budget') ?? BUDGET);
-  return Math.max(20000, Math.min(4e6, Number.isFinite(asked) ? asked : BUDGET));
+  const asked = Number(query.get('budget') ?? 1e6);
+  return Math.max(20000, Math.min(4e6, Number.isFinite(asked) ? asked : 1e6));
 }
