@@ -172,6 +172,9 @@ pub(crate) struct TrainArgs {
     #[command(flatten)]
     #[serde(flatten)]
     pub(crate) plan: PlanOptions,
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub(crate) zones: ZoneOptions,
     /// Backend to train on
     #[arg(long, value_enum, default_value = "auto")]
     pub(crate) backend: Backend,

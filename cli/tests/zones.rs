@@ -49,6 +49,8 @@ fn pixels_of_zones_change_training_and_pruning_reproducibly() {
     assert!(none.is_null() && !zones.is_null() && capture == same && plain != weighed);
     let (_, again, other_threads) = train("again", &["--zones", "boxes.json", "--threads", "1", "--workers", "2"]);
     assert!(again == zones && other_threads == weighed, "the same zones give another model");
+    let (_, again, configured) = train("configured", &["--config", "weighed/config.toml"]);
+    assert!(again == zones && configured == weighed, "the saved configuration leaves the zones out");
     let (_, zones, unweighed) = train("unweighed", &["--zones", "boxes.json", "--zone-weight", "0"]);
     assert!(!zones.is_null() && unweighed == plain, "zones of no weight change the model");
 
@@ -100,6 +102,7 @@ fn boxes_that_do_not_fit_are_refused_in_one_line() {
         &|b| b["images"] = json!([{"id": 0, "file_name": "x.png", "width": 9, "height": 9}]),
         "x.png",
     );
+    change("empty.json", &|b| b["images"][0]["width"] = json!(0), "no pixels");
     change("bbox.json", &|b| b["annotations"][0]["bbox"] = json!([1, 2, 3]), "bbox.json");
     let many = |b: &mut Value| b["annotations"] = vec![b["annotations"][0].clone(); 10_000].into();
     change("many.json", &many, "more than 1000 boxes");
@@ -107,6 +110,8 @@ fn boxes_that_do_not_fit_are_refused_in_one_line() {
     for (name, says) in [("text.json", "text.json"), ("missing.json", "missing.json")] {
         refused(at, &[&TRAIN[..], &["--out", "out", "--zones", name]].concat(), says);
     }
+    // A plan is made before anything is known of the photos: it takes no objects.
+    refused(at, &["plan", "city", "--zones", "text.json"], "--zones");
     refused(at, &[&TRAIN[..], &["--out", "out", "--zone-weight", "3"]].concat(), "--detector");
     refused(at, &[&TRAIN[..], &["--out", "out", "--zones", "good", "--detector", "x.onnx"]].concat(), "--detector");
     fs::write(at.join("text.onnx"), "no network").unwrap();

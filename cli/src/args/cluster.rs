@@ -10,6 +10,7 @@ use scene::BlockId;
 
 use super::plan::PlanOptions;
 use super::values::{Auto, Backend, seconds};
+use super::zones::ZoneOptions;
 
 /// How to reach a coordinator and authenticate to it.
 #[derive(Debug, Clone, Args)]
@@ -170,6 +171,8 @@ pub(crate) struct SubmitArgs {
     pub(crate) connection: Connection,
     #[command(flatten)]
     pub(crate) plan: PlanOptions,
+    #[command(flatten)]
+    pub(crate) zones: ZoneOptions,
     /// Backend of the job
     #[arg(long, value_enum, default_value = "auto")]
     pub(crate) backend: Backend,

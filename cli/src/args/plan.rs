@@ -8,7 +8,6 @@ use scene::Capture;
 use serde::Serialize;
 
 use super::values::{Auto, decibels, metres, metres_or_none, residual, views_per_step, weight};
-use super::zones::ZoneOptions;
 
 /// How the scene is divided.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum, Serialize)]
@@ -92,9 +91,6 @@ pub(crate) struct PlanOptions {
     /// keeps splats from floating where few photos overlap; 0 leaves it out
     #[arg(long, value_name = "W", value_parser = weight, default_value_t = 0.0)]
     pub(crate) depth_weight: f64,
-    #[command(flatten)]
-    #[serde(flatten)]
-    pub(crate) zones: ZoneOptions,
     /// Leave out the capture's lidar: its sweeps give neither target depths nor initial points
     #[arg(long)]
     pub(crate) no_lidar: bool,
@@ -156,7 +152,6 @@ impl PlanOptions {
             refine_poses: self.refine_poses,
             label_blocks: self.label_blocks,
             depth_weight: self.depth_weight,
-            zone_weight: self.zones.weight(),
             evaluate: self.evaluate,
             test_stretches: self.test_stretches,
             ..PlanSettings::default()

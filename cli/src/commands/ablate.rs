@@ -11,7 +11,7 @@ use store::Store;
 use worker::one_block::{Evaluation, OneBlockTraining};
 
 use crate::ablation_variants::{DEFAULT, Variant};
-use crate::args::{AblateArgs, Auto, Blocks, DepthKind, PlanOptions, RESIDUAL, ZoneOptions};
+use crate::args::{AblateArgs, Auto, Blocks, DepthKind, PlanOptions, RESIDUAL};
 use crate::backend;
 use crate::captures::{self, ingest_photos};
 use crate::commands::train::CACHE_BYTES;
@@ -138,7 +138,6 @@ fn plan_options(args: &AblateArgs, seed: u64) -> PlanOptions {
         refine_poses: false,
         label_blocks: false,
         depth_weight: 0.0,
-        zones: ZoneOptions::default(),
         no_lidar: true,
         depths: None,
         depth_kind: DepthKind::Metric,

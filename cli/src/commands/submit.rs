@@ -5,7 +5,7 @@
 
 use std::path::Path;
 
-use blocks::Plan;
+use blocks::{Plan, PlanSettings};
 use coordinator::Results;
 use dataset::ingest::Ingested;
 use model::save_json;
@@ -52,7 +52,7 @@ pub(crate) fn run(args: &SubmitArgs, output: &Output) -> Result<(), Failure> {
     let source = captures::open_to_plan(&args.capture, &args.plan, output)?;
     // Plan and coordinator are checked before any photo is read.
     let (planned_for, plan) = plan_of(&source, &args.plan)?;
-    let zones = zone_source(&args.plan.zones, &planned_for)?;
+    let zones = zone_source(&args.zones, &planned_for)?;
     let mut remote = Remote::open(&args.connection)?;
     let about = remote.call(async |client: &mut Client| client.about(proto::AboutRequest {}).await)?;
     let backend = backend_of(args, &about, output)?;
@@ -64,7 +64,8 @@ pub(crate) fn run(args: &SubmitArgs, output: &Output) -> Result<(), Failure> {
     let store = remote.store(&about)?;
     let Ingested { capture, id, .. } = ingest_photos(&source, &store.blocking(), args.plan.downscale, output)?;
     let zones = zones.map(|from| find_zones(&capture, &from, &store.blocking(), output)).transpose()?;
-    let plan = Plan { capture: id, zones: zones.map(|(_, id)| id), ..plan };
+    let settings = PlanSettings { zone_weight: args.zones.weight(), ..plan.settings };
+    let plan = Plan { capture: id, zones: zones.map(|(_, id)| id), settings, ..plan };
     let plan_id = store.blocking().put(plan.to_frame())?;
     let request = proto::SubmitRequest { plan: plan_id.0.to_vec(), store_url: store.url().into() };
     let job = remote.call(async |client: &mut Client| client.submit(traced(request)).await)?;

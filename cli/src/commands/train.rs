@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
 use bench::CurvePoint;
-use blocks::Plan;
+use blocks::{Plan, PlanSettings};
 use coordinator::{LocalError, Results, run_local};
 use dataset::ingest::Ingested;
 use eval::{ByKind, Group};
@@ -190,7 +190,7 @@ fn prepare(args: &TrainArgs, clock: &Stopwatch, output: &Output) -> Result<Prepa
     let source = captures::open_to_plan(&args.capture, &args.plan, output)?;
     // The plan is checked before any photo is read.
     let (planned_for, plan) = plan_of(&source, &args.plan)?;
-    let zones = zone_source(&args.plan.zones, &planned_for)?;
+    let zones = zone_source(&args.zones, &planned_for)?;
     let backend = backend::open(args.backend)?;
     let plan = Plan { backend: backend.name(), ..plan };
     check_plan(&plan, &planned_for, output)?;
@@ -201,7 +201,8 @@ fn prepare(args: &TrainArgs, clock: &Stopwatch, output: &Output) -> Result<Prepa
 
     let Ingested { capture, id: capture_id, .. } = ingested;
     let zones = zones.map(|from| find_zones(&capture, &from, &store.blocking(), output)).transpose()?;
-    let plan = Plan { capture: capture_id, zones: zones.map(|(_, id)| id), ..plan };
+    let settings = PlanSettings { zone_weight: args.zones.weight(), ..plan.settings };
+    let plan = Plan { capture: capture_id, zones: zones.map(|(_, id)| id), settings, ..plan };
     let (config_text, config_hash) = resolved(args, &plan);
     save(&args.out.join("config.toml"), config_text.as_bytes())?;
     save_json(&args.out.join("plan.json"), &plan)?;
