@@ -12,7 +12,7 @@ use store::BlockingStore;
 
 pub use self::boxes_file::BoxesFile;
 use crate::ingest::IngestError;
-use crate::windows::WindowReader;
+use crate::windows::{WindowError, WindowReader};
 
 /// The zones of a capture.
 pub const ZONES: Kind = Kind(*b"zone", 1);
@@ -81,6 +81,11 @@ fn detected(
     store: &BlockingStore,
     progress: &dyn Fn(usize, usize),
 ) -> Result<Zones, IngestError> {
+    let classes = detector.card().classes.clone();
+    if classes.len() > usize::from(u16::MAX) {
+        let problem = format!("has {} classes, and {} are the most", classes.len(), u16::MAX);
+        return Err(BadInput::new(detector.file(), problem, "map them to fewer in its card").into());
+    }
     let without_points = Capture { views: capture.views.clone(), ..Capture::default() };
     let reader = WindowReader::new(Arc::new(without_points), store.clone(), 0);
     let mut of_views = Vec::with_capacity(capture.views.len());
@@ -94,9 +99,7 @@ fn detected(
             None => {
                 let k = view.camera.pinhole;
                 let photo = reader.window(number, 0, Rect { x: 0, y: 0, width: k.width, height: k.height });
-                let advice = "ingest the capture again";
-                let photo = photo.map_err(|error| BadInput::new(view.name.clone(), error.to_string(), advice))?;
-                let zones = found(detector, &photo)?;
+                let zones = found(detector, &*photo.map_err(|error| unreadable(&view.name, error))?)?;
                 store.put_record(&name, frame::encode(RECORD, &zones, &[]))?;
                 zones
             }
@@ -104,7 +107,14 @@ fn detected(
         of_views.push(zones);
         progress(of_views.len(), capture.views.len());
     }
-    Ok(Zones { classes: detector.card().classes.clone(), of_views })
+    Ok(Zones { classes, of_views })
+}
+
+fn unreadable(view: &str, error: WindowError) -> IngestError {
+    match error {
+        WindowError::Store { error, .. } => error.into(),
+        other => BadInput::new(view, other.to_string(), "ingest the capture again").into(),
+    }
 }
 
 /// What a detector finds on a photo outside its mask, surest first.

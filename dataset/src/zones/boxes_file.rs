@@ -2,7 +2,7 @@
 //! `file_name`, `width`, `height`), `annotations` (`image_id`, `category_id`, `bbox`: left, top, width, height in pixels,
 //! and `score` where a detector wrote them) and `categories` (`id`, `name`).
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
 use std::io::Read;
 use std::path::Path;
@@ -82,10 +82,10 @@ impl BoxesFile {
     pub fn zones(&self, capture: &Capture) -> Result<Zones, BadInput> {
         let bad = |problem: String| BadInput::new(self.file.clone(), problem, ADVICE);
         let views = &capture.views;
-        let mut by_name: BTreeMap<&str, usize> = BTreeMap::new();
-        for (view, number) in views.iter().zip(0..) {
-            by_name.insert(&view.name, number);
+        if let Some(empty) = self.boxes.images.iter().find(|image| image.width == 0 || image.height == 0) {
+            return Err(bad(format!("gives {:?} no pixels", empty.file_name)));
         }
+        let by_name: BTreeMap<&str, usize> = views.iter().map(|view| view.name.as_str()).zip(0..).collect();
         let of_image = |image: &Image| by_name.get(image.file_name.trim_start_matches("./")).copied();
         let images: BTreeMap<i64, (&Image, usize)> =
             self.boxes.images.iter().filter_map(|image| Some((image.id, (image, of_image(image)?)))).collect();
@@ -99,7 +99,7 @@ impl BoxesFile {
         if known.len() > usize::from(u16::MAX) {
             return Err(bad(format!("has {} categories, and {} are the most", known.len(), u16::MAX)));
         }
-        let all: std::collections::BTreeSet<i64> = self.boxes.images.iter().map(|image| image.id).collect();
+        let all: BTreeSet<i64> = self.boxes.images.iter().map(|image| image.id).collect();
         let mut of_views = vec![Vec::new(); views.len()];
         for Annotation { image_id, category_id, bbox: [left, top, width, height], score } in &self.boxes.annotations {
             let Some(&(image, view)) = images.get(image_id) else {

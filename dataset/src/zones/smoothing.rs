@@ -1,7 +1,7 @@
 //! Smooths zones over three photos of a sequence (SDG, section 3.2: a moving average over three frames against jitter).
 
 use perceive::iou;
-use scene::Zone;
+use scene::{Zone, Zones};
 
 /// Least overlap of the zones of one object on photos that follow each other.
 const SAME: f32 = 0.5;
@@ -23,7 +23,7 @@ pub(super) fn smoothed(of_views: &[Vec<Zone>], follows: impl Fn(usize) -> bool) 
             for a in before {
                 let Some(b) = same(a, after) else { continue };
                 let between = Zone { corners: mean(&[a.corners, b.corners]), score: a.score.min(b.score), ..*a };
-                if same(&between, &zones).is_none() {
+                if same(&between, &zones).is_none() && zones.len() < Zones::MAX {
                     zones.push(between);
                 }
             }
