@@ -6,7 +6,6 @@
 //! the model had them, as far as the file says where that is.
 
 mod folder;
-mod gathered;
 mod imported;
 mod rad;
 mod sog;

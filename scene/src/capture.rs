@@ -196,22 +196,27 @@ impl Capture {
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use super::*;
     use crate::camera::{Pinhole, Rigid};
 
+    /// A view of this many pixels.
+    pub(crate) fn view(width: u32, height: u32) -> View {
+        let (cx, cy) = (0.5 * f64::from(width), 0.5 * f64::from(height));
+        let camera =
+            Camera { pinhole: Pinhole { width, height, fx: 5.0, fy: 5.0, cx, cy }, camera_from_world: Rigid::IDENTITY };
+        View { name: "a.png".into(), camera, mips: Vec::new(), masked: false, depth: None }
+    }
+
     #[test]
     fn invalid_captures_are_refused() {
-        let pinhole = Pinhole { width: 4, height: 3, fx: 5.0, fy: 5.0, cx: 2.0, cy: 1.5 };
-        let camera = Camera { pinhole, camera_from_world: Rigid::IDENTITY };
-        let view = View { name: "a.png".into(), camera, mips: Vec::new(), masked: false, depth: None };
         let points = SparsePoints {
             positions: vec![DVec3::ZERO, DVec3::ONE],
             colours: vec![[1, 2, 3]; 2],
             track_start: vec![0, 1, 1],
             seen_by: vec![0],
         };
-        let good = Capture { views: vec![view], points, geo_origin: None };
+        let good = Capture { views: vec![view(4, 3)], points, geo_origin: None };
         assert_eq!([good.check(), Capture::default().check()], [Ok(()), Ok(())]);
         let changes: [fn(&mut Capture); 12] = [
             |c| c.views[0].camera.pinhole.width = 0,

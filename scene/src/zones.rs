@@ -75,13 +75,11 @@ impl Zones {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::camera::{Camera, Pinhole, Rigid};
+    use crate::capture::tests::view;
 
     #[test]
     fn zones_lie_inside_their_photos() {
-        let pinhole = Pinhole { width: 40, height: 30, fx: 5.0, fy: 5.0, cx: 20.0, cy: 15.0 };
-        let camera = Camera { pinhole, camera_from_world: Rigid::IDENTITY };
-        let views = [View { name: "a.png".into(), camera, mips: Vec::new(), masked: false, depth: None }];
+        let views = [view(40, 30)];
         let zones = |corners, class, score| Zones {
             classes: vec!["car".into()],
             of_views: vec![vec![Zone { corners, class, score }]],

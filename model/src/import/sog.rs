@@ -2,15 +2,14 @@
 //!
 //! Source: as of [`scene::sog`] and of [`crate::write_streamed_sog`].
 
-use std::collections::BTreeMap;
-use std::path::Path;
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
 
 use scene::{BadInput, CodecError, GeoOrigin, Splats, sog};
 use serde::Deserialize;
 
 use super::folder::{Folder, unreadable};
-use super::gathered::Gathered;
-use super::imported::Imported;
+use super::imported::{Gathered, Imported};
 use crate::files::load;
 
 /// Name of the file with the tree.
@@ -52,15 +51,28 @@ struct Run {
 
 /// Reads a `.sog` or a `meta.json`.
 pub(super) fn read(path: &Path) -> Result<(Splats, bool), BadInput> {
+    let (splats, antialiased, _) = read_new(path, &mut BTreeSet::new())?;
+    Ok((splats, antialiased))
+}
+
+/// As [`read`], with the number of bytes that were read, less those of pictures that are known.
+fn read_new(path: &Path, known: &mut BTreeSet<PathBuf>) -> Result<(Splats, bool, usize), BadInput> {
     let bytes = load(path)?;
+    let mut length = bytes.len();
     let read = match bytes.starts_with(b"PK") {
         true => sog::read_bundle(&bytes),
         false => {
             let folder = Folder::of(path);
-            sog::read(&bytes, |name| folder.bytes(name))
+            sog::read(&bytes, |name| {
+                let picture = folder.bytes(name)?;
+                let is_new = folder.path(name)?.canonicalize().is_ok_and(|real| known.insert(real));
+                length += if is_new { picture.len() } else { 0 };
+                Ok(picture)
+            })
         }
     };
-    read.map_err(|error| unreadable(path, &error))
+    let (splats, antialiased) = read.map_err(|error| unreadable(path, &error))?;
+    Ok((splats, antialiased, length))
 }
 
 /// Reads the finest level of every leaf and the environment.
@@ -78,26 +90,29 @@ pub(super) fn read_streamed(path: &Path) -> Result<Imported, BadInput> {
         let file = meta.filenames.get(pair[0].file).map_or("", String::as_str);
         return Err(wrong(format!("has two leaves with the same splats of {file:?}")));
     }
-    let (mut folder, mut all) = (Folder::of(path), Gathered::new());
-    let mut load = |name: &str| read(&folder.take(name).map_err(|error| wrong(error.to_string()))?);
+    let (mut folder, mut known, mut all) = (Folder::of(path), BTreeSet::new(), Gathered::new());
+    let mut load = |name: &str| read_new(&folder.take(name).map_err(|error| wrong(error.to_string()))?, &mut known);
+    let mut add = |splats: &Splats, antialiased: bool, length: usize| {
+        all.allow(length);
+        all.add(splats, antialiased).map_err(|error| wrong(error.to_string()))
+    };
     for of_file in runs.chunk_by(|a, b| a.file == b.file) {
         let index = of_file[0].file;
         let name = meta.filenames.get(index).ok_or_else(|| wrong(format!("has no name for file {index}")))?;
-        let (splats, antialiased) = load(name)?;
+        let (splats, antialiased, length) = load(name)?;
         let mut rows = Vec::new();
         for run in of_file {
             let end = run.offset.checked_add(run.count).filter(|&end| end <= splats.len());
             let end = end.ok_or_else(|| wrong(format!("has a leaf beyond the {} splats of {name:?}", splats.len())))?;
             rows.extend(run.offset as u32..end as u32);
         }
-        all.add(&splats.select(&rows), antialiased);
+        add(&splats.select(&rows), antialiased, length)?;
     }
     if let Some(name) = &meta.environment {
-        let (splats, antialiased) = load(name)?;
-        all.add(&splats, antialiased);
+        let (splats, antialiased, length) = load(name)?;
+        add(&splats, antialiased, length)?;
     }
-    let (splats, antialiased) = all.finish();
-    Ok(Imported { splats, antialiased, geo_origin: meta.asset.geo_origin })
+    Ok(all.finish(meta.asset.geo_origin))
 }
 
 /// The finest run of every leaf.

@@ -142,6 +142,26 @@ fn the_finest_level_of_every_leaf_is_read() {
 }
 
 #[test]
+fn small_files_of_a_streamed_sog_are_limited_together() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    let mut flat = Splats::new(0);
+    (0..310_000).for_each(|_| flat.push(&Splat::round(Vec3::ZERO, 0.0, Vec3::ONE, 0.5)));
+    sog::write(&flat, false).unwrap().iter().for_each(|file| fs::write(at(&file.name), &file.bytes).unwrap());
+    // The same pictures by another name.
+    fs::copy(at("meta.json"), at("again.json")).unwrap();
+    let read = |environment: &str| {
+        let run = r#"{"lods": {"0": {"file": 0, "offset": 0, "count": 310000}}}"#;
+        let tree = format!(r#"{{"filenames": ["meta.json"], "environment": {environment}, "tree": {run}}}"#);
+        fs::write(at("lod-meta.json"), tree).unwrap();
+        crate::read(folder.path()).map(|model| model.splats.len()).map_err(|error| error.to_string())
+    };
+    assert_eq!(read("null"), Ok(310_000));
+    let problem = read("\"again.json\"").unwrap_err();
+    assert!(problem.contains("lod-meta.json: has files that are too short for the 620000 splats"), "{problem}");
+}
+
+#[test]
 fn files_that_are_no_model_are_named() {
     let folder = tempfile::tempdir().unwrap();
     for (name, bytes, wanted) in [

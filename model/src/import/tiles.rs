@@ -10,8 +10,7 @@ use serde::Deserialize;
 use serde::de::IgnoredAny;
 
 use super::folder::{Folder, unreadable};
-use super::gathered::Gathered;
-use super::imported::Imported;
+use super::imported::{Gathered, Imported};
 use crate::files::load;
 
 /// Name of the file with the tiles.
@@ -103,6 +102,19 @@ fn geo_origin(ecef_from_local: DMat4) -> Option<GeoOrigin> {
     GeoOrigin::at_ecef(ecef_from_local.w_axis.truncate())
 }
 
+/// The name that a URI stands for: `%20` is a space.
+fn file_name(uri: &str) -> Result<String, CodecError> {
+    let wrong = || CodecError::new(format!("names {uri:?}, in which a % stands for no character"));
+    let mut parts = uri.split('%');
+    let mut bytes = parts.next().unwrap_or_default().as_bytes().to_vec();
+    for part in parts {
+        let code = part.get(..2).filter(|code| code.bytes().all(|digit| digit.is_ascii_hexdigit()));
+        bytes.push(code.and_then(|code| u8::from_str_radix(code, 16).ok()).ok_or_else(wrong)?);
+        bytes.extend(&part.as_bytes()[2..]);
+    }
+    String::from_utf8(bytes).map_err(|_| wrong())
+}
+
 /// Reads a `tileset.json`, one tile at a time. What lies on Earth comes in metres east, north and up of a place there.
 pub(super) fn read(path: &Path) -> Result<Imported, BadInput> {
     let wrong = |problem: String| unreadable(path, &CodecError::new(problem));
@@ -128,9 +140,16 @@ pub(super) fn read(path: &Path) -> Result<Imported, BadInput> {
     let (mut folder, mut all) = (Folder::of(path), Gathered::new());
     let mut world_from_tiles = None;
     for (uri, place) in finest.files {
-        let file = folder.take(uri).map_err(|error| wrong(error.to_string()))?;
+        let file = file_name(uri).and_then(|name| folder.take(&name)).map_err(|error| wrong(error.to_string()))?;
         let bad = |error: CodecError| unreadable(&file, &error);
-        for mut part in splat_glb::read(&load(&file)?).map_err(bad)? {
+        let bytes = load(&file)?;
+        if bytes.starts_with(b"{") {
+            return Err(bad(CodecError::new("is JSON; tilesets as content and .gltf are not read, .glb is")));
+        }
+        let parts = splat_glb::read(&bytes).map_err(bad)?;
+        all.allow(bytes.len());
+        drop(bytes);
+        for mut part in parts {
             let place = place * Z_UP * part.place;
             let world_from_tiles = *world_from_tiles.get_or_insert_with(|| {
                 finest.geo_origin = finest.geo_origin.or_else(|| geo_origin(place));
@@ -144,11 +163,10 @@ pub(super) fn read(path: &Path) -> Result<Imported, BadInput> {
             if let Some(row) = (0..part.splats.len()).find(|&row| !part.splats.is_finite(row)) {
                 return Err(bad(CodecError::new(format!("splat {row} is placed beyond what numbers can hold"))));
             }
-            all.add(&part.splats, part.antialiased);
+            all.add(&part.splats, part.antialiased).map_err(|error| wrong(error.to_string()))?;
         }
     }
-    let (splats, antialiased) = all.finish();
-    Ok(Imported { splats, antialiased, geo_origin: finest.geo_origin })
+    Ok(all.finish(finest.geo_origin))
 }
 
 #[cfg(test)]

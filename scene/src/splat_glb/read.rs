@@ -16,6 +16,8 @@ pub(super) const MAX_JSON: usize = 1 << 20;
 const BYTE: u32 = 5120;
 const SHORT: u32 = 5122;
 const UNSIGNED_SHORT: u32 = 5123;
+/// A primitive takes at most as much memory as this many splats, besides its own: the columns themselves.
+const PRIMITIVE_ROWS: u64 = 16;
 /// The mode of primitives of splats: points.
 const POINTS: u32 = 0;
 const KERNEL: &str = "ellipse";
@@ -338,7 +340,7 @@ impl Reader<'_> {
     /// Refuses more splats than a file of this length can hold.
     fn take(&mut self, count: usize, sh_degree: u8) -> Result<(), CodecError> {
         let columns = column::SH + 3 * sh_coefficients(sh_degree);
-        let needed = (count as u64).saturating_mul(4 * columns as u64);
+        let needed = (count as u64).saturating_add(PRIMITIVE_ROWS).saturating_mul(4 * columns as u64);
         let refused = || CodecError::new(format!("a file of this length cannot hold {count} splats and its others"));
         self.memory = self.memory.checked_sub(needed).ok_or_else(refused)?;
         Ok(())

@@ -188,4 +188,12 @@ fn a_mesh_shown_again_and_again_is_refused() {
     document["scenes"][0]["nodes"] = (0..1000).collect();
     let problem = read(&file(&document, binary)).unwrap_err().0;
     assert!(problem.contains("cannot hold 4000 splats"), "{problem}");
+
+    // Nor one of no splats.
+    let empty = spz::write(&Splats::new(3), false, Version::V3).unwrap();
+    document["bufferViews"][0]["byteLength"] = json!(empty.len());
+    let primitive = document["meshes"][0]["primitives"][0].clone();
+    document["meshes"][0]["primitives"] = json!(vec![primitive; 20]);
+    let problem = read(&file(&document, &empty)).unwrap_err().0;
+    assert!(problem.contains("cannot hold 0 splats"), "{problem}");
 }

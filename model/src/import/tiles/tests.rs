@@ -117,11 +117,11 @@ fn the_finest_tiles_are_chosen_by_refinement() {
     let exported = Exported::new();
     let glb = exported.tileset()["root"]["children"][0]["content"]["uri"].as_str().unwrap().to_owned();
     let at = |name: &str| exported.0.path().join("tiles").join(name);
-    for name in ["b.glb", "c.glb"] {
+    for name in ["b.glb", "c d.glb"] {
         fs::copy(at(&glb), at(name)).unwrap();
     }
     let of = |uri: &str| json!({ "uri": uri });
-    let leaves = || vec![tile(json!({ "contents": [of("b.glb"), of("./c.glb")] }))];
+    let leaves = || vec![tile(json!({ "contents": [of("b.glb"), of("./c%20%64.glb")] }))];
     let read = |root: Value| {
         exported.read(&json!({ "asset": { "version": "1.1" }, "root": root })).map(|model| model.splats.len())
     };
@@ -132,6 +132,24 @@ fn the_finest_tiles_are_chosen_by_refinement() {
     let mut middle = tile(json!({ "content": of(&glb), "children": leaves() }));
     middle.as_object_mut().unwrap().remove("refine");
     assert_eq!(read(tile(json!({ "refine": "ADD", "children": [middle] }))), Ok(180));
+}
+
+#[test]
+fn many_small_files_are_limited_together() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut flat = Splats::new(3);
+    (0..80_000).for_each(|_| flat.push(&Splat::round(Vec3::ZERO, 0.0, Vec3::ONE, 0.5)));
+    let bytes = splat_glb::write(&flat, false, DMat4::IDENTITY).unwrap();
+    let read = |names: &[&str]| {
+        names.iter().for_each(|name| fs::write(folder.path().join(name), &bytes).unwrap());
+        let contents: Vec<Value> = names.iter().map(|name| json!({ "uri": name })).collect();
+        let tileset = json!({ "asset": { "version": "1.1" }, "root": tile(json!({ "contents": contents })) });
+        fs::write(folder.path().join(TILESET), tileset.to_string()).unwrap();
+        crate::read(folder.path()).map(|model| model.splats.len()).map_err(|error| error.to_string())
+    };
+    assert_eq!(read(&["a.glb"]), Ok(80_000));
+    let problem = read(&["a.glb", "b.glb"]).unwrap_err();
+    assert!(problem.contains("tileset.json: has files that are too short for the 160000 splats"), "{problem}");
 }
 
 #[test]
@@ -159,7 +177,14 @@ fn tilesets_that_cannot_be_read_are_named() {
         ("", "leads out of the folder"),
         ("none.glb", "cannot be read"),
         ("cut.glb", "cut.glb: glTF without JSON"),
-        ("other.json", "other.json: not binary glTF"),
+        ("%2e%2E/a.glb", "leads out of the folder"),
+        ("https%3A//example.com/a.glb", "leads out of the folder"),
+        ("a%2", "\"a%2\", in which a %"),
+        ("a%+1.glb", "stands for no character"),
+        ("%ff.glb", "stands for no character"),
+        ("%é.glb", "stands for no character"),
+        ("a%00.glb", "cannot be read"),
+        ("other.json", "other.json: is JSON; tilesets"),
         ("a.ply", "a.ply: not binary glTF"),
     ] {
         refused(&with("content", json!({ "uri": uri })), wanted);
