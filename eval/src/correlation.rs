@@ -14,13 +14,18 @@ pub struct Correlation {
 
 /// The correlation of pairs; `None` of fewer than three, or where all are equal on a side.
 pub(crate) fn correlation(pairs: &[(f64, f64)]) -> Option<Correlation> {
+    // Compared, for the mean of equal numbers can be another number.
+    let varies = |side: fn(&(f64, f64)) -> f64| pairs.iter().any(|of| side(of) != side(&pairs[0]));
+    if pairs.len() < 3 || !varies(|of| of.0) || !varies(|of| of.1) {
+        return None;
+    }
     let count = pairs.len() as f64;
     let mean = |side: fn(&(f64, f64)) -> f64| pairs.iter().map(side).sum::<f64>() / count;
     let (x, y) = (mean(|of| of.0), mean(|of| of.1));
     let moment = |of: &dyn Fn(f64, f64) -> f64| pairs.iter().map(|(a, b)| of(a - x, b - y)).sum::<f64>();
     let (xx, yy, xy) = (moment(&|a, _| a * a), moment(&|_, b| b * b), moment(&|a, b| a * b));
     let r = (xy / (xx.sqrt() * yy.sqrt())).clamp(-1.0, 1.0);
-    (pairs.len() > 2 && r.is_finite()).then(|| Correlation { r, p: chance(r, pairs.len() - 2) })
+    r.is_finite().then(|| Correlation { r, p: chance(r, pairs.len() - 2) })
 }
 
 /// The two-sided p value of a coefficient: 1 - A(t | ν) with t = r √(ν / (1 - r²)), in finite sums over the angle
@@ -69,6 +74,9 @@ mod tests {
         assert_eq!(correlation(&[]), None);
         assert_eq!(correlation(&[(1.0, 2.0), (2.0, 3.0)]), None);
         assert_eq!(correlation(&[(1.0, 2.0), (1.0, 3.0), (1.0, 4.0)]), None);
+        for count in 3..40 {
+            assert_eq!(correlation(&vec![(0.1, 0.7); count]), None, "{count}");
+        }
         let line = correlation(&[(1.0, 4.0), (2.0, 3.0), (3.0, 2.0)]).unwrap();
         assert!((line.r + 1.0).abs() < 1e-12 && line.p < 1e-7, "{line:?}");
     }

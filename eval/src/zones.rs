@@ -1,7 +1,7 @@
 //! Figures of the parts of a picture where a detector finds something on the photo (the object zones of the
 //! perception-aware paper, section 6).
 
-use perceive::Detection;
+use perceive::{Detection, box_pixels};
 use serde::Serialize;
 use train::metrics;
 
@@ -23,7 +23,7 @@ impl ZoneFigures {
         let Comparison { width, height, mask, .. } = *compared;
         let mut inside = vec![0u8; width * height];
         for zone in zones {
-            let (columns, rows) = pixels(zone.corners, width, height);
+            let (columns, rows) = box_pixels(zone.corners, width, height);
             rows.for_each(|y| inside[y * width..][columns.clone()].fill(255));
         }
         if let Some(mask) = mask {
@@ -39,19 +39,6 @@ impl ZoneFigures {
             zone_ssim: Some(sum / count as f64),
         }
     }
-}
-
-/// Columns and rows of the pixels whose centres a box contains.
-pub(crate) fn pixels(
-    [left, top, right, bottom]: [f32; 4],
-    width: usize,
-    height: usize,
-) -> (std::ops::Range<usize>, std::ops::Range<usize>) {
-    let range = |from: f32, to: f32, side: usize| {
-        let end = ((to + 0.5).max(0.0) as usize).min(side);
-        ((from - 0.5).ceil().max(0.0) as usize).min(end)..end
-    };
-    (range(left, right, width), range(top, bottom, height))
 }
 
 #[cfg(test)]
@@ -89,15 +76,5 @@ mod tests {
         for nothing in [&[][..], &[zone([9.0, 0.0, 16.0, 12.0])], &[zone([2.1, 2.1, 2.2, 2.2])]] {
             assert_eq!(figures(nothing), ZoneFigures::default());
         }
-    }
-
-    #[test]
-    fn a_box_has_the_pixels_whose_centres_it_contains() {
-        let of = |corners| pixels(corners, 10, 8);
-        assert_eq!(of([0.0, 0.0, 10.0, 8.0]), (0..10, 0..8));
-        assert_eq!(of([1.4, 0.6, 2.6, 2.4]), (1..3, 1..2));
-        assert_eq!(of([-5.0, -5.0, -1.0, 20.0]), (0..0, 0..8));
-        assert_eq!(of([12.0, 3.0, 15.0, 2.0]), (10..10, 2..2));
-        assert_eq!(of([f32::NAN; 4]).0.len(), 0);
     }
 }

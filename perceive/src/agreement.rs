@@ -31,7 +31,7 @@ pub struct Counts {
 /// Detections on photos and renders by groups of classes. The field names are keys of `eval/report.json`.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
 pub struct Agreement {
-    /// Cars, buses and trucks.
+    /// Cars, buses, trucks, and what a card maps to `vehicle`.
     pub vehicles: Counts,
     /// People.
     pub people: Counts,
@@ -151,6 +151,8 @@ mod tests {
         assert_eq!(compared(&[at(PERSON, 0.9, 0.0)], &[at(BENCH, 0.9, 0.0)]).all, counts(1, 1, 0));
         assert_eq!(compared(&photo, &photo).all, counts(3, 3, 3));
         assert_eq!(compared(&[], &[]), Agreement::default());
+        let of_a_card = ["car", "vehicle"].map(str::to_owned);
+        assert_eq!(agreement(&[at(0, 0.9, 0.0)], &[at(1, 0.9, 0.0)], &of_a_card).vehicles, counts(1, 1, 1));
         // The truck overlaps the car by 8 of 12, the bench is where it was, the person is lost.
         assert!((found.mean_overlap().unwrap() - (2.0 / 3.0 + 1.0) / 3.0).abs() < 1e-6);
         assert_eq!(compared(&[], &render).mean_overlap(), None);

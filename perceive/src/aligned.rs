@@ -22,7 +22,7 @@ mod tests;
 
 use scene::BadInput;
 
-use crate::boxes::iou;
+use crate::boxes::{MAX_BOXES, iou};
 use crate::card::Card;
 use crate::gradient::{Activations, Network};
 use crate::network::Shapes;
@@ -218,6 +218,7 @@ fn objects(anchors: &Anchors, output: &[f32], card: &Card) -> Vec<Object> {
     };
     let mut all: Vec<Found> = (0..anchors.count()).filter_map(found).collect();
     all.sort_by(|a, b| b.score.total_cmp(&a.score));
+    all.truncate(MAX_BOXES);
     let corners = |of: &Found| of.anchor.corners.map(|corner| corner as f32);
     let mut groups: Vec<Vec<Found>> = Vec::new();
     for next in all {

@@ -26,7 +26,7 @@ pub(crate) fn overlap(a: [f32; 4], b: [f32; 4]) -> f64 {
 }
 
 /// Most boxes that are compared with each other; of more, those with the highest scores.
-const MAX_BOXES: usize = 3000;
+pub(crate) const MAX_BOXES: usize = 3000;
 
 /// Non-maximum suppression by class: in order of their scores, boxes that overlap an earlier one of their class by more
 /// than `limit` are dropped. Equal scores keep their order.

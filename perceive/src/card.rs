@@ -1,7 +1,7 @@
 //! Model cards: how pictures go into a detector and what its numbers mean. ONNX does not say it.
 //!
 //! A network with the shapes of a known head has a card built in. A TOML file of the network's name beside it changes
-//! the card; [`Written`] has its keys.
+//! the card; [`Written`] has its keys. One that would change nothing is refused.
 
 use std::collections::BTreeMap;
 use std::fmt::Write;
@@ -10,6 +10,7 @@ use serde::Deserialize;
 
 use crate::coco;
 use crate::network::Shapes;
+use crate::placed::fitted;
 
 /// The largest side of a network's input, pixels.
 const MAX_SIDE: usize = 4096;
@@ -137,6 +138,11 @@ impl Head {
         }
     }
 
+    /// Whether the output has a plane for each number of an anchor; else a row for each anchor.
+    pub(crate) fn is_in_planes(self) -> bool {
+        matches!(self, Self::Yolov8 | Self::Fastestdet)
+    }
+
     /// How many numbers an anchor has; `classes` is the number of classes.
     pub(crate) fn numbers(self, classes: usize, bins: usize) -> usize {
         match self {
@@ -176,6 +182,7 @@ impl Card {
             card.check(&written.map).map_err(|problem| bad(&problem))?;
             if let Some(input) = card.input_of(shapes) {
                 card.input = input;
+                card.check_use(&written).map_err(|problem| bad(&problem))?;
                 return Ok(card);
             }
             let (classes, name) = (card.outputs.len(), head.name());
@@ -236,6 +243,26 @@ impl Card {
         self.strides.iter().map(|&stride| (stride, self.input.map(|side| side.div_ceil(stride))))
     }
 
+    /// The cells of all anchors in their order, grids from the first on, each by rows: side in pixels of the input,
+    /// column and row.
+    pub(crate) fn cells(&self) -> impl Iterator<Item = [usize; 3]> {
+        self.grids()
+            .flat_map(|(stride, [columns, rows])| (0..columns * rows).map(move |i| [stride, i % columns, i / columns]))
+    }
+
+    /// Size in pixels of the input of a picture of this size, and its upper left corner.
+    pub(crate) fn area(&self, size: [usize; 2]) -> ([usize; 2], [usize; 2]) {
+        let filled = if self.resize == Resize::Stretch { self.input } else { fitted(self.input, size) };
+        let corner =
+            |axis: usize| if self.resize == Resize::Centre { (self.input[axis] - filled[axis]) / 2 } else { 0 };
+        (filled, [0, 1].map(corner))
+    }
+
+    /// Which of a picture's planes, red first, a plane of the input is.
+    pub(crate) fn plane(&self, of_input: usize) -> usize {
+        if self.channels == Channels::Bgr { 2 - of_input } else { of_input }
+    }
+
     fn check(&self, map: &BTreeMap<String, String>) -> Result<(), String> {
         if let Some(key) = map.keys().find(|key| !self.outputs.contains(key)) {
             return Err(format!("it maps {key}, which is none of its classes"));
@@ -250,6 +277,19 @@ impl Card {
             ((1..=MAX_BINS).contains(&self.bins), "bins are not in 1..256"),
         ];
         rules.into_iter().find(|(holds, _)| !holds).map_or(Ok(()), |(_, problem)| Err(problem.to_owned()))
+    }
+
+    /// Refuses keys that this card does not use.
+    fn check_use(&self, written: &Written) -> Result<(), String> {
+        for (key, is_written) in [("bins", written.bins.is_some()), ("anchor", written.anchor.is_some())] {
+            if is_written && self.head != Head::Nanodet {
+                return Err(format!("{key} changes nothing for {}: remove it", self.head.name()));
+            }
+        }
+        if written.pad.is_some() && self.resize == Resize::Stretch {
+            return Err("pad changes nothing where resize is stretch: remove it".to_owned());
+        }
+        Ok(())
     }
 
     /// Width and height of the input, if the shapes are those of this card.
@@ -351,6 +391,29 @@ mod tests {
             let error = Card::of(&two, Some(bad)).unwrap_err();
             assert!(!error.contains('\n') && error.contains(part), "{error}");
         }
+    }
+
+    #[test]
+    fn keys_that_change_nothing_are_refused() {
+        let yolox = shapes(&[1, 3, 416, 416], &[1, 3549, 85]);
+        let fastestdet = shapes(&[1, 3, 352, 352], &[1, 85, 22, 22]);
+        let nanodet = shapes(&[1, 3, 416, 416], &[1, 3598, 112]);
+        for (shapes, idle, part) in [
+            (&yolox, "bins = 8", "bins changes nothing for yolox: remove it"),
+            (&yolox, "head = 'yolox'\nanchor = 0.5", "anchor changes nothing for yolox: remove it"),
+            (&fastestdet, "bins = 16", "bins changes nothing for fastestdet"),
+            (&fastestdet, "pad = 0", "pad changes nothing where resize is stretch"),
+            (&yolox, "resize = 'stretch'\npad = 0", "pad changes nothing"),
+            (&nanodet, "pad = 114", "pad changes nothing"),
+        ] {
+            let error = Card::of(shapes, Some(idle)).unwrap_err();
+            assert!(!error.contains('\n') && error.contains(part), "{error}");
+        }
+        // The same keys where they are used; for another number of bins the head is told by its shape.
+        let card = Card::of(&nanodet, Some("bins = 8\nanchor = 0.5\nresize = 'centre'\npad = 0")).unwrap();
+        assert_eq!((card.bins, card.anchor, card.pad), (8, 0.5, 0));
+        let wide = Card::of(&shapes(&[1, 3, 416, 416], &[1, 3598, 144]), Some("bins = 16")).unwrap();
+        assert_eq!((wide.head, wide.bins), (Head::Nanodet, 16));
     }
 
     #[test]

@@ -70,7 +70,14 @@ impl Detector {
         let run = || {
             let input = Value::from_shape(&[1, 3, height, width], input).map_err(|error| error.to_string())?;
             let output = self.model.run_one(input.into(), None).map_err(|error| error.to_string())?;
-            Ok(output.into_tensor::<f32>().ok_or("its output is not made of floats")?.into_data())
+            let output = output.into_tensor::<f32>().ok_or("its output is not made of floats")?.into_data();
+            let anchors: usize = self.card.grids().map(|(_, [columns, rows])| columns * rows).sum();
+            let count = anchors * self.card.head.numbers(self.card.outputs.len(), self.card.bins);
+            // A file can declare another shape than its operators give.
+            if output.len() != count {
+                return Err(format!("its output has {} numbers, not the {count} that it declares", output.len()));
+            }
+            Ok(output)
         };
         without_panic(run).map_err(|error| format!("cannot be run on a picture ({error})"))
     }
@@ -78,10 +85,9 @@ impl Detector {
 
 #[cfg(test)]
 mod tests {
-    use std::path::{Path, PathBuf};
-
     use super::expected::EXPECTED;
     use super::*;
+    use crate::testing::{self, shared};
 
     /// What a network gives for a picture.
     pub(super) struct Expected {
@@ -104,15 +110,6 @@ mod tests {
     const YOLOX: &str = "detectors/yolox_nano_416.onnx";
     const TINY: &str = "classes = ['a', 'b', 'c']";
 
-    fn shared(name: &str) -> Option<PathBuf> {
-        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/data").join(name);
-        let is_there = path.exists();
-        if !is_there {
-            println!("skipped: ../shared/data not present");
-        }
-        is_there.then_some(path)
-    }
-
     /// A network with its card.
     fn network(name: &str) -> Option<(Vec<u8>, Option<&'static str>)> {
         let bytes: &[u8] = match name {
@@ -130,7 +127,7 @@ mod tests {
             let of_row = |y: usize| columns.clone().flat_map(move |x| (0..3).map(move |c| value(y, x, c)));
             return Some(((0..70).flat_map(of_row).collect(), 70));
         };
-        let image = image::open(shared(&format!("images_street/kitti_object/image_2/{photo}"))?).unwrap().to_rgb8();
+        let image = testing::photo(photo)?;
         let of_row = |row: &[u8]| row[3 * columns.start..3 * columns.end].to_vec();
         Some((image.chunks_exact(3 * image.width() as usize).flat_map(of_row).collect(), image.height() as usize))
     }
@@ -186,6 +183,15 @@ mod tests {
         // The smallest and a thin picture.
         assert!(detector.detect(&Picture { rgb: &[9; 3], width: 1, height: 1 }, 0.3).unwrap().is_empty());
         assert!(detector.detect(&Picture { rgb: &[9; 3000], width: 1000, height: 1 }, 0.3).is_ok());
+    }
+
+    #[test]
+    fn an_output_of_another_size_than_declared_is_refused() {
+        let (bytes, card) = network("yolov8_tiny.onnx").unwrap();
+        let mut detector = Detector::load("net.onnx", bytes, card).unwrap();
+        detector.card.strides.pop();
+        let error = detector.detect(&Picture { rgb: &[9; 3], width: 1, height: 1 }, 0.3).unwrap_err().to_string();
+        assert!(error.starts_with("net.onnx") && error.contains("its output has 882 numbers, not the 840"), "{error}");
     }
 
     #[test]

@@ -38,16 +38,19 @@ type Found = (usize, f32, [f32; 4]);
 /// the finest on, each by rows. Boxes that are not finite or empty are left out.
 pub(crate) fn decode(output: &[f32], card: &Card, placed: &Placed, threshold: f32) -> Vec<Detection> {
     let size = card.head.numbers(card.outputs.len(), card.bins);
-    let cells: Vec<Cell> = card.grids().flat_map(|(stride, grid)| cells(stride, grid)).collect();
+    let cell = |cell: [usize; 3]| {
+        let [stride, column, row] = cell.map(|number| number as f32);
+        Cell { stride, column, row }
+    };
+    let cells: Vec<Cell> = card.cells().map(cell).collect();
     let head: fn(&Numbers, Cell, &Card) -> Found = match card.head {
         Head::Yolox => yolox,
         Head::Yolov8 => yolov8,
         Head::Fastestdet => fastestdet,
         Head::Nanodet => nanodet,
     };
-    let in_planes = matches!(card.head, Head::Yolov8 | Head::Fastestdet);
     let detection = |(i, cell): (usize, &Cell)| {
-        let (first, step) = if in_planes { (i, cells.len()) } else { (i * size, 1) };
+        let (first, step) = if card.head.is_in_planes() { (i, cells.len()) } else { (i * size, 1) };
         let (class, score, corners) = head(&Numbers { output, first, step }, *cell, card);
         if !(score >= threshold && score.is_finite() && corners.iter().all(|corner| corner.is_finite())) {
             return None;
@@ -57,15 +60,6 @@ pub(crate) fn decode(output: &[f32], card: &Card, placed: &Placed, threshold: f3
         is_there.then_some(Detection { class: card.class_of[class], score, corners })
     };
     cells.iter().enumerate().filter_map(detection).collect()
-}
-
-fn cells(stride: usize, [columns, rows]: [usize; 2]) -> impl Iterator<Item = Cell> {
-    let cell = move |i: usize| Cell {
-        stride: stride as f32,
-        column: (i % columns.max(1)) as f32,
-        row: (i / columns.max(1)) as f32,
-    };
-    (0..columns * rows).map(cell)
 }
 
 fn around([x, y]: [f32; 2], [width, height]: [f32; 2]) -> [f32; 4] {

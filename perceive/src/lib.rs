@@ -18,12 +18,14 @@ mod masked;
 pub mod network;
 mod placed;
 pub mod precision;
+#[cfg(test)]
+mod testing;
 
 pub use agreement::{Agreement, Counts, agreement};
 pub use boxes::{Detection, iou};
 pub use card::Card;
 pub use detector::Detector;
-pub use masked::masked_share;
+pub use masked::{box_pixels, masked_share};
 pub use precision::{Boxes, Precision, TrueBox, precision};
 
 /// A picture: rows from the top, three bytes a pixel, red first.

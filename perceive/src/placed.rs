@@ -1,7 +1,7 @@
 //! Places a picture in a network's input: in a corner or in the middle with grey around it, or stretched.
 
 use crate::Picture;
-use crate::card::{Card, Channels, Resize};
+use crate::card::Card;
 
 /// Where a picture lies in the input.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -24,13 +24,13 @@ pub(crate) fn fitted([width, height]: [usize; 2], [w, h]: [usize; 2]) -> [usize;
 pub(crate) fn place(picture: &Picture, card: &Card) -> (Vec<f32>, Placed) {
     let [width, height] = card.input;
     let sides = [picture.width, picture.height];
-    let [w, h] = if card.resize == Resize::Stretch { card.input } else { fitted(card.input, sides) };
-    let [x, y] = if card.resize == Resize::Centre { [(width - w) / 2, (height - h) / 2] } else { [0, 0] };
+    let (filled, corner) = card.area(sides);
+    let [x, y] = corner;
     let mut input = vec![f32::from(card.pad); 3 * width * height];
-    let [columns, rows] = [(w, sides[0]), (h, sides[1])].map(|(to, from)| taps(to, from));
+    let [columns, rows] = [0, 1].map(|axis| taps(filled[axis], sides[axis]));
     for (channel, plane) in input.chunks_exact_mut(width * height).enumerate() {
         let (mean, std) = (card.mean[channel], card.std[channel]);
-        let channel = if card.channels == Channels::Bgr { 2 - channel } else { channel };
+        let channel = card.plane(channel);
         let at = |x: usize, y: usize| f32::from(picture.rgb[3 * (y * picture.width + x) + channel]);
         for (line, &(top, bottom, down)) in plane.chunks_exact_mut(width).skip(y).zip(&rows) {
             for (value, &(left, right, along)) in line[x..].iter_mut().zip(&columns) {
@@ -41,8 +41,7 @@ pub(crate) fn place(picture: &Picture, card: &Card) -> (Vec<f32>, Placed) {
         }
         plane.iter_mut().for_each(|value| *value = (*value - mean) / std);
     }
-    let scale = [sides[0] as f32 / w as f32, sides[1] as f32 / h as f32];
-    (input, Placed { scale, offset: [x as f32, y as f32], size: sides.map(|side| side as f32) })
+    (input, Placed::new(sides, card))
 }
 
 /// For each of `to` pixels the two of `from` between whose centres its centre lies, and the share of the second.
@@ -56,6 +55,13 @@ pub(crate) fn taps(to: usize, from: usize) -> Vec<(usize, usize, f32)> {
 }
 
 impl Placed {
+    /// Where [`place`] puts a picture of this size.
+    pub(crate) fn new(size: [usize; 2], card: &Card) -> Self {
+        let (filled, corner) = card.area(size);
+        let scale = [0, 1].map(|axis| size[axis] as f32 / filled[axis] as f32);
+        Self { scale, offset: corner.map(|place| place as f32), size: size.map(|side| side as f32) }
+    }
+
     /// Corners in the input as corners in the picture, cut at its edges.
     pub(crate) fn in_picture(&self, corners: [f32; 4]) -> [f32; 4] {
         let along =
@@ -68,7 +74,7 @@ impl Placed {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::card::{Head, Written};
+    use crate::card::{Channels, Head, Resize, Written};
 
     fn card(input: [usize; 2], resize: Resize, channels: Channels, std: f32) -> Card {
         Card { input, resize, channels, std: [std; 3], ..Card::new(Head::Yolox, &Written::default()) }

@@ -200,7 +200,7 @@ mod tests {
             let found = precision(&made.iter().collect::<Vec<_>>());
             let [off, off50] = [(found.map, map), (found.map50, map50)].map(|(found, wanted)| found.unwrap() - wanted);
             println!("{views} views, {classes} classes: {found:?}, off by {off:.1e} and {off50:.1e}");
-            assert!(off.abs() < 1e-9 && off50.abs() < 1e-9);
+            assert!(off.abs() < 1e-12 && off50.abs() < 1e-12);
         }
     }
 

@@ -25,10 +25,7 @@ pub(super) struct Anchors<'a> {
 
 impl<'a> Anchors<'a> {
     pub(super) fn new(card: &'a Card, placed: Placed) -> Self {
-        let of_grid = |(stride, [columns, rows]): (usize, [usize; 2])| {
-            (0..columns * rows).map(move |i| [stride, i % columns, i / columns].map(|number| number as f64))
-        };
-        Self { card, placed, cells: card.grids().flat_map(of_grid).collect() }
+        Self { card, placed, cells: card.cells().map(|cell| cell.map(|number| number as f64)).collect() }
     }
 
     pub(super) fn count(&self) -> usize {
@@ -42,12 +39,10 @@ impl<'a> Anchors<'a> {
 
     /// Place in the output of number `i` of an anchor.
     fn place(&self, anchor: usize, i: usize) -> usize {
-        let classes = self.card.outputs.len();
-        match self.card.head {
-            Head::Yolox => anchor * (5 + classes) + i,
-            Head::Nanodet => anchor * (classes + 4 * self.card.bins) + i,
-            Head::Yolov8 | Head::Fastestdet => i * self.count() + anchor,
+        if self.card.head.is_in_planes() {
+            return i * self.count() + anchor;
         }
+        anchor * self.card.head.numbers(self.card.outputs.len(), self.card.bins) + i
     }
 
     pub(super) fn read(&self, output: &[f32], anchor: usize) -> Anchor {
@@ -174,9 +169,8 @@ mod tests {
 
     /// Numbers in 0.1..0.9.
     fn output(card: &Card) -> Vec<f32> {
-        let numbers = if card.head == Head::Nanodet { 2 + 4 * card.bins } else { 7 };
-        let anchors = Anchors::new(card, PLACED).count();
-        (0..anchors * numbers).map(|i| 0.1 + 0.8 * ((i * 7919 + 13) % 101) as f32 / 101.0).collect()
+        let numbers = card.cells().count() * card.head.numbers(2, card.bins);
+        (0..numbers).map(|i| 0.1 + 0.8 * ((i * 7919 + 13) % 101) as f32 / 101.0).collect()
     }
 
     #[test]

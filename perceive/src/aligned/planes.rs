@@ -2,8 +2,8 @@
 
 use rayon::prelude::*;
 
-use crate::card::{Card, Channels, Resize};
-use crate::placed::{Placed, fitted, taps};
+use crate::card::Card;
+use crate::placed::{Placed, taps};
 
 /// Where the pixels of pictures of one size go.
 pub(super) struct Placement {
@@ -20,35 +20,28 @@ pub(super) struct Placement {
     planes: [(usize, f32, f32); 3],
     /// What each plane has around the picture.
     around: [f32; 3],
+    placed: Placed,
 }
 
 impl Placement {
     /// The placement of [`place`](crate::placed::place).
     pub(super) fn new(size: [usize; 2], card: &Card) -> Self {
-        let [width, height] = card.input;
-        let [w, h] = if card.resize == Resize::Stretch { card.input } else { fitted(card.input, size) };
-        let plane = |i: usize| {
-            let channel = if card.channels == Channels::Bgr { 2 - i } else { i };
-            (channel, -card.mean[i] / card.std[i], (255.0 - card.mean[i]) / card.std[i])
-        };
+        let ([width, height], offset) = card.area(size);
+        let plane = |i: usize| (card.plane(i), -card.mean[i] / card.std[i], (255.0 - card.mean[i]) / card.std[i]);
         Self {
             size,
             input: card.input,
-            offset: if card.resize == Resize::Centre { [(width - w) / 2, (height - h) / 2] } else { [0, 0] },
-            columns: taps(w, size[0]),
-            rows: taps(h, size[1]),
+            offset,
+            columns: taps(width, size[0]),
+            rows: taps(height, size[1]),
             planes: [0, 1, 2].map(plane),
             around: [0, 1, 2].map(|i| (f32::from(card.pad) - card.mean[i]) / card.std[i]),
+            placed: Placed::new(size, card),
         }
     }
 
     pub(super) fn placed(&self) -> Placed {
-        let ratio = |from: usize, to: usize| from as f32 / to as f32;
-        Placed {
-            scale: [ratio(self.size[0], self.columns.len()), ratio(self.size[1], self.rows.len())],
-            offset: self.offset.map(|place| place as f32),
-            size: self.size.map(|side| side as f32),
-        }
+        self.placed
     }
 
     /// The input for a picture of three planes, red first, 0..1.
@@ -104,6 +97,7 @@ mod tests {
     use crate::Picture;
     use crate::card::{Head, Written};
     use crate::placed::place;
+    use crate::testing::dot;
 
     #[test]
     fn planes_are_placed_like_pictures_and_the_gradient_is_the_adjoint() {
@@ -122,7 +116,6 @@ mod tests {
             // ⟨A x, y⟩ = ⟨x, Aᵀ y⟩ of the linear part.
             let black = placement.forward(&vec![0.0; count]);
             let y: Vec<f32> = (0..input.len()).map(|i| (i * 31 % 17) as f32 - 8.0).collect();
-            let dot = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(&a, &b)| f64::from(a) * f64::from(b)).sum::<f64>();
             let forward = dot(&input, &y) - dot(&black, &y);
             let backward = dot(&planes, &placement.backward(&y));
             assert!((forward - backward).abs() < 1e-4 * (1.0 + forward.abs()), "{forward} against {backward}");

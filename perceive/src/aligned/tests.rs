@@ -1,20 +1,11 @@
 //! The whole chain: detectors in `shared/` on street photos.
 
-use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use super::*;
+use crate::testing::{self, dot, shared};
 
 const DETECTORS: [&str; 2] = ["yolox_nano_416", "fastestdet_352"];
-
-fn shared(name: &str) -> Option<PathBuf> {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/data").join(name);
-    let is_there = path.exists();
-    if !is_there {
-        println!("skipped: ../shared/data not present");
-    }
-    is_there.then_some(path)
-}
 
 fn detector(name: &str) -> Option<Aligned> {
     let bytes = std::fs::read(shared(&format!("detectors/{name}.onnx"))?).unwrap();
@@ -24,7 +15,7 @@ fn detector(name: &str) -> Option<Aligned> {
 
 /// Three planes of a photo, its width and its height.
 fn photo(name: &str) -> Option<(Vec<f32>, usize, usize)> {
-    let image = image::open(shared(&format!("images_street/kitti_object/image_2/{name}.png"))?).unwrap().to_rgb8();
+    let image = testing::photo(&format!("{name}.png"))?;
     let plane = |channel: usize| image.pixels().map(move |pixel| f32::from(pixel[channel]) / 255.0);
     Some(((0..3).flat_map(plane).collect(), image.width() as usize, image.height() as usize))
 }
@@ -41,10 +32,6 @@ fn noise(count: usize, seed: u64) -> Vec<f32> {
 
 fn noisy(photo: &[f32], strength: f32, seed: u64) -> Vec<f32> {
     photo.iter().zip(noise(photo.len(), seed)).map(|(x, n)| x + strength * n).collect()
-}
-
-fn dot(a: &[f32], b: &[f32]) -> f64 {
-    a.iter().zip(b).map(|(&a, &b)| f64::from(a) * f64::from(b)).sum()
 }
 
 #[test]

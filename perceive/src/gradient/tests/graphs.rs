@@ -7,6 +7,7 @@ use crate::gradient::onnx::{
     Attribute, Dimension, Graph, Model, Node, OperatorSet, Shape, Tensor, TensorType, Type, ValueInfo,
 };
 use crate::gradient::{Activations, Network};
+use crate::testing::dot;
 
 /// A node from its operator, inputs (separated by spaces, `-` for none) and attributes.
 pub(super) fn node(operator: &str, inputs: &str, output: &str, attribute: Vec<Attribute>) -> Node {
@@ -67,11 +68,6 @@ pub(super) fn file(version: i64, input: &[i64], node: Vec<Node>, initializer: Ve
     let graph = Graph { node, initializer, input: vec![value("x", input)], output };
     let opset_import = vec![OperatorSet { domain: String::new(), version }];
     Model { ir_version: 6, graph: Some(graph), opset_import }.encode_to_vec()
-}
-
-/// Σ a·b.
-pub(super) fn dot(a: &[f32], b: &[f32]) -> f64 {
-    a.iter().zip(b).map(|(&a, &b)| f64::from(a) * f64::from(b)).sum()
 }
 
 /// Compares the network's output with rten's, and the derivative along random directions with differences.

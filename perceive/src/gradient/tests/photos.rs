@@ -1,27 +1,18 @@
 //! The detectors in `shared/` on a street photo.
 
-use std::path::{Path, PathBuf};
 use std::time::Instant;
 
-use super::graphs::{dot, noise, rten};
+use super::graphs::{noise, rten};
 use crate::Picture;
 use crate::card::{Card, Head, Written};
 use crate::gradient::{Activations, Network};
 use crate::placed::place;
-
-fn shared(name: &str) -> Option<PathBuf> {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/data").join(name);
-    let is_there = path.exists();
-    if !is_there {
-        println!("skipped: ../shared/data not present");
-    }
-    is_there.then_some(path)
-}
+use crate::testing::{self, dot, shared};
 
 /// A network's bytes and a photo as its input.
 fn detector(name: &str, side: usize, white: f32) -> Option<(Vec<u8>, Vec<f32>)> {
     let bytes = std::fs::read(shared(name)?).unwrap();
-    let photo = image::open(shared("images_street/kitti_object/image_2/000001.png")?).unwrap().to_rgb8();
+    let photo = testing::photo("000001.png")?;
     let picture = Picture { rgb: &photo, width: photo.width() as usize, height: photo.height() as usize };
     let card = Card { input: [side, side], std: [255.0 / white; 3], ..Card::new(Head::Yolox, &Written::default()) };
     Some((bytes, place(&picture, &card).0))
