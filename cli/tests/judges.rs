@@ -138,6 +138,13 @@ fn detectors_are_run_on_photos_and_renders() {
     }
     let text = String::from_utf8(plat(at, &words("tiny.onnx")).stdout).unwrap();
     assert!(text.contains("tiny.onnx: detections with a score of 1") && text.contains("0 missed"), "{text}");
+    let lines = fs::read(at.join("city/boxes3d.json")).unwrap();
+    fs::write(at.join("city/boxes3d.json"), "[]").unwrap();
+    refused(at, &words("tiny.onnx"), "boxes3d.json: has no line of a photo");
+    fs::write(at.join("city/boxes3d.json"), lines).unwrap();
+    card("classes = ['car', 'person', 'bench']\nbins = 4");
+    refused(at, &words("tiny.onnx"), "bins");
+    card("classes = ['car', 'person', 'bench']");
     fs::remove_dir_all(at.join("city/truth")).unwrap();
     assert!(done(at, &words("tiny.onnx"))["detections"][0].get("truth").is_none());
 

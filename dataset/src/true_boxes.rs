@@ -87,7 +87,10 @@ impl TrueBoxes {
                 return Err(bad(&boxes, format!("has a photo {image:?} that has no true camera")));
             };
             let objects = objects.into_iter().map(|of| seen(of, camera)).collect();
-            photos.insert(image.trim_start_matches("images/").to_owned(), (camera.pinhole, objects));
+            photos.insert(image.strip_prefix("images/").unwrap_or(&image).to_owned(), (camera.pinhole, objects));
+        }
+        if photos.is_empty() {
+            return Err(bad(&boxes, "has no line of a photo".to_owned()));
         }
         Ok(Some(Self { photos }))
     }

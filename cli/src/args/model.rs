@@ -92,6 +92,8 @@ ends in .toml, beside it, can change how pictures go in and what comes out; thes
     classes = ['person', 'bicycle', ...]  # those of COCO
     [map]                    # new names for classes; those with the same name become one
     bus = 'vehicle'
+
+NanoDet's card also has bins and anchor. A key that would change nothing is refused.
 ";
 
 const LPIPS_HELP: &str = "\
