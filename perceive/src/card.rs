@@ -10,7 +10,6 @@ use serde::Deserialize;
 
 use crate::coco;
 use crate::network::Shapes;
-use crate::placed::fitted;
 
 /// The largest side of a network's input, pixels.
 const MAX_SIDE: usize = 4096;
@@ -326,6 +325,12 @@ fn mapped(outputs: &[String], map: &BTreeMap<String, String>) -> (Vec<String>, V
     (names, class_of)
 }
 
+/// Width and height of a picture that is as large as fits; at least a pixel.
+fn fitted([width, height]: [usize; 2], [w, h]: [usize; 2]) -> [usize; 2] {
+    // In integers, so that the side that limits is hit exactly.
+    if width * h <= height * w { [width, (h * width / w).max(1)] } else { [(w * height / h).max(1), height] }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -428,5 +433,14 @@ mod tests {
             ["bus", "vehicle", "animal", "cat"].map(|name| card.class_named(name)),
             [Some(0), Some(0), Some(2), None]
         );
+    }
+
+    #[test]
+    fn the_side_that_limits_is_filled() {
+        assert_eq!(fitted([416, 416], [1242, 375]), [416, 125]);
+        assert_eq!(fitted([416, 416], [375, 1242]), [125, 416]);
+        assert_eq!(fitted([416, 416], [480, 270]), [416, 234]);
+        assert_eq!(fitted([96, 64], [3, 2]), [96, 64]);
+        assert_eq!(fitted([416, 416], [60_000, 1]), [416, 1]);
     }
 }

@@ -14,12 +14,6 @@ pub(crate) struct Placed {
     pub(crate) size: [f32; 2],
 }
 
-/// Width and height of a picture that is as large as fits; at least a pixel.
-pub(crate) fn fitted([width, height]: [usize; 2], [w, h]: [usize; 2]) -> [usize; 2] {
-    // In integers, so that the side that limits is hit exactly.
-    if width * h <= height * w { [width, (h * width / w).max(1)] } else { [(w * height / h).max(1), height] }
-}
-
 /// The input (planes of the card's order and range) with the picture, resized bilinearly between pixel centres.
 pub(crate) fn place(picture: &Picture, card: &Card) -> (Vec<f32>, Placed) {
     let [width, height] = card.input;
@@ -103,14 +97,5 @@ mod tests {
         let normal = Card { mean: [1.0, 2.0, 3.0], std: [2.0, 1.0, 1.0], ..rgb };
         let (input, _) = place(&picture, &normal);
         assert_eq!([input[0], input[15], input[16 + 15], input[32 + 15]], [127.0, 56.5, 112.0, 111.0]);
-    }
-
-    #[test]
-    fn the_side_that_limits_is_filled() {
-        assert_eq!(fitted([416, 416], [1242, 375]), [416, 125]);
-        assert_eq!(fitted([416, 416], [375, 1242]), [125, 416]);
-        assert_eq!(fitted([416, 416], [480, 270]), [416, 234]);
-        assert_eq!(fitted([96, 64], [3, 2]), [96, 64]);
-        assert_eq!(fitted([416, 416], [60_000, 1]), [416, 1]);
     }
 }
