@@ -147,9 +147,9 @@ function model(sim) {
   };
 }
 
-// The strictest policy that the pages need: Spark's WebAssembly and workers are inlined in its chunk.
+// The strictest policy that the pages need: Spark's workers are inlined in its chunk, and it fetches blobs.
 const POLICY = "default-src 'self'; script-src 'self' 'wasm-unsafe-eval'; worker-src 'self' blob:; connect-src 'self' data: blob:; img-src 'self' data: blob:; style-src 'self' 'unsafe-inline'";
-const types = { '.html': 'text/html; charset=utf-8', '.js': 'text/javascript', '.css': 'text/css', '.txt': 'text/plain; charset=utf-8' };
+const types = { '.html': 'text/html; charset=utf-8', '.js': 'text/javascript', '.css': 'text/css', '.txt': 'text/plain; charset=utf-8', '.wasm': 'application/wasm' };
 function asset(path, request, response) {
   const file = normalize(path === '/' ? '/index.html' : path).replace(/^(\.\.[/\\])+/, '');
   try {
