@@ -2,6 +2,7 @@
 import { useEffect, useRef } from 'preact/hooks';
 import { useSignal } from '@preact/signals';
 import { get, type Download, type ModelView, type View as Photo } from '../api';
+import { askFirst } from '../first';
 import { bytes, count, fixed } from '../format';
 import { job, jobId } from '../live';
 import { href, route, setQuery } from '../route';
@@ -10,10 +11,12 @@ import { Command, Empty, Panel, useGet, Waiting } from '../widgets/boundary';
 import type { Look, Stage, Stats } from '../viewer/stage';
 
 const FORMATS = ['rad', 'spz'] as const;
+/** Splats at first: about as many as a picture has places for. Each further hundred thousand is 4 to 8 MB to load. */
+const BUDGET = 250000;
 
 export function View() {
   const asked = useGet<ModelView>(job.value!.model ? `/api/jobs/${jobId.value}/model` : null, job.value!.counts.done);
-  const missing = useSignal(webgl2Missing());
+  const missing = useSignal('');
   if (missing.value) return <NoWebGl reason={missing.value} />;
   if (!job.value!.model) return <div class="panel"><Empty><h3>No block is finished yet</h3>The model appears with its first block, and grows as others finish. <a href={href('blocks')}>The blocks so far</a></Empty></div>;
   if (!asked.value) return <Waiting error={asked.error} what="the model" />;
@@ -36,9 +39,13 @@ function Scene({ model, onLost }: { model: ModelView; onLost: (reason: string) =
 
   useEffect(() => {
     let live = true;
+    const format = FORMATS.find((f) => f === query.get('format')) ?? null;
+    if (format !== 'spz') askFirst(jobId.value!, model);
     void import('../viewer/stage').then(({ Stage }) => {
       if (!live || !canvas.current) return;
-      const format = FORMATS.find((f) => f === query.get('format')) ?? null;
+      // Not before: to start a context takes a while, in which no answer of the server would be looked at.
+      const reason = webgl2Missing(canvas.current);
+      if (reason) { onLost(reason); return; }
       try {
         stage.current = new Stage(canvas.current, jobId.value!, model, look.value, format);
       } catch (e) { onLost((e as Error).message); return; }
@@ -168,15 +175,14 @@ function NoWebGl({ reason }: { reason: string }) {
   );
 }
 
-function webgl2Missing(): string {
+/** Why the canvas cannot draw; otherwise it has the context that the viewer will draw with. */
+function webgl2Missing(canvas: HTMLCanvasElement): string {
   if (typeof WebGL2RenderingContext === 'undefined') return 'This browser has no WebGL2';
-  const context = document.createElement('canvas').getContext('webgl2');
-  if (!context) return 'This browser knows WebGL2 but could not start it (no graphics driver, or it is switched off)';
-  context.getExtension('WEBGL_lose_context')?.loseContext();
-  return '';
+  if (canvas.getContext('webgl2', { antialias: false, powerPreference: 'high-performance' })) return '';
+  return 'This browser knows WebGL2 but could not start it (no graphics driver, or it is switched off)';
 }
 
 function budgetOf(query: URLSearchParams): number {
-  const asked = Number(query.get('budget') ?? 1e6);
-  return Math.max(20000, Math.min(4e6, Number.isFinite(asked) ? asked : 1e6));
+  const asked = Number(query.get('budget') ?? BUDGET);
+  return Math.max(20000, Math.min(4e6, Number.isFinite(asked) ? asked : BUDGET));
 }

@@ -1,7 +1,8 @@
 // The splats of blocks: loading them a few at a time, hiding the quarters that finer blocks draw, tinting by level.
-import { dyno, SplatFileType, SplatMesh } from '@sparkjsdev/spark';
+import { dyno, PagedSplats, SplatFileType, SplatMesh } from '@sparkjsdev/spark';
 import * as THREE from 'three';
 import type { ModelView } from '../api';
+import { blockUrl, takeFirst } from '../first';
 import { square, type Cut, type Node } from './cut';
 
 const LOADS_AT_ONCE = 3;
@@ -54,9 +55,29 @@ export class Blocks {
     await mesh.initialized;
     if (this.closed) { mesh.dispose(); return; }
     mesh.quaternion.copy(this.turningSpz);
+    mesh.visible = this.skyWanted;
     this.group.add(mesh);
     this.sky = mesh;
     this.changed();
+  }
+
+  /** The sky is drawn once the city is: it fills the picture, and a slow GPU would draw it again and again until then. */
+  private skyWanted = false;
+  showSky(): void {
+    this.skyWanted = true;
+    if (this.sky) this.sky.visible = true;
+    this.changed();
+  }
+
+  /** Splats of sky among those that are drawn. */
+  get skySplats(): number { return this.sky?.visible ? this.sky.numSplats : 0; }
+
+  /** Lets Spark compile the program of paged blocks while their splats are on the way: it does so at the first splat, and the empty page has one that is not drawn. */
+  warm(): void {
+    for (const { mesh } of this.held.values()) {
+      const splats = mesh?.paged;
+      if (splats?.pager && !splats.splatEncoding && splats.numSplats === 0) splats.numSplats = splats.dynoNumSplats.value = 1;
+    }
   }
 
   get pending(): number { return this.queue.length + this.loading; }
@@ -103,13 +124,13 @@ export class Blocks {
   }
 
   private async load(n: Node, held: Held): Promise<void> {
-    const url = `/api/jobs/${this.job}/blocks/${n.block.artefact}`;
+    const url = blockUrl(this.job, n.block);
     // The server says once whether it has the paged format; SPZ holds the same splats in one piece.
     this.format ??= await (this.probe ??= hasRad(`${url}.rad`));
     const objectModifier = this.quarters(n, held.mask);
     let mesh: SplatMesh;
     if (this.format === 'rad') {
-      mesh = new SplatMesh({ url: `${url}.rad`, fileType: SplatFileType.RAD, paged: true, objectModifier });
+      mesh = new SplatMesh({ paged: paged(`${url}.rad`, this.model.sh_degree), objectModifier });
     } else {
       const reply = await fetch(`${url}.spz`);
       if (!reply.ok) throw new Error(`${url}.spz: the server answered ${reply.status}`);
@@ -208,6 +229,18 @@ export class Blocks {
       this.held.delete(key);
     }
   }
+}
+
+/** A file's splats by pages; its first chunk may be on the way already. */
+function paged(rootUrl: string, shDegree: number): PagedSplats {
+  const first = takeFirst(rootUrl);
+  class Paged extends PagedSplats {
+    override async getRadMeta() { return (await first) ?? super.getRadMeta(); }
+  }
+  const splats = new Paged({ rootUrl, fileType: SplatFileType.RAD });
+  // Spark reads it from the first chunk, and its program depends on it.
+  splats.numSh = shDegree;
+  return splats;
 }
 
 async function hasRad(url: string): Promise<'rad' | 'spz'> {
