@@ -24,6 +24,8 @@ export interface Stats {
 const FIRST_SPLATS = 20000;
 const MORE_MILLIS = 500;
 const FETCHERS = 3;
+/** A first chunk with nothing to see does not hold the others up for longer. */
+const PATIENCE_MILLIS = 3000;
 const PAGE_SPLATS = 65536;
 /** WebGL without a GPU takes a second for a sharp picture: the first one, and those while the eye moves, have half the resolution. */
 const SOFTWARE = /swiftshader|llvmpipe|softpipe|software|basic render/i;
@@ -173,7 +175,9 @@ export class Stage {
       this.choose();
     }
     // Spark takes chunks that have come only while it draws, and does not say that one has come.
-    if (this.moved || this.allowMore(time) || (this.spark.pager?.lodTreeUpdates.length ?? 0) > 0) this.dirty = true;
+    const came = (this.spark.pager?.lodTreeUpdates.length ?? 0) > 0;
+    if (came && this.cameAt === 0) this.cameAt = time;
+    if (this.moved || this.allowMore(time) || came) this.dirty = true;
     if (!this.finished()) { this.tell(time); return; }
     this.setCoarse(this.software && (this.drawn === 0 || time - this.movedAt < REST_MILLIS));
     if (!this.dirty) { this.tell(time); return; }
@@ -225,14 +229,14 @@ export class Stage {
   /** Paged blocks share this many splats. Asking for all at once would bring megabytes before anything is seen. */
   private allowed = FIRST_SPLATS;
   private allowedAt = 0;
+  private cameAt = 0;
   /** Whether more is allowed than at the frame before. */
   private allowMore(time: number): boolean {
-    if (this.drawn === 0 || this.allowed >= this.look.budget) return false;
-    if (this.allowedAt === 0) {
-      this.allowedAt = time;
-      // One chunk at a time until something is seen: two would share the line, and the first come later.
-      if (this.spark.pager) this.spark.pager.numFetchers = FETCHERS;
-    }
+    const waits = this.drawn === 0 && (this.cameAt === 0 || time - this.cameAt < PATIENCE_MILLIS);
+    // One chunk until something is seen: a second would share the line with the first, or the cores with its picture.
+    if (this.spark.pager) this.spark.pager.numFetchers = this.cameAt === 0 ? 1 : waits ? 0 : FETCHERS;
+    if (waits || this.allowed >= this.look.budget) return false;
+    if (this.allowedAt === 0) this.allowedAt = time;
     if (time - this.allowedAt < MORE_MILLIS) return false;
     this.allowedAt = time;
     this.allowed *= 2;
