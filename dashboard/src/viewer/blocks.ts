@@ -207,13 +207,24 @@ export class Blocks {
       if (!n) continue;
       if (held.settled === 'no') {
         held.settled = 'soon';
-        setTimeout(() => { held.settled = 'yes'; if (!this.closed) { this.arrange(); this.changed(); } }, SETTLE_MILLIS);
+        this.settle(key, held);
       }
       held.used = this.turn;
       const colour = new THREE.Color(this.tint ? TINTS[n.level % TINTS.length] : '#ffffff');
       if (!held.mesh.recolor.equals(colour)) { held.mesh.recolor.copy(colour); held.mesh.updateVersion(); }
     }
     this.drop();
+  }
+
+  private settle(key: string, held: Held): void {
+    setTimeout(() => {
+      if (this.closed || this.held.get(key) !== held) return;
+      // The first chunk brings the encoding. On a slow line it takes longer than a while.
+      if (held.mesh!.paged && !held.mesh!.paged.splatEncoding) { this.settle(key, held); return; }
+      held.settled = 'yes';
+      this.arrange();
+      this.changed();
+    }, SETTLE_MILLIS);
   }
 
   retint(on: boolean): void {
@@ -233,11 +244,14 @@ export class Blocks {
 
 /** A file's splats by pages; its first chunk may be on the way already. */
 function paged(rootUrl: string, shDegree: number): PagedSplats {
+  const options = { rootUrl, fileType: SplatFileType.RAD };
   const first = takeFirst(rootUrl);
-  class Paged extends PagedSplats {
-    override async getRadMeta() { return (await first) ?? super.getRadMeta(); }
+  // Spark's own constructor asks for the header and keeps the promise, so an override must not come back to it: another reads what failed.
+  class Begun extends PagedSplats {
+    private own: PagedSplats | undefined;
+    override getRadMeta() { return first!.then((opened) => opened ?? (this.own ??= new PagedSplats(options)).getRadMeta()); }
   }
-  const splats = new Paged({ rootUrl, fileType: SplatFileType.RAD });
+  const splats = first ? new Begun(options) : new PagedSplats(options);
   // Spark reads it from the first chunk, and its program depends on it.
   splats.numSh = shDegree;
   return splats;

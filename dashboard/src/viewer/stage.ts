@@ -35,7 +35,7 @@ const REST_MILLIS = 400;
 function pagedSplats(model: ModelView): number {
   const most = 256;
   if (model.blocks.some((b) => b.artefact === null)) return most * PAGE_SPLATS;
-  return Math.min(most, model.blocks.reduce((pages, b) => pages + 1 + Math.floor((2 * b.splats) / PAGE_SPLATS), 0)) * PAGE_SPLATS;
+  return Math.min(most, model.blocks.reduce((pages, b) => pages + 1 + Math.ceil((2 * b.splats) / PAGE_SPLATS), 0)) * PAGE_SPLATS;
 }
 
 export interface Look { budget: number; tint: boolean; outlines: boolean; seams: boolean; ghosts: boolean }
@@ -234,7 +234,7 @@ export class Stage {
   private allowMore(time: number): boolean {
     const waits = this.drawn === 0 && (this.cameAt === 0 || time - this.cameAt < PATIENCE_MILLIS);
     // One chunk until something is seen: a second would share the line with the first, or the cores with its picture.
-    if (this.spark.pager) this.spark.pager.numFetchers = this.cameAt === 0 ? 1 : waits ? 0 : FETCHERS;
+    this.fetchers(this.cameAt === 0 ? 1 : waits ? 0 : FETCHERS);
     if (waits || this.allowed >= this.look.budget) return false;
     if (this.allowedAt === 0) this.allowedAt = time;
     if (time - this.allowedAt < MORE_MILLIS) return false;
@@ -242,6 +242,13 @@ export class Stage {
     this.allowed *= 2;
     this.spark.lodSplatCount = Math.min(this.allowed, this.look.budget);
     return true;
+  }
+
+  private fetchers(most: number): void {
+    const pager = this.spark.pager;
+    if (!pager || pager.numFetchers === most) return;
+    pager.numFetchers = most;
+    pager.driveFetchers(); // Spark would look again only once the eye has moved
   }
 
   private fence: WebGLSync | null = null;
