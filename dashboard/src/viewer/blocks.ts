@@ -23,7 +23,8 @@ interface Held {
 
 export class Blocks {
   readonly group = new THREE.Group();
-  readonly shown = new Set<Node>();
+  /** The drawn blocks, each with the quarters (bits) that its children draw. */
+  readonly shown = new Map<Node, number>();
   /** From the files' axes to those of the ground plane. */
   private readonly turning = new THREE.Quaternion();
   /** SPZ's own axes point up and back where those of the other files point down and ahead: half a turn about x. */
@@ -196,10 +197,10 @@ export class Blocks {
       if (mask === 15 || !loaded(n)) return;
       const held = this.held.get(n.block.artefact!)!;
       if (held.mask.value !== mask) { held.mask.value = mask; held.mesh!.updateVersion(); }
-      this.shown.add(n);
+      this.shown.set(n, mask);
     };
     for (const n of wanted) if (!n.parent || !wanted.has(n.parent)) visit(n);
-    const visible = new Map([...this.shown].map((n) => [n.block.artefact!, n]));
+    const visible = new Map([...this.shown.keys()].map((n) => [n.block.artefact!, n]));
     for (const [key, held] of this.held) {
       if (!held.mesh) continue;
       const n = visible.get(key);

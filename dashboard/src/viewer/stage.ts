@@ -17,7 +17,7 @@ export interface Stats {
   frames: number;
   format: string;
   errors: string[];
-  labels: { text: string; task: number; left: number; top: number }[];
+  labels: { text: string; task: number | null; left: number; top: number }[];
 }
 
 /** Splats of the first picture: what the first chunk of a file has. More is asked for once that is seen, twice as much each time. */
@@ -112,8 +112,12 @@ export class Stage {
   private lead: Stage | null = null;
   private copyLead(): void {
     const [from, to] = [this.lead!.mover.camera, this.mover.camera];
-    if (from.position.equals(to.position) && from.quaternion.equals(to.quaternion) && from.projectionMatrix.equals(to.projectionMatrix)) return;
+    // Each stage is about the centre of its own model.
+    const [theirs, own] = [new THREE.Vector3(...this.lead!.model.centre), new THREE.Vector3(...this.model.centre)];
+    const at = from.position.clone().add(theirs).sub(own);
+    if (at.equals(to.position) && from.quaternion.equals(to.quaternion) && from.projectionMatrix.equals(to.projectionMatrix)) return;
     to.copy(from, false);
+    to.position.copy(at);
     this.moved = true;
   }
 
@@ -265,17 +269,17 @@ export class Stage {
     });
   }
 
-  /** The nearest ghosts' labels in CSS pixels. */
+  /** The nearest labels in CSS pixels. */
   private labels(): Stats['labels'] {
     const { clientWidth: w, clientHeight: h } = this.canvas;
     const eye = this.mover.camera.position;
     const near = [...this.boxes.labels].sort((a, b) => a.at.distanceToSquared(eye) - b.at.distanceToSquared(eye));
     const out: Stats['labels'] = [];
-    for (const { node, at } of near) {
+    for (const { text, task, at } of near) {
       const p = at.clone().project(this.mover.camera);
       const [left, top] = [((p.x + 1) / 2) * w, ((1 - p.y) / 2) * h];
       if (p.z > 1 || left < 0 || top < 0 || left > w || top > h || out.some((o) => Math.abs(o.left - left) < 90 && Math.abs(o.top - top) < 18)) continue;
-      out.push({ text: node.block.block, task: node.block.task, left, top });
+      out.push({ text, task, left, top });
       if (out.length === 30) break;
     }
     return out;
