@@ -155,10 +155,8 @@ fn siblings_are_in_one_chunk_or_follow_each_other() {
         assert_eq!((order.number(order.head - 1), order.number(order.head)), (order.head - 1, CHUNK_NODES as u64));
     }
     let one = Order::new(1, CHUNK_NODES as u64 - 1, &[]);
-    assert_eq!(
-        (one.chunks().collect::<Vec<_>>(), one.numbers().unwrap()),
-        (vec![0..CHUNK_NODES as u64], CHUNK_NODES as u32)
-    );
+    assert!(one.chunks().eq(std::iter::once(0..one.nodes())));
+    assert_eq!(one.numbers().unwrap(), CHUNK_NODES as u32);
     assert_eq!(Order::new(0, 0, &[]).chunks().count(), 0);
 }
 
