@@ -197,13 +197,14 @@ export interface ModelView {
   root: Square;
   centre: [number, number, number];
   blocks: ModelBlock[];
-  before_prune: boolean;
   sh_degree: number;
   antialiased: boolean;
   /** Which formats of blocks there are; tried out where the server does not say. */
   formats?: ('rad' | 'spz')[];
   /** Quaternion (x, y, z, w) from the files' axes to those of the ground plane. */
   turn?: [number, number, number, number];
+  /** Where two blocks of the finest model meet: how far their pictures differ there, and the error's step across, levels of 255. */
+  faces?: { a: string; b: string; jump: number | null; step: number | null }[];
 }
 
 export interface Curve {

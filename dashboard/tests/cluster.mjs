@@ -1,9 +1,9 @@
 // plat's own programs for tests: a coordinator with its dashboard, workers, jobs; and the folder `dist` in front of a server.
 import { spawn } from 'node:child_process';
-import { openSync, readFileSync } from 'node:fs';
+import { existsSync, openSync, readFileSync } from 'node:fs';
+import http from 'node:http';
 import { createServer } from 'node:net';
-import { join } from 'node:path';
-import { preview } from 'vite';
+import { extname, join, resolve } from 'node:path';
 
 const PLAT = process.env.PLAT ?? 'plat';
 
@@ -76,12 +76,32 @@ export async function answers(url) {
   throw new Error(`${url} does not answer`);
 }
 
-/** PAGES=dist: the pages of this folder instead of those in the program, everything else from the program. */
-export async function front(url) {
-  if (process.env.PAGES !== 'dist') return url;
-  const proxy = Object.fromEntries(['/api', '/files', '/status', '/healthz'].map((path) => [path, url]));
-  const [port] = await freePorts(1);
-  await preview({ root: join(import.meta.dirname, '..'), logLevel: 'silent', preview: { port, host: '127.0.0.1', proxy } });
+const TYPES = { '.html': 'text/html', '.js': 'text/javascript', '.css': 'text/css', '.wasm': 'application/wasm' };
+
+/** PAGES=dist: the pages of this folder, compressed and with the program's own headers, instead of those in the program; everything else from the program. */
+export async function front(url, pages = process.env.PAGES) {
+  if (!pages) return url;
+  const folder = resolve(import.meta.dirname, '..', pages);
+  const policy = (await fetch(url)).headers.get('content-security-policy');
+  const agent = new http.Agent({ keepAlive: true });
+  const server = http.createServer((ask, reply) => {
+    const path = ask.url === '/' ? '/index.html' : ask.url;
+    if (path === '/index.html' || path.startsWith('/assets/')) {
+      const file = join(folder, path);
+      const packed = existsSync(`${file}.br`) && /\bbr\b/.test(ask.headers['accept-encoding'] ?? '');
+      if (!existsSync(file)) { reply.writeHead(404).end(); return; }
+      const kept = path.startsWith('/assets/') ? 'public, max-age=31536000, immutable' : 'no-cache';
+      reply.writeHead(200, { 'content-type': TYPES[extname(file)] ?? 'application/octet-stream', 'cache-control': kept, ...(policy && { 'content-security-policy': policy }), ...(packed && { 'content-encoding': 'br' }) });
+      reply.end(readFileSync(packed ? `${file}.br` : file));
+      return;
+    }
+    const on = http.request(url + ask.url, { method: ask.method, headers: ask.headers, agent }, (r) => { reply.writeHead(r.statusCode, r.headers); r.pipe(reply); });
+    on.on('error', () => reply.destroy());
+    reply.on('close', () => on.destroy());
+    ask.pipe(on);
+  });
+  const port = await new Promise((done) => { server.listen(0, '127.0.0.1', () => done(server.address().port)); });
+  server.unref();
   return `http://127.0.0.1:${port}`;
 }
 

@@ -30,6 +30,21 @@ test('the cut', async () => {
   assert.deepEqual(drawn(names.map((n) => block(n)), 1), ['0/0/0:0']);
 });
 
+test('where drawn blocks meet', async () => {
+  const { tree, meeting } = await load('viewer/cut.ts');
+  const block = (name) => ({ block: name, task: 0, artefact: name, splats: 1, rho_metres: 1, box: null, backdrop: false });
+  const at = Object.fromEntries(tree(['0/0/0', '1/0/0', '1/1/0', '1/0/1', '1/1/1', '2/2/0'].map(block)).map((n) => [n.block.block, n]));
+  const faces = (...drawn) => meeting(new Map(drawn.map(([name, mask]) => [at[name], mask])), { x: 0, y: 0, edge: 8 })
+    .map(({ a, b, from, to }) => `${a.block.block} ${b.block.block} ${from} ${to}`).sort();
+  // Four quarters: four faces, and none where only corners touch.
+  assert.deepEqual(faces(['1/0/0', 0], ['1/1/0', 0], ['1/0/1', 0], ['1/1/1', 0]),
+    ['1/0/0 1/0/1 0,4 4,4', '1/0/0 1/1/0 4,0 4,4', '1/0/1 1/1/1 4,4 4,8', '1/1/0 1/1/1 4,4 8,4']);
+  // A block that stands in for three quarters meets the child in the fourth, and no quarter of its own.
+  assert.deepEqual(faces(['0/0/0', 1], ['1/0/0', 0]), ['0/0/0 1/0/0 0,4 4,4', '0/0/0 1/0/0 4,0 4,4']);
+  // Of different sizes: the part where both are.
+  assert.deepEqual(faces(['1/0/0', 0], ['2/2/0', 0]), ['1/0/0 2/2/0 4,0 4,2']);
+});
+
 test('the front', async () => {
   const { runs, front, dominator, mainSplit, csv } = await load('widgets/front.ts');
   const run = (label, cpu_seconds, psnr, more = {}) => ({ label, scene: 's', source: null, split: 'a', cpu_seconds, wall_seconds: cpu_seconds, psnr, ssim: null, perceptual: null, ...more });

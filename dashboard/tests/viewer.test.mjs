@@ -27,14 +27,35 @@ test('the viewer', async (t) => {
       await page.waitForTimeout(2500);
       await shot(page, 'viewer-photo');
       await page.selectOption('.tools select', '');
-      await page.getByLabel('before pruning').check();
-      await page.waitForSelector('text=pruned');
-      await page.waitForTimeout(2500);
-      assert.equal(await page.locator('.viewer canvas').count(), 2);
-      await shot(page, 'viewer-before');
     }
+    await page.getByLabel('outlines').uncheck();
+    await page.getByLabel('missing blocks').uncheck();
+    await page.getByLabel('levels').uncheck();
+    await page.getByRole('button', { name: 'Show all' }).click();
+    await page.getByLabel('seams').check();
+    await page.getByLabel('Budget').fill('4.8');
+    await page.waitForTimeout(2500);
+    await shot(page, 'viewer-seams');
+    if (!REAL) assert.match((await page.locator('.labels').innerText()), /^\d+\.\d$/m, 'faces that were measured have a label');
     assert.deepEqual(page.problems, []);
     await page.context().close();
+  });
+  if (!REAL) await t.test('compares two jobs by a wipe', async () => {
+    const several = await mock('several');
+    const page = await open(b, `${several.url}/#/view?job=1&budget=20000`, small);
+    await page.waitForFunction(() => Number(document.querySelector('[data-testid=hud]')?.dataset.shown) > 500, undefined, { timeout: 30000 });
+    await page.getByLabel('Compare with').selectOption('2');
+    await page.waitForFunction(() => Number(document.querySelector('[data-testid=compare]')?.dataset.shown) > 500, undefined, { timeout: 30000 });
+    assert.equal(await page.locator('.viewer canvas').count(), 2);
+    await page.getByLabel('Wipe between job 2').fill('30');
+    await page.waitForTimeout(1500);
+    assert.match(await page.locator('.viewer canvas').nth(1).getAttribute('style'), /inset\(0px 70% 0px 0px\)/);
+    await shot(page, 'viewer-compare');
+    await page.getByLabel('Compare with').selectOption('');
+    await page.waitForSelector('[data-testid=compare]', { state: 'detached' });
+    assert.deepEqual(page.problems, []);
+    await page.context().close();
+    await several.stop();
   });
   await t.test('without WebGL2: the reason and the files', async () => {
     const page = await open(b, 'about:blank', small);

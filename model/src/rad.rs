@@ -15,6 +15,7 @@
 mod scratch;
 
 use std::borrow::Cow;
+use std::ops::Range;
 use std::path::Path;
 
 use blocks::{Cells, Cut, Ground};
@@ -221,27 +222,34 @@ impl<'a> Writer<'a> {
         Ok(Children { start, count: group.len() as u16, part })
     }
 
+    /// Nodes in the order of the file.
+    fn nodes(&mut self, range: Range<u64>) -> Result<Vec<Node>, ModelError> {
+        let top = self.top.count();
+        let mut nodes = self.top.backwards(range.start.min(top), range.end.min(top))?;
+        nodes.extend(self.below.backwards(range.start.saturating_sub(top), range.end.saturating_sub(top))?);
+        Ok(nodes)
+    }
+
     fn finish(mut self, geo_origin: Option<GeoOrigin>, antialiased: bool) -> Result<Exported, ModelError> {
-        let order = Order { top: self.top.count(), below: self.below.count() };
+        let (top, below) = (self.top.count(), self.below.count());
+        let first = self.nodes(0..(top + below).min(rad::FIRST_NODES as u64))?;
+        let order = Order::new(top, below, &first);
         let bad = |error: scene::CodecError| BadInput::new(self.path.display().to_string(), error.to_string(), ADVICE);
-        let count = u64::from(order.count().map_err(bad)?);
-        if count == 0 {
+        order.numbers().map_err(bad)?;
+        if order.nodes() == 0 {
             return Err(BadInput::new(self.out.display().to_string(), "would hold no splat", ADVICE).into());
         }
         let encoding = self.bounds.encoding();
         let mut chunks = Bytes::create(self.out, "chunks")?;
-        let bases: Vec<u64> = (0..count).step_by(rad::CHUNK_NODES).collect();
-        let mut lengths = Vec::with_capacity(bases.len());
-        for bases in bases.chunks(rayon::current_num_threads()) {
-            let mut read = Vec::with_capacity(bases.len());
-            for &base in bases {
-                let end = count.min(base + rad::CHUNK_NODES as u64);
-                let mut nodes = self.top.backwards(base.min(order.top), end.min(order.top))?;
-                let below = |index: u64| index.saturating_sub(order.top);
-                nodes.extend(self.below.backwards(below(base), below(end))?);
-                read.push((base, nodes));
+        let parts: Vec<Range<u64>> = order.chunks().collect();
+        let mut lengths = Vec::with_capacity(parts.len());
+        for parts in parts.chunks(rayon::current_num_threads()) {
+            let mut read = Vec::with_capacity(parts.len());
+            for part in parts {
+                read.push((part.start, self.nodes(part.clone())?));
             }
-            let encode = |(base, nodes): &(u64, Vec<Node>)| rad::chunk(*base, nodes, order, &encoding, self.sh_degree);
+            let encode =
+                |(place, nodes): &(u64, Vec<Node>)| rad::chunk(*place, nodes, order, &encoding, self.sh_degree);
             let encoded: Vec<Vec<u8>> = read.par_iter().map(encode).collect::<Result<_, _>>().map_err(bad)?;
             for chunk in encoded {
                 lengths.push(chunk.len() as u64);

@@ -21,10 +21,10 @@ use tokio_util::sync::CancellationToken;
 
 use crate::feed::Feed;
 use crate::job::JobRecord;
-use crate::project::{Project, Results};
+use crate::project::{Face, Project, Results};
 use crate::views::Server;
 
-/// Number of the job that a folder is shown as.
+/// Number of the job that a folder is shown as, the first of several.
 pub(crate) const JOB: u64 = 1;
 /// Interval at which the folder is looked at.
 const PERIOD: Duration = Duration::from_secs(2);
@@ -42,15 +42,22 @@ struct Figures {
     perceptual: Option<f64>,
     #[serde(default)]
     views: Vec<ViewFigures>,
+    seams: Option<Seams>,
+}
+
+/// What `plat eval --seams` says.
+#[derive(Deserialize)]
+struct Seams {
+    faces: Vec<Face>,
 }
 
 /// Shows the folder until `stop`, and what is in it at once.
 ///
 /// # Errors
 /// A folder without a plan.
-pub(crate) async fn show(feed: Arc<Feed>, folder: PathBuf, stop: CancellationToken) -> Result<(), BadInput> {
+pub(crate) fn show(feed: Arc<Feed>, job: u64, folder: PathBuf, stop: CancellationToken) -> Result<(), BadInput> {
     let mut seen = changes(&folder);
-    load(&feed, &folder)?;
+    load(&feed, job, &folder)?;
     tokio::spawn(async move {
         loop {
             tokio::select! {
@@ -61,7 +68,7 @@ pub(crate) async fn show(feed: Arc<Feed>, folder: PathBuf, stop: CancellationTok
             let looked = tokio::task::spawn_blocking(move || {
                 let now = changes(&folder);
                 if now != before
-                    && let Err(error) = load(&feed, &folder)
+                    && let Err(error) = load(&feed, job, &folder)
                 {
                     tracing::warn!("{error}");
                 }
@@ -83,7 +90,7 @@ pub(crate) fn finish(feed: &Feed, folder: &Path) -> Result<(), BadInput> {
     board.set_server(Server { controls: false, coordinator: None, ..server });
     let Some(job) = board.remeasured(JOB) else {
         drop(board);
-        return load(feed, folder);
+        return load(feed, JOB, folder);
     };
     job.outcome.get_or_insert(Outcome::Done);
     job.ended_unix_ms.get_or_insert(feed.now());
@@ -102,6 +109,7 @@ fn set_figures(job: &mut JobRecord, folder: &Path) {
     if let Ok(evaluated) = json::<Figures>(folder, "eval/report.json") {
         (job.psnr, job.ssim, job.perceptual) = (evaluated.psnr, evaluated.ssim, evaluated.perceptual);
         job.project.add_figures(evaluated.views);
+        job.project.set_faces(evaluated.seams.map_or(Vec::new(), |seams| seams.faces));
     }
 }
 
@@ -111,7 +119,7 @@ fn changes(folder: &Path) -> Vec<Option<SystemTime>> {
 }
 
 /// Reads everything, and replaces the job.
-pub(crate) fn load(feed: &Feed, folder: &Path) -> Result<(), BadInput> {
+fn load(feed: &Feed, number: u64, folder: &Path) -> Result<(), BadInput> {
     let bad = |file: &str, problem: String| {
         BadInput::new(folder.join(file).display().to_string(), problem, "give a folder that plat train wrote")
     };
@@ -134,7 +142,7 @@ pub(crate) fn load(feed: &Feed, folder: &Path) -> Result<(), BadInput> {
     let (now, ended_unix_ms) = (feed.now(), ended("model/model.json"));
 
     let mut board = feed.board();
-    board.add(JOB, project.clone());
+    board.add(number, project.clone());
     for line in lines.split(|byte| *byte == b'\n') {
         let Ok(line) = serde_json::from_slice::<ReportLine>(line) else { continue };
         let Some(task) = line.task.parse().ok().and_then(|block| project.task_of(block)) else { continue };
@@ -144,10 +152,10 @@ pub(crate) fn load(feed: &Feed, folder: &Path) -> Result<(), BadInput> {
         let ReportLine { step, steps, cpu_seconds, wall_seconds, splats, loss, psnr, merged_splats, attempt, .. } =
             line;
         let report = Report { step, steps, loss, splats, cpu_seconds, wall_seconds, psnr, merged_splats };
-        board.update(now, JOB, &Update::Changed(changed));
-        board.update(now, JOB, &Update::Reported(TaskReported { task, attempt, report: Some(report) }));
+        board.update(now, number, &Update::Changed(changed));
+        board.update(now, number, &Update::Reported(TaskReported { task, attempt, report: Some(report) }));
     }
-    let Some(job) = board.job_mut(JOB) else { return Ok(()) };
+    let Some(job) = board.job_mut(number) else { return Ok(()) };
     for (task, entry) in manifest
         .iter()
         .flat_map(|manifest| &manifest.blocks)

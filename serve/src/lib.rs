@@ -77,8 +77,8 @@ pub enum Source {
         /// [`Kind::Train`] if it runs in this process for one job.
         kind: Kind,
     },
-    /// A folder that `plat train` wrote.
-    Folder(PathBuf),
+    /// Folders that `plat train` wrote, as jobs from 1 on.
+    Folders(Vec<PathBuf>),
     /// Only files.
     Files,
 }
@@ -124,7 +124,7 @@ pub async fn serve(listener: TcpListener, options: Options, source: Source) -> R
     let scheme = if tls.is_some() { "https" } else { "http" };
     let kind = match &source {
         Source::Coordinator { kind, .. } => *kind,
-        Source::Folder(_) | Source::Files => Kind::Folder,
+        Source::Folders(_) | Source::Files => Kind::Folder,
     };
     let about = Server {
         version: env!("CARGO_PKG_VERSION"),
@@ -146,8 +146,10 @@ pub async fn serve(listener: TcpListener, options: Options, source: Source) -> R
             });
             Some(find)
         }
-        Source::Folder(folder) => {
-            folder::show(feed.clone(), folder, stop.clone()).await?;
+        Source::Folders(folders) => {
+            for (job, folder) in (folder::JOB..).zip(folders) {
+                folder::show(feed.clone(), job, folder, stop.clone())?;
+            }
             None
         }
         Source::Files => None,

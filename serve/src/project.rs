@@ -9,7 +9,7 @@ use dataset::windows::WindowReader;
 use eval::ViewFigures;
 use glam::{DMat4, DVec3};
 use scene::{ArtefactId, BlockId, Capture, Pixels, Rect, Splats, frame};
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 use store::BlockingStore;
 
@@ -53,6 +53,18 @@ pub(crate) struct Project {
 struct Figures {
     by_view: BTreeMap<u32, ViewFigures>,
     by_block: Vec<Option<f64>>,
+    faces: Vec<Face>,
+}
+
+/// How well two blocks of the finest model fit where they meet, as `plat eval --seams` measured it.
+#[derive(Debug, Deserialize)]
+pub(crate) struct Face {
+    a: BlockId,
+    b: BlockId,
+    /// How far the pictures of the two differ there, levels of 255.
+    jump: Option<f64>,
+    /// How much the error changes from one side to the other, levels of 255.
+    step: Option<f64>,
 }
 
 /// About a task.
@@ -223,10 +235,13 @@ impl Project {
             })
         };
         let turn = ground.ground_from_world.to_array();
+        let figures = self.figures.read().unwrap_or_else(PoisonError::into_inner);
+        let face = |face: &Face| json!({"a": face.a.to_string(), "b": face.b.to_string(), "jump": face.jump, "step": face.step});
         json!({
-            "seq": seq, "root": self.root(), "centre": centre.to_array(), "turn": turn, "before_prune": false, "formats": ["rad", "spz"],
+            "seq": seq, "root": self.root(), "centre": centre.to_array(), "turn": turn, "formats": ["rad", "spz"],
             "sh_degree": plan.settings.sh_degree, "antialiased": plan.settings.antialiased,
             "blocks": plan.tasks.iter().zip(0..).map(block).collect::<Vec<Value>>(),
+            "faces": figures.faces.iter().map(face).collect::<Vec<Value>>(),
         })
     }
 
@@ -299,6 +314,11 @@ impl Project {
             }
         }
         figures.by_block = sums.into_iter().map(|(sum, count)| (count > 0).then(|| sum / f64::from(count))).collect();
+    }
+
+    /// Takes over the figures of faces between blocks.
+    pub(crate) fn set_faces(&self, faces: Vec<Face>) {
+        self.figures.write().unwrap_or_else(PoisonError::into_inner).faces = faces;
     }
 
     /// Means of PSNR, SSIM and SSIMULACRA2 over the measured views.

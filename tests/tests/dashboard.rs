@@ -235,7 +235,7 @@ async fn a_folder_is_shown_while_it_is_written_and_afterwards() {
     let serve_it = async || {
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
         let address = listener.local_addr().unwrap();
-        let serving = serve::serve(listener, options(&folder), Source::Folder(out.clone())).await;
+        let serving = serve::serve(listener, options(&folder), Source::Folders(vec![out.clone()])).await;
         serving.map(|serving| (serving, address))
     };
     std::fs::create_dir(&out).unwrap();
@@ -274,6 +274,17 @@ async fn a_folder_is_shown_while_it_is_written_and_afterwards() {
             .iter()
             .any(|file| file["path"] == "town/merged.ply")
     );
+
+    // Two folders are two jobs. Figures of faces are those of `plat eval --seams`.
+    let out = folder.path().join("town");
+    let face = r#"{"a": {"level": 1, "x": 0, "y": 0}, "b": {"level": 1, "x": 1, "y": 0}, "views": 3, "jump": 4.5, "step": null}"#;
+    std::fs::create_dir_all(out.join("eval")).unwrap();
+    std::fs::write(out.join("eval/report.json"), format!(r#"{{"seams": {{"faces": [{face}]}}}}"#)).unwrap();
+    let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let at = listener.local_addr().unwrap();
+    let _serving = serve::serve(listener, options(&folder), Source::Folders(vec![out.clone(), out])).await.unwrap();
+    let model = json(at, "/api/jobs/2/model").await;
+    assert_eq!(model["faces"][0], serde_json::json!({"a": "1/0/0", "b": "1/1/0", "jump": 4.5, "step": null}));
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -105,11 +105,12 @@ fn lease(text: &str) -> Result<f64, String> {
 
 #[derive(Debug, Clone, Args)]
 pub(crate) struct ServeArgs {
-    /// Folder of a model that plat train wrote or writes, of exported files, or the store of a cluster (a folder or its URL)
+    /// Folders of models that plat train wrote or writes, which the viewer can compare; or a folder of exported files, or the store
+    /// of a cluster (a folder or its URL)
     #[arg(value_name = "DIR|STORE", required_unless_present = "coordinator")]
-    pub(crate) path: Option<String>,
+    pub(crate) paths: Vec<String>,
     /// Show the jobs of this coordinator: http://host:port, https://host:port with --tls-ca
-    #[arg(long, value_name = "URL", conflicts_with = "path")]
+    #[arg(long, value_name = "URL", conflicts_with = "paths")]
     pub(crate) coordinator: Option<String>,
     /// CA certificates to verify the coordinator with, PEM
     #[arg(long, value_name = "FILE")]

@@ -52,7 +52,17 @@ async fn source(args: &ServeArgs, access: Access) -> Result<(Source, Option<Path
     if let Some(url) = &args.coordinator {
         return Ok((following(url, access)?, None));
     }
-    let path = args.path.as_deref().unwrap_or_default();
+    let folders: Vec<PathBuf> = args.paths.iter().map(PathBuf::from).collect();
+    let is_model = |folder: &PathBuf| folder.join("model/model.json").is_file() || folder.join("plan.json").is_file();
+    if folders.iter().all(is_model) {
+        let newest = folders.last().cloned();
+        return Ok((Source::Folders(folders), newest));
+    }
+    let [path] = &args.paths[..] else {
+        let other =
+            folders.iter().find(|folder| !is_model(folder)).map_or_else(String::new, |f| f.display().to_string());
+        return Err(BadInput::new(other, "is no model of plat train", "give only such folders, or one path").into());
+    };
     if path.contains("://") {
         return Ok((following(path, access)?, None));
     }
@@ -60,9 +70,6 @@ async fn source(args: &ServeArgs, access: Access) -> Result<(Source, Option<Path
     if !folder.is_dir() {
         let advice = "give a folder that plat train wrote, one of exported files, or the store of a cluster";
         return Err(BadInput::new(path, "is not a folder", advice).into());
-    }
-    if folder.join("model/model.json").is_file() || folder.join("plan.json").is_file() {
-        return Ok((Source::Folder(folder.clone()), Some(folder)));
     }
     if is_cluster(&folder).await {
         let url = format!("file://{}", std::path::absolute(&folder).unwrap_or(folder).display());

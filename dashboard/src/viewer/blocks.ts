@@ -1,7 +1,8 @@
 // The splats of blocks: loading them a few at a time, hiding the quarters that finer blocks draw, tinting by level.
-import { dyno, SplatFileType, SplatMesh } from '@sparkjsdev/spark';
+import { dyno, PagedSplats, SplatFileType, SplatMesh } from '@sparkjsdev/spark';
 import * as THREE from 'three';
 import type { ModelView } from '../api';
+import { blockUrl, takeFirst } from '../first';
 import { square, type Cut, type Node } from './cut';
 
 const LOADS_AT_ONCE = 3;
@@ -22,7 +23,8 @@ interface Held {
 
 export class Blocks {
   readonly group = new THREE.Group();
-  readonly shown = new Set<Node>();
+  /** The drawn blocks, each with the quarters (bits) that its children draw. */
+  readonly shown = new Map<Node, number>();
   /** From the files' axes to those of the ground plane. */
   private readonly turning = new THREE.Quaternion();
   /** SPZ's own axes point up and back where those of the other files point down and ahead: half a turn about x. */
@@ -54,9 +56,29 @@ export class Blocks {
     await mesh.initialized;
     if (this.closed) { mesh.dispose(); return; }
     mesh.quaternion.copy(this.turningSpz);
+    mesh.visible = this.skyWanted;
     this.group.add(mesh);
     this.sky = mesh;
     this.changed();
+  }
+
+  /** The sky is drawn once the city is: it fills the picture, and a slow GPU would draw it again and again until then. */
+  private skyWanted = false;
+  showSky(): void {
+    this.skyWanted = true;
+    if (this.sky) this.sky.visible = true;
+    this.changed();
+  }
+
+  /** Splats of sky among those that are drawn. */
+  get skySplats(): number { return this.sky?.visible ? this.sky.numSplats : 0; }
+
+  /** Lets Spark compile the program of paged blocks while their splats are on the way: it does so at the first splat, and the empty page has one that is not drawn. */
+  warm(): void {
+    for (const { mesh } of this.held.values()) {
+      const splats = mesh?.paged;
+      if (splats?.pager && !splats.splatEncoding && splats.numSplats === 0) splats.numSplats = splats.dynoNumSplats.value = 1;
+    }
   }
 
   get pending(): number { return this.queue.length + this.loading; }
@@ -103,13 +125,13 @@ export class Blocks {
   }
 
   private async load(n: Node, held: Held): Promise<void> {
-    const url = `/api/jobs/${this.job}/blocks/${n.block.artefact}`;
+    const url = blockUrl(this.job, n.block);
     // The server says once whether it has the paged format; SPZ holds the same splats in one piece.
     this.format ??= await (this.probe ??= hasRad(`${url}.rad`));
     const objectModifier = this.quarters(n, held.mask);
     let mesh: SplatMesh;
     if (this.format === 'rad') {
-      mesh = new SplatMesh({ url: `${url}.rad`, fileType: SplatFileType.RAD, paged: true, objectModifier });
+      mesh = new SplatMesh({ paged: paged(`${url}.rad`, this.model.sh_degree), objectModifier });
     } else {
       const reply = await fetch(`${url}.spz`);
       if (!reply.ok) throw new Error(`${url}.spz: the server answered ${reply.status}`);
@@ -175,10 +197,10 @@ export class Blocks {
       if (mask === 15 || !loaded(n)) return;
       const held = this.held.get(n.block.artefact!)!;
       if (held.mask.value !== mask) { held.mask.value = mask; held.mesh!.updateVersion(); }
-      this.shown.add(n);
+      this.shown.set(n, mask);
     };
     for (const n of wanted) if (!n.parent || !wanted.has(n.parent)) visit(n);
-    const visible = new Map([...this.shown].map((n) => [n.block.artefact!, n]));
+    const visible = new Map([...this.shown.keys()].map((n) => [n.block.artefact!, n]));
     for (const [key, held] of this.held) {
       if (!held.mesh) continue;
       const n = visible.get(key);
@@ -186,13 +208,24 @@ export class Blocks {
       if (!n) continue;
       if (held.settled === 'no') {
         held.settled = 'soon';
-        setTimeout(() => { held.settled = 'yes'; if (!this.closed) { this.arrange(); this.changed(); } }, SETTLE_MILLIS);
+        this.settle(key, held);
       }
       held.used = this.turn;
       const colour = new THREE.Color(this.tint ? TINTS[n.level % TINTS.length] : '#ffffff');
       if (!held.mesh.recolor.equals(colour)) { held.mesh.recolor.copy(colour); held.mesh.updateVersion(); }
     }
     this.drop();
+  }
+
+  private settle(key: string, held: Held): void {
+    setTimeout(() => {
+      if (this.closed || this.held.get(key) !== held) return;
+      // The first chunk brings the encoding. On a slow line it takes longer than a while.
+      if (held.mesh!.paged && !held.mesh!.paged.splatEncoding) { this.settle(key, held); return; }
+      held.settled = 'yes';
+      this.arrange();
+      this.changed();
+    }, SETTLE_MILLIS);
   }
 
   retint(on: boolean): void {
@@ -208,6 +241,21 @@ export class Blocks {
       this.held.delete(key);
     }
   }
+}
+
+/** A file's splats by pages; its first chunk may be on the way already. */
+function paged(rootUrl: string, shDegree: number): PagedSplats {
+  const options = { rootUrl, fileType: SplatFileType.RAD };
+  const first = takeFirst(rootUrl);
+  // Spark's own constructor asks for the header and keeps the promise, so an override must not come back to it: another reads what failed.
+  class Begun extends PagedSplats {
+    private own: PagedSplats | undefined;
+    override getRadMeta() { return first!.then((opened) => opened ?? (this.own ??= new PagedSplats(options)).getRadMeta()); }
+  }
+  const splats = first ? new Begun(options) : new PagedSplats(options);
+  // Spark reads it from the first chunk, and its program depends on it.
+  splats.numSh = shDegree;
+  return splats;
 }
 
 async function hasRad(url: string): Promise<'rad' | 'spz'> {

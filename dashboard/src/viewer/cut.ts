@@ -48,6 +48,26 @@ export function square(n: Node, root: Square): Square {
   return { x: root.x + n.x * edge, y: root.y + n.y * edge, edge };
 }
 
+type Point = [x: number, y: number];
+
+/** Where two of the drawn blocks meet: a part of the one's border and of the other's. `drawn` has the quarters (bits) that a block's children draw. */
+export function meeting(drawn: Map<Node, number>, root: Square): { a: Node; b: Node; from: Point; to: Point }[] {
+  const regions = [...drawn].flatMap(([n, mask]) => {
+    const { x, y, edge } = square(n, root);
+    if (mask === 0) return [{ n, x, y, edge }];
+    return [0, 1, 2, 3].filter((q) => !((mask >> q) & 1)).map((q) => ({ n, x: x + (q & 1 ? edge / 2 : 0), y: y + (q & 2 ? edge / 2 : 0), edge: edge / 2 }));
+  });
+  // Sides that are the same differ by rounding.
+  const near = 1e-6 * root.edge;
+  return regions.flatMap((r, i) => regions.slice(i + 1).flatMap((s) => {
+    const from: Point = [Math.max(r.x, s.x), Math.max(r.y, s.y)];
+    const to: Point = [Math.min(r.x + r.edge, s.x + s.edge), Math.min(r.y + r.edge, s.y + s.edge)];
+    const [width, depth] = [to[0] - from[0], to[1] - from[1]];
+    const touch = r.n !== s.n && Math.abs(Math.min(width, depth)) < near && Math.max(width, depth) > near;
+    return touch ? [{ a: r.n, b: s.n, from, to }] : [];
+  }));
+}
+
 /** Metres from the eye to the block, at least a hundredth of its edge. */
 export function distance(n: Node, root: Square, eye: Eye): number {
   const s = square(n, root);

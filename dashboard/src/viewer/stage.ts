@@ -17,13 +17,26 @@ export interface Stats {
   frames: number;
   format: string;
   errors: string[];
-  labels: { text: string; task: number; left: number; top: number }[];
+  labels: { text: string; task: number | null; left: number; top: number }[];
 }
 
 /** Splats of the first picture: what the first chunk of a file has. More is asked for once that is seen, twice as much each time. */
 const FIRST_SPLATS = 20000;
 const MORE_MILLIS = 500;
 const FETCHERS = 3;
+/** A first chunk with nothing to see does not hold the others up for longer. */
+const PATIENCE_MILLIS = 3000;
+const PAGE_SPLATS = 65536;
+/** WebGL without a GPU takes a second for a sharp picture: the first one, and those while the eye moves, have half the resolution. */
+const SOFTWARE = /swiftshader|llvmpipe|softpipe|software|basic render/i;
+const REST_MILLIS = 400;
+
+/** Splats that Spark's pages hold, which it allocates at once: all nodes of a finished model, which are fewer than twice its splats, or else its own default. */
+function pagedSplats(model: ModelView): number {
+  const most = 256;
+  if (model.blocks.some((b) => b.artefact === null)) return most * PAGE_SPLATS;
+  return Math.min(most, model.blocks.reduce((pages, b) => pages + 1 + Math.ceil((2 * b.splats) / PAGE_SPLATS), 0)) * PAGE_SPLATS;
+}
 
 export interface Look { budget: number; tint: boolean; outlines: boolean; seams: boolean; ghosts: boolean }
 
@@ -49,13 +62,15 @@ export class Stage {
 
   constructor(private readonly canvas: HTMLCanvasElement, job: number, private model: ModelView, private look: Look, format: 'rad' | 'spz' | null) {
     this.renderer = new THREE.WebGLRenderer({ canvas, antialias: false, powerPreference: 'high-performance' });
-    this.renderer.setPixelRatio(Math.min(1.5, devicePixelRatio || 1));
+    this.renderer.setPixelRatio(this.ratio);
+    const gl = this.renderer.getContext();
+    this.software = SOFTWARE.test(String(gl.getParameter(gl.getExtension('WEBGL_debug_renderer_info')?.UNMASKED_RENDERER_WEBGL ?? gl.RENDERER)));
     this.renderer.setClearColor(0x101418);
     // Trained with the anti-aliasing filter: compensated blur. Otherwise the plain one, as the trainer draws.
     const blur = model.antialiased ? { preBlurAmount: 0, blurAmount: 0.3 } : { preBlurAmount: 0.3, blurAmount: 0 };
     // What is outside the picture counts for little; `plat eval --budget` chooses nodes by the same weights.
     const around = { coneFov0: 90, coneFov: 150, coneFoveate: 0.1, behindFoveate: 0.05 };
-    this.spark = new SparkRenderer({ renderer: this.renderer, lodSplatCount: Math.min(FIRST_SPLATS, look.budget), numLodFetchers: 1, ...blur, ...around, onDirty: () => { this.dirty = true; } });
+    this.spark = new SparkRenderer({ renderer: this.renderer, lodSplatCount: Math.min(FIRST_SPLATS, look.budget), numLodFetchers: 1, maxPagedSplats: pagedSplats(model), ...blur, ...around, onDirty: () => { this.dirty = true; } });
     this.nodes = tree(model.blocks);
     this.blocks = new Blocks(job, model, format, () => { this.dirty = true; this.lines(); });
     void this.blocks.backdrop().catch(() => { /* the city is drawn without its sky */ });
@@ -97,8 +112,12 @@ export class Stage {
   private lead: Stage | null = null;
   private copyLead(): void {
     const [from, to] = [this.lead!.mover.camera, this.mover.camera];
-    if (from.position.equals(to.position) && from.quaternion.equals(to.quaternion) && from.projectionMatrix.equals(to.projectionMatrix)) return;
+    // Each stage is about the centre of its own model.
+    const [theirs, own] = [new THREE.Vector3(...this.lead!.model.centre), new THREE.Vector3(...this.model.centre)];
+    const at = from.position.clone().add(theirs).sub(own);
+    if (at.equals(to.position) && from.quaternion.equals(to.quaternion) && from.projectionMatrix.equals(to.projectionMatrix)) return;
     to.copy(from, false);
+    to.position.copy(at);
     this.moved = true;
   }
 
@@ -127,6 +146,7 @@ export class Stage {
 
   /** What is drawn now, as a data URL. WebGL keeps no picture, so it is drawn and read in one go. */
   picture(width: number, height: number): string {
+    this.setCoarse(false);
     this.renderer.render(this.scene, this.mover.camera);
     const copy = Object.assign(document.createElement('canvas'), { width, height });
     copy.getContext('2d')!.drawImage(this.canvas, 0, 0, width, height);
@@ -152,20 +172,27 @@ export class Stage {
     if (this.mover.step(Math.min(0.1, (time - this.last) / 1000))) this.moved = true;
     this.last = time;
     if (this.lead) this.copyLead();
+    if (this.moved) this.movedAt = time;
     if (this.moved && time - this.cutAt > 400) {
       this.moved = false;
       this.cutAt = time;
       this.choose();
     }
-    if (this.moved) this.dirty = true;
-    if (!this.dirty || !this.finished()) { this.tell(time); return; }
+    // Spark takes chunks that have come only while it draws, and does not say that one has come.
+    const came = (this.spark.pager?.lodTreeUpdates.length ?? 0) > 0;
+    if (came && this.cameAt === 0) this.cameAt = time;
+    if (this.moved || this.allowMore(time) || came) this.dirty = true;
+    if (!this.finished()) { this.tell(time); return; }
+    this.setCoarse(this.software && (this.drawn === 0 || time - this.movedAt < REST_MILLIS));
+    if (!this.dirty) { this.tell(time); return; }
     this.dirty = false;
+    this.blocks.warm();
     this.renderer.render(this.scene, this.mover.camera);
     const gl = this.renderer.getContext() as WebGL2RenderingContext;
     this.fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    this.drawing = this.spark.activeSplats;
     gl.flush();
     this.frameTimes.push(time);
-    this.allowMore(time);
     this.tell(time, true);
   }
 
@@ -176,26 +203,56 @@ export class Stage {
     if (gl.clientWaitSync(this.fence, 0, 0) === gl.TIMEOUT_EXPIRED) return false;
     gl.deleteSync(this.fence);
     this.fence = null;
+    const before = this.drawn;
+    this.drawn = Math.max(0, this.drawing - this.blocks.skySplats);
+    if (before === 0 && this.drawn > 0) {
+      this.toldAt = 0; // the first picture is told at once
+      this.movedAt = performance.now(); // the sky comes to it before it is sharp
+      this.blocks.showSky();
+    }
     return true;
   }
+
+  private readonly ratio = Math.min(1.5, devicePixelRatio || 1);
+  private readonly software: boolean;
+  private coarse = false;
+  private movedAt = 0;
+  /** Half the resolution, with the same splats. */
+  private setCoarse(coarse: boolean): void {
+    if (coarse === this.coarse) return;
+    this.coarse = coarse;
+    this.renderer.setPixelRatio(coarse ? this.ratio / 2 : this.ratio);
+    this.spark.lodRenderScale = coarse ? 0.5 : 1;
+    this.dirty = true;
+  }
+
+  /** Splats of blocks in the frame that the GPU has finished last, and those with the sky's in the one that it draws now. */
+  private drawn = 0;
+  private drawing = 0;
 
   /** Paged blocks share this many splats. Asking for all at once would bring megabytes before anything is seen. */
   private allowed = FIRST_SPLATS;
   private allowedAt = 0;
-  private allowMore(time: number): void {
-    // Frames go on until something is seen and all is allowed: Spark asks for pages while it draws, and says nothing when the first has come.
-    const seen = this.spark.activeSplats > 0;
-    if (this.blocks.shown.size > 0 && (!seen || this.allowed < this.look.budget)) this.dirty = true;
-    if (!seen || this.allowed >= this.look.budget) return;
-    if (this.allowedAt === 0) {
-      this.allowedAt = time;
-      // One chunk at a time until something is seen: two would share the line, and the first come later.
-      if (this.spark.pager) this.spark.pager.numFetchers = FETCHERS;
-    }
-    if (time - this.allowedAt < MORE_MILLIS) return;
+  private cameAt = 0;
+  /** Whether more is allowed than at the frame before. */
+  private allowMore(time: number): boolean {
+    const waits = this.drawn === 0 && (this.cameAt === 0 || time - this.cameAt < PATIENCE_MILLIS);
+    // One chunk until something is seen: a second would share the line with the first, or the cores with its picture.
+    this.fetchers(this.cameAt === 0 ? 1 : waits ? 0 : FETCHERS);
+    if (waits || this.allowed >= this.look.budget) return false;
+    if (this.allowedAt === 0) this.allowedAt = time;
+    if (time - this.allowedAt < MORE_MILLIS) return false;
     this.allowedAt = time;
     this.allowed *= 2;
     this.spark.lodSplatCount = Math.min(this.allowed, this.look.budget);
+    return true;
+  }
+
+  private fetchers(most: number): void {
+    const pager = this.spark.pager;
+    if (!pager || pager.numFetchers === most) return;
+    pager.numFetchers = most;
+    pager.driveFetchers(); // Spark would look again only once the eye has moved
   }
 
   private fence: WebGLSync | null = null;
@@ -205,24 +262,24 @@ export class Stage {
     this.toldAt = time;
     this.frameTimes = this.frameTimes.filter((t) => time - t < 2000);
     this.onStats({
-      shown: this.spark.activeSplats,
+      shown: this.drawn,
       total: this.nodes.reduce((n, m) => n + (m.block.artefact !== null && m.children.every((c) => !c || c.block.artefact === null) ? m.block.splats : 0), 0),
       blocks: this.blocks.shown.size, pending: this.blocks.pending, held: this.now.held, megabytes: this.bytes / 1e6,
       frames: this.frameTimes.length / 2, format: this.blocks.kind, errors: this.blocks.errors, labels: this.labels(),
     });
   }
 
-  /** The nearest ghosts' labels in CSS pixels. */
+  /** The nearest labels in CSS pixels. */
   private labels(): Stats['labels'] {
     const { clientWidth: w, clientHeight: h } = this.canvas;
     const eye = this.mover.camera.position;
     const near = [...this.boxes.labels].sort((a, b) => a.at.distanceToSquared(eye) - b.at.distanceToSquared(eye));
     const out: Stats['labels'] = [];
-    for (const { node, at } of near) {
+    for (const { text, task, at } of near) {
       const p = at.clone().project(this.mover.camera);
       const [left, top] = [((p.x + 1) / 2) * w, ((1 - p.y) / 2) * h];
       if (p.z > 1 || left < 0 || top < 0 || left > w || top > h || out.some((o) => Math.abs(o.left - left) < 90 && Math.abs(o.top - top) < 18)) continue;
-      out.push({ text: node.block.block, task: node.block.task, left, top });
+      out.push({ text, task, left, top });
       if (out.length === 30) break;
     }
     return out;

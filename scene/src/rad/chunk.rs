@@ -11,11 +11,17 @@ use super::quantise::{f16_of, r8_of, rotation_of, s8_of, scale_of};
 use super::{Node, Order};
 use crate::error::CodecError;
 
-/// Encodes the nodes from index `base` of the file on, in its order.
+/// Encodes nodes in the order of the file, `place` of which come before them.
 ///
 /// # Errors
 /// None that is known: those of writing JSON and deflate to memory.
-pub fn chunk(base: u64, nodes: &[Node], order: Order, bounds: &Encoding, sh_degree: u8) -> Result<Vec<u8>, CodecError> {
+pub fn chunk(
+    place: u64,
+    nodes: &[Node],
+    order: Order,
+    bounds: &Encoding,
+    sh_degree: u8,
+) -> Result<Vec<u8>, CodecError> {
     let mut properties = Properties { metas: Vec::new(), payload: Vec::new() };
     properties.add("center", "f32_lebytes", None, &centres(nodes))?;
     properties.add("alpha", "f16", None, &words(nodes, |node| f16_of(alpha(node))))?;
@@ -40,7 +46,7 @@ pub fn chunk(base: u64, nodes: &[Node], order: Order, bounds: &Encoding, sh_degr
     let Properties { metas, payload } = properties;
     let meta = ChunkMeta {
         version: 1,
-        base,
+        base: order.number(place),
         count: nodes.len() as u64,
         payload_bytes: payload.len() as u64,
         max_sh: sh_degree,

@@ -27,7 +27,7 @@ const NEEDED: [&str; 5] = ["center", "alpha", "rgb", "scales", "orientation"];
 pub struct Rad {
     /// The nodes. An opacity from 1 to 2 is that of a merged splat, as stored.
     pub nodes: Vec<Gaussian>,
-    /// The first child of each node and their number.
+    /// The first child of each node, as its place in `nodes`, and how many there are.
     pub children: Vec<(u32, u16)>,
     /// SH degree.
     pub sh_degree: u8,
@@ -61,27 +61,44 @@ pub fn read(bytes: &[u8]) -> Result<Rad, CodecError> {
         return Err(CodecError::new(format!("RAD of {} splats in {} chunks", meta.count, meta.chunks.len())));
     }
     let mut rad = Rad { nodes: Vec::new(), children: Vec::new(), sh_degree: meta.max_sh, comment: meta.comment };
+    // How many nodes come before those of each chunk.
+    let mut places = Vec::new();
     for range in &meta.chunks {
         if range.filename.is_some() {
             return Err(CodecError::new("RAD with chunks in files of their own"));
         }
         let chunk = usize::try_from(range.offset).ok().and_then(|offset| bytes.get(start..)?.get(offset..));
         let chunk = chunk.and_then(|chunk| chunk.get(..usize::try_from(range.bytes).ok()?));
-        read_chunk(chunk.ok_or_else(|| CodecError::new("a RAD chunk ends beyond the file"))?, size, &mut rad)?;
+        let chunk = chunk.ok_or_else(|| CodecError::new("a RAD chunk ends beyond the file"))?;
+        let base = places.len() as u64 * size;
+        places.push(rad.nodes.len());
+        read_chunk(chunk, base, size.min(meta.count - base), &mut rad)?;
     }
-    let count = rad.nodes.len() as u64;
-    let is_after = |(index, &(start, count_of)): (usize, &(u32, u16))| {
-        count_of == 0 || (u64::from(start) > index as u64 && u64::from(start) + u64::from(count_of) <= count)
+    let last = places.last().map_or(0, |place| (places.len() as u64 - 1) * size + (rad.nodes.len() - place) as u64);
+    if last != meta.count {
+        return Err(CodecError::new("RAD has other nodes than it says"));
+    }
+    places.push(rad.nodes.len());
+    // A chunk may have fewer nodes than numbers.
+    let place = |number: u64| {
+        let (chunk, within) = ((number / size) as usize, (number % size) as usize);
+        let place = places.get(chunk)? + within;
+        (place < *places.get(chunk + 1)?).then_some(place)
     };
-    match count == meta.count && rad.children.iter().enumerate().all(is_after) {
-        true => Ok(rad),
-        false => Err(CodecError::new("RAD has other nodes than it says, or children before their parents")),
+    for (index, (first, count)) in rad.children.iter_mut().enumerate().filter(|(_, (_, count))| *count > 0) {
+        let (number, others) = (u64::from(*first), u64::from(*count) - 1);
+        let places = place(number).zip(place(number + others));
+        let follow = places.filter(|&(first, last)| first > index && (last - first) as u64 == others);
+        let (place, _) =
+            follow.ok_or_else(|| CodecError::new("RAD has children that are not there, or before their parent"))?;
+        *first = place as u32;
     }
+    Ok(rad)
 }
 
-fn read_chunk(bytes: &[u8], most: u64, rad: &mut Rad) -> Result<(), CodecError> {
+fn read_chunk(bytes: &[u8], base: u64, most: u64, rad: &mut Rad) -> Result<(), CodecError> {
     let (meta, at) = prefixed::<ChunkMeta>(bytes, CHUNK_MAGIC, "a RAD chunk")?;
-    if meta.base != rad.nodes.len() as u64 || meta.count > most.min(MAX_CHUNK) || meta.count == 0 {
+    if meta.base != base || meta.count > most.min(MAX_CHUNK) || meta.count == 0 {
         return Err(CodecError::new(format!("a RAD chunk of {} splats from {}", meta.count, meta.base)));
     }
     let names = || meta.properties.iter().map(|property| property.property.as_str());

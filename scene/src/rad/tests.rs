@@ -25,7 +25,7 @@ fn splats(count: usize, sh_degree: u8, seed: u64) -> Splats {
     splats
 }
 
-/// Asserts that each splat is a leaf of the file within its steps, of which one number in a thousand may lie outside; leaves are found by their places, which are kept.
+/// Asserts that each splat is a leaf of the file within its steps, of which few SH coefficients may lie outside; leaves are found by their places, which are kept.
 fn assert_leaves(splats: &Splats, rad: &Rad) {
     let leaves = rad.leaves();
     assert_eq!(leaves.len(), splats.len());
@@ -35,15 +35,20 @@ fn assert_leaves(splats: &Splats, rad: &Rad) {
     let mut wanted: Vec<usize> = (0..splats.len()).collect();
     let own = |i: usize| Gaussian::of(splats, i, ORIGIN);
     wanted.sort_by_key(|&i| key(own(i).mean));
+    let (mut numbers, mut outside) = (0, 0);
     for (leaf, wanted) in by_place.into_iter().zip(wanted) {
         let (leaf, wanted) = (Gaussian::of(&leaves, leaf, DVec3::ZERO), own(wanted));
         assert_eq!(leaf.mean, wanted.mean);
         assert!(((leaf.scale / wanted.scale).map(f32::ln)).abs().max_element() < 0.06);
         assert!(leaf.quat.dot(wanted.quat).abs() > 0.02f32.cos());
         assert!((leaf.opacity - wanted.opacity).abs() < 5e-4);
-        let sh = leaf.sh.as_flattened().iter().zip(wanted.sh.as_flattened());
-        assert!(sh.enumerate().all(|(k, (a, b))| (a - b).abs() < if k < 3 { 0.004 / SH_C0 } else { 0.005 }));
+        for (k, (a, b)) in leaf.sh.as_flattened().iter().zip(wanted.sh.as_flattened()).enumerate() {
+            numbers += 1;
+            outside += usize::from((a - b).abs() >= if k < 3 { 0.004 / SH_C0 } else { 0.005 });
+        }
     }
+    // One in a thousand at either end, of twice as many nodes.
+    assert!(outside <= numbers / 250, "{outside} of {numbers}");
 }
 
 /// Asserts that every node but the root is the child of one that comes before it.
@@ -98,13 +103,61 @@ fn several_chunks_are_laid_out_as_viewers_read_them() {
     let meta: serde_json::Value = serde_json::from_slice(&bytes[8..8 + length]).unwrap();
     let start = 8 + length.next_multiple_of(8);
     assert_eq!(meta["allChunkBytes"], (bytes.len() - start) as u64);
-    for chunk in meta["chunks"].as_array().unwrap() {
+    let mut nodes = 0;
+    for (index, chunk) in meta["chunks"].as_array().unwrap().iter().enumerate() {
         let at = start + chunk["offset"].as_u64().unwrap() as usize;
         assert!(at.is_multiple_of(8) && bytes[at..].starts_with(b"RADC"));
+        let length = u32::from_le_bytes(bytes[at + 4..at + 8].try_into().unwrap()) as usize;
+        let chunk: serde_json::Value = serde_json::from_slice(&bytes[at + 8..at + 8 + length]).unwrap();
+        let (base, count) = (chunk["base"].as_u64().unwrap(), chunk["count"].as_u64().unwrap());
+        assert_eq!(base, (index * CHUNK_NODES) as u64);
+        match index {
+            0 => assert!((FIRST_NODES as u64 - 64..=FIRST_NODES as u64).contains(&count)),
+            _ => assert_eq!(count, (meta["count"].as_u64().unwrap() - base).min(CHUNK_NODES as u64)),
+        }
+        nodes += count;
     }
+    assert_eq!(nodes, rad.nodes.len() as u64);
     // Sizes fall along the file, so that what is large is loaded first.
     let mean = |nodes: &[Gaussian]| nodes.iter().map(Gaussian::size).sum::<f32>() / nodes.len() as f32;
     assert!(mean(&rad.nodes[..1000]) > 4.0 * mean(&rad.nodes[CHUNK_NODES..]));
+}
+
+#[test]
+fn a_long_first_chunk_has_the_same_nodes() {
+    let splats = splats(60_000, 1, 4);
+    let (top, nodes) = tree(&splats, ORIGIN).unwrap();
+    let long = Order { top, below: nodes.len() as u64 - top, head: CHUNK_NODES as u64 };
+    let bytes = encode(&nodes, long, 1, None).unwrap();
+    assert_eq!((long.chunks().count(), long.numbers().unwrap() as usize), (2, nodes.len()));
+    assert_eq!(read(&bytes).unwrap(), read(&write(&splats, ORIGIN, None).unwrap()).unwrap());
+}
+
+#[test]
+fn siblings_are_in_one_chunk_or_follow_each_other() {
+    let leaf = |start, count| {
+        let gaussian = Gaussian::of(&splats(1, 0, 1), 0, ORIGIN);
+        Node { gaussian, children: Children { start, count, part: Part::Below } }
+    };
+    // The file has what was handed out last first: 30 children whose last comes `before` nodes after the end of the first chunk.
+    let order = |before: u64| {
+        let below = 200_000;
+        Order::new(1, below, &[leaf(0, 0), leaf(below - FIRST_NODES as u64 - before + 1, 30)])
+    };
+    for (before, head) in [(0, 0), (1, 29), (29, 1), (30, 0)] {
+        let order = order(before);
+        assert_eq!(order.head, FIRST_NODES as u64 - head, "{before}");
+        let chunks: Vec<_> = order.chunks().collect();
+        assert_eq!(
+            (chunks[0].clone(), chunks[1].start, chunks.last().unwrap().end),
+            (0..order.head, order.head, 200_001)
+        );
+        assert_eq!((order.number(order.head - 1), order.number(order.head)), (order.head - 1, CHUNK_NODES as u64));
+    }
+    let one = Order::new(1, CHUNK_NODES as u64 - 1, &[]);
+    assert!(one.chunks().eq(std::iter::once(0..one.nodes())));
+    assert_eq!(one.numbers().unwrap(), CHUNK_NODES as u32);
+    assert_eq!(Order::new(0, 0, &[]).chunks().count(), 0);
 }
 
 #[test]
@@ -126,9 +179,9 @@ fn what_cannot_be_written_is_refused() {
     let mut splats = splats(3, 0, 1);
     splats.columns_mut()[column::MEAN][1] = f32::NAN;
     assert!(write(&splats, ORIGIN, None).unwrap_err().0.contains("splat 1"));
-    assert!(Order { top: 1, below: u64::from(u32::MAX) }.count().is_err());
+    assert!(Order::new(1, u64::from(u32::MAX), &[]).numbers().is_err());
     let bounds = Bounds::new().encoding();
-    assert!(header(Order { top: 1, below: 1 << 31 }, &[9; 40_000], &bounds, 0, None).is_err());
+    assert!(header(Order::new(1, 1 << 31, &[]), &[9; 40_000], &bounds, 0, None).is_err());
 }
 
 #[test]
