@@ -88,6 +88,13 @@ pub(crate) fn run(args: &StabilityArgs, output: &Output) -> Result<(), Failure> 
         .into_iter()
         .filter_map(|line| if let PartLine::Stability(line) = line { Some(line) } else { None })
         .collect();
+    for of in &args.captures {
+        let known = of.name.as_ref().is_some_and(|name| args.cases.iter().any(|case| case.name == *name));
+        if !known {
+            let given = of.name.clone().unwrap_or_else(|| of.path.display().to_string());
+            return Err(BadInput::new(given, "is no case that is run", "give captures as CASE=PATH").into());
+        }
+    }
     let mut lines: Vec<Stability> = Vec::new();
     let mut rows = Vec::new();
     for case in &args.cases {
