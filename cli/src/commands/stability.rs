@@ -216,6 +216,9 @@ fn measured(stage: &Stage, line: Stability, args: &StabilityArgs, output: &Outpu
     let capture = &stage.trained_on[usize::from(line.on)];
     let trained = match train::train(&train_args(capture, &out, line.seed, &line.options[1])?, output) {
         Err(Failure::Input(refused)) if stage.case.counter == Counter::Refusal => {
+            // The line is kept, and the folder is this machine's.
+            let folder = capture.canonicalize().unwrap_or_else(|_| capture.clone());
+            let refused = refused.replace(&format!("{}/", folder.display()), "");
             return Ok(Stability { refused: Some(refused), ..line });
         }
         other => other?,
