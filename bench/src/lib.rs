@@ -18,7 +18,7 @@ use scene::BadInput;
 use serde::{Deserialize, Serialize};
 use store::file::SaveError;
 
-pub use chart::chart;
+pub use chart::{chart, pruning_chart};
 pub use judged::Judged;
 pub use parts::{PartLine, append_part};
 pub use report_line::ReportLine;

@@ -5,7 +5,7 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 use store::file::SaveError;
 
-use crate::{CurvePoint, Judged};
+use crate::{CurvePoint, Judged, ResultLine};
 
 /// A measurement of one component, as one line of JSON.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -361,6 +361,29 @@ pub struct TreeFaces {
     pub step: Option<f64>,
     /// PSNR in the same regions of a model of the same capture without faces, dB.
     pub without_psnr: Option<[Option<f64>; 2]>,
+}
+
+impl Prune {
+    /// The pruned model as a run, by its order.
+    pub(crate) fn as_run(&self) -> ResultLine {
+        ResultLine {
+            label: self.order.clone(),
+            commit: self.commit.clone(),
+            machine: self.machine.clone(),
+            scene: self.scene.clone(),
+            downscale: self.downscale,
+            // Each number of splats is a configuration of its own.
+            budget: u32::try_from(self.splats).ok(),
+            tolerance_db: self.tolerance_db,
+            psnr: self.held_out_psnr[1],
+            splats: Some(self.splats),
+            judged: self.judged.clone(),
+            cpu_seconds: self.cpu_seconds,
+            seed: Some(0),
+            command: self.command.clone(),
+            ..ResultLine::default()
+        }
+    }
 }
 
 impl PartLine {

@@ -249,7 +249,7 @@ pub(crate) struct ScaleArgs {
 
 #[derive(Debug, Clone, Args)]
 pub(crate) struct ChartArgs {
-    /// Folder of result lines; chart.svg is written there
+    /// Folder of result lines; chart.svg is written there, and prune.svg of the lines that detectors judged
     #[arg(long, value_name = "DIR", default_value = "bench/results")]
     pub(crate) results: PathBuf,
     /// Folder of other trainers' figures; by default bench/reference if it exists
