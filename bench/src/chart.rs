@@ -7,7 +7,8 @@ mod panel;
 
 use std::fmt::Write;
 
-use crate::{Averaged, ResultLine, averaged, scenes};
+use crate::parts::Prune;
+use crate::{Averaged, PartLine, ResultLine, averaged, scenes};
 use panel::{GAP, Measure, Point, ROW, Series, escape, panel};
 
 const LEFT: f64 = 8.0;
@@ -27,6 +28,11 @@ const COLOURS: [(&str, &str); 6] = [
 /// Strokes that tell a colour's labels apart.
 const STROKES: [&str; 3] = ["", " dotted", " dash-dot"];
 
+/// The title of the chart of runs.
+const TITLE: &str = "Held-out views: quality over CPU time and over splats";
+/// The title of the chart of pruning.
+const PRUNING: &str = "Held-out views after pruning: quality and what detectors find over splats and over CPU time";
+
 /// A scene and its panels.
 type Row<'a> = (&'a str, Vec<(Measure, Vec<Series>)>);
 
@@ -34,6 +40,18 @@ type Row<'a> = (&'a str, Vec<(Measure, Vec<Series>)>);
 /// is drawn as its curve over time; with several, as one point each, joined by a line. Measures without values have no panel, scenes
 /// without runs and references no row.
 pub fn chart(lines: &[ResultLine], reference: &[ResultLine]) -> String {
+    drawn(TITLE, lines, reference)
+}
+
+/// Draws what is left of models after pruning, of the lines that detectors judged: a line for each order. `None` without
+/// such lines.
+pub fn pruning_chart(lines: &[PartLine]) -> Option<String> {
+    let of_prune = lines.iter().filter_map(|line| if let PartLine::Prune(line) = line { Some(line) } else { None });
+    let judged: Vec<ResultLine> = of_prune.filter(|line| !line.judged.is_empty()).map(Prune::as_run).collect();
+    (!judged.is_empty()).then(|| drawn(PRUNING, &judged, &[]))
+}
+
+fn drawn(title: &str, lines: &[ResultLine], reference: &[ResultLine]) -> String {
     let [runs, references] = [lines, reference].map(averaged);
     let scenes = scenes(runs.iter().chain(&references).map(|run| &run.line));
     let labels = labels(&runs);
@@ -53,9 +71,9 @@ pub fn chart(lines: &[ResultLine], reference: &[ResultLine]) -> String {
     let height = header + (NAME + ROW) * rows.len() as f64 + 8.0;
     let mut svg = format!(
         "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {width} {height}\" width=\"{width}\" height=\"{height}\" \
-         role=\"img\" aria-label=\"Quality of held-out views over CPU seconds and splats\">\n<style>\n{}</style>\n\
+         role=\"img\" aria-label=\"{title}\">\n<style>\n{}</style>\n\
          <rect class=\"card\" x=\"0.5\" y=\"0.5\" width=\"{}\" height=\"{}\" rx=\"8\"/>\n\
-         <text class=\"title\" x=\"20\" y=\"28\">Held-out views: quality over CPU time and over splats</text>\n{legend}",
+         <text class=\"title\" x=\"20\" y=\"28\">{title}</text>\n{legend}",
         style(),
         width - 1.0,
         height - 1.0
@@ -180,8 +198,8 @@ fn style() -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::KindFigures;
     use crate::tests::line;
+    use crate::{Judged, KindFigures};
 
     /// The panels of a chart, each as text.
     fn panels(svg: &str) -> Vec<&str> {
@@ -267,5 +285,46 @@ mod tests {
         let svg = chart(&[line("plat", "fox", &[(10.0, 20.0)])], &[]);
         assert!(svg.contains("<circle") && !svg.contains("NaN"));
         assert!(!chart(&[], &[]).contains("NaN"));
+    }
+
+    #[test]
+    fn pruned_models_are_drawn_by_order_where_detectors_judged_them() {
+        let line = |order: &str, splats: u64, misses: u64, judges: usize| {
+            let judged = Judged {
+                detector: "d.onnx".into(),
+                objects: 10,
+                misses,
+                extra: 0,
+                map: Some(0.5),
+                mean_iou: None,
+                zone_psnr: Some(20.0),
+            };
+            PartLine::Prune(Prune {
+                commit: "c".into(),
+                machine: "m".into(),
+                scene: "street".into(),
+                downscale: 1,
+                order: order.into(),
+                keep: Some(0.5),
+                recovery_steps: Some(9),
+                tolerance_db: None,
+                splats_before: 1000,
+                splats,
+                held_in_psnr: [25.0, 24.0],
+                held_out_psnr: [24.0, 23.0],
+                judged: vec![judged; judges],
+                cpu_seconds: 3.0,
+                command: "plat".into(),
+            })
+        };
+        assert_eq!(pruning_chart(&[line("energy", 500, 1, 0)]), None);
+        let lines = [line("energy", 500, 4, 2), line("energy", 250, 5, 2), line("energy-zones", 500, 2, 2)];
+        let svg = pruning_chart(&lines).unwrap();
+        let kept =
+            panels(&svg).into_iter().find(|panel| panel.contains("splats") && panel.contains("objects kept, share"));
+        let kept = kept.expect("a panel of the objects kept over splats");
+        assert!(kept.contains("energy, 500 splats: 0.600") && kept.contains("energy, 250 splats: 0.500"), "{kept}");
+        assert!(kept.contains("energy-zones: 0.800"), "{kept}");
+        assert_eq!(svg.matches("class=\"panel\"").count(), 6);
     }
 }

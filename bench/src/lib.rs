@@ -4,6 +4,7 @@
 //! other trainers' figures ([`reference`]). Lines with a `kind` are measurements of a component ([`PartLine`]).
 
 pub mod chart;
+mod judged;
 pub mod parts;
 pub mod reference;
 mod report_line;
@@ -17,7 +18,8 @@ use scene::BadInput;
 use serde::{Deserialize, Serialize};
 use store::file::SaveError;
 
-pub use chart::chart;
+pub use chart::{chart, pruning_chart};
+pub use judged::Judged;
 pub use parts::{PartLine, append_part};
 pub use report_line::ReportLine;
 pub use seeds::{Averaged, averaged};
@@ -72,8 +74,11 @@ pub struct ResultLine {
     pub perceptual: Option<f64>,
     /// PSNR inside object zones, dB.
     pub zone_psnr: Option<f64>,
-    /// Share of the detections on photos that are also detected on renders.
+    /// Share of the detections on photos that are also detected on renders, of the first detector.
     pub detections_kept: Option<f64>,
+    /// What each detector finds on the held-out views.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub judged: Vec<Judged>,
     /// Mean relative error of the rendered depth over held-out views.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub depth_absrel: Option<f64>,
@@ -172,7 +177,8 @@ impl ResultLine {
         let numbers = [Some(self.cpu_seconds), Some(self.psnr), self.wall_seconds, self.ssim, self.lpips];
         let more = [self.tolerance_db, self.cc_psnr, self.perceptual, self.zone_psnr, self.detections_kept, self.fps];
         let depth = [self.depth_absrel, self.depth_delta1];
-        numbers.iter().chain(&more).chain(&depth).flatten().all(|v| v.is_finite())
+        self.judged.iter().all(Judged::is_finite)
+            && numbers.iter().chain(&more).chain(&depth).flatten().all(|v| v.is_finite())
             && [self.aerial, self.street].iter().flatten().all(KindFigures::is_finite)
             && self.curve.iter().all(|p| p.cpu_seconds.is_finite() && p.psnr.is_finite())
     }
@@ -220,6 +226,24 @@ pub fn read(path: &Path) -> Result<Vec<ResultLine>, BadInput> {
             |what: String| BadInput::new(format!("{name}:{}", i + 1), what, "restore the line from version control");
         let line: ResultLine = serde_json::from_str(line).map_err(|e| bad(format!("is not a result line: {e}")))?;
         if line.is_finite() { Ok(line) } else { Err(bad("has a number that is not finite".into())) }
+    };
+    lines.map(parse).collect()
+}
+
+/// The measurements of parts in a results file.
+///
+/// # Errors
+/// As [`read`].
+pub fn read_parts(path: &Path) -> Result<Vec<PartLine>, BadInput> {
+    let name = path.display().to_string();
+    let refuse = |e: std::io::Error| BadInput::new(name.clone(), format!("cannot be read: {e}"), "check the path");
+    let text = fs::read_to_string(path).map_err(refuse)?;
+    let lines = text.lines().enumerate().filter(|(_, line)| is_part(line));
+    let parse = |(i, line): (usize, &str)| {
+        serde_json::from_str(line).map_err(|e| {
+            let problem = format!("is not a measurement: {e}");
+            BadInput::new(format!("{name}:{}", i + 1), problem, "restore the line from version control")
+        })
     };
     lines.map(parse).collect()
 }

@@ -5,7 +5,7 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 use store::file::SaveError;
 
-use crate::CurvePoint;
+use crate::{CurvePoint, Judged, ResultLine};
 
 /// A measurement of one component, as one line of JSON.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -23,6 +23,8 @@ pub enum PartLine {
     Ablation(Ablation),
     /// A job on a cluster.
     Scale(Scale),
+    /// A known failure, without or with its counter-measure.
+    Stability(Stability),
 }
 
 /// Median times of the renderer's passes.
@@ -224,8 +226,11 @@ pub struct Prune {
     pub downscale: u32,
     /// Order of pruning.
     pub order: String,
-    /// Share kept, without recovery; null with a tolerance.
+    /// Share kept; null with a tolerance.
     pub keep: Option<f64>,
+    /// Training steps after cuts; null in lines of a share from before it was recorded, which had none.
+    #[serde(default)]
+    pub recovery_steps: Option<u32>,
     /// Allowed loss on the views that it was pruned by after recovery, dB.
     pub tolerance_db: Option<f64>,
     /// Number of splats before.
@@ -236,7 +241,54 @@ pub struct Prune {
     pub held_in_psnr: [f64; 2],
     /// PSNR on the held-out views: before and after, dB.
     pub held_out_psnr: [f64; 2],
+    /// What detectors find on the held-out views, after.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub judged: Vec<Judged>,
     /// User and system time of all threads, seconds.
+    pub cpu_seconds: f64,
+    /// The command that wrote the line.
+    pub command: String,
+}
+
+/// A model trained on a capture with a known failure. Figures are means over the held-out views.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Stability {
+    /// The program's git commit.
+    pub commit: String,
+    /// See [`crate::machine`].
+    pub machine: String,
+    /// The failure.
+    pub case: String,
+    /// The capture's name; `generated` if the case made it.
+    pub capture: String,
+    /// Whether the counter-measure is on.
+    pub on: bool,
+    /// The counter-measure; null if there is none.
+    pub counter: Option<String>,
+    /// Seed of the training.
+    pub seed: u64,
+    /// Options of `plat synth` for the capture, and of `plat train`.
+    pub options: [String; 2],
+    /// The line that the capture was refused with. Then there are no figures.
+    pub refused: Option<String>,
+    /// Of all views, dB.
+    pub psnr: Option<f64>,
+    /// Of the street views, where there are aerial ones too, dB.
+    pub street_psnr: Option<f64>,
+    /// With an exposure fitted to the left half of each photo, of the right half, dB.
+    pub fitted_psnr: Option<f64>,
+    /// Structural similarity.
+    pub ssim: Option<f64>,
+    /// Mean error of depths as a share of the true one.
+    pub depth_absrel: Option<f64>,
+    /// PSNR near the faces between blocks less that elsewhere, dB.
+    pub seam_db: Option<f64>,
+    /// What detectors find.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub judged: Vec<Judged>,
+    /// Number of splats.
+    pub splats: u64,
+    /// User and system time of all threads in training, seconds.
     pub cpu_seconds: f64,
     /// The command that wrote the line.
     pub command: String,
@@ -311,6 +363,29 @@ pub struct TreeFaces {
     pub without_psnr: Option<[Option<f64>; 2]>,
 }
 
+impl Prune {
+    /// The pruned model as a run, by its order.
+    pub(crate) fn as_run(&self) -> ResultLine {
+        ResultLine {
+            label: self.order.clone(),
+            commit: self.commit.clone(),
+            machine: self.machine.clone(),
+            scene: self.scene.clone(),
+            downscale: self.downscale,
+            // Each number of splats is a configuration of its own.
+            budget: u32::try_from(self.splats).ok(),
+            tolerance_db: self.tolerance_db,
+            psnr: self.held_out_psnr[1],
+            splats: Some(self.splats),
+            judged: self.judged.clone(),
+            cpu_seconds: self.cpu_seconds,
+            seed: Some(0),
+            command: self.command.clone(),
+            ..ResultLine::default()
+        }
+    }
+}
+
 impl PartLine {
     fn is_finite(&self) -> bool {
         match self {
@@ -325,10 +400,13 @@ impl PartLine {
                 let ceilings = [line.ceiling_gflops, line.ceiling_gbytes].into_iter().flatten();
                 passes.into_iter().chain(walls).chain(of_stages).chain(ceilings).all(f64::is_finite)
             }
-            Self::Prune(line) => (line.held_in_psnr.iter().chain(&line.held_out_psnr))
-                .chain([&line.cpu_seconds])
-                .chain(line.keep.iter().chain(&line.tolerance_db))
-                .all(|value| value.is_finite()),
+            Self::Prune(line) => {
+                line.judged.iter().all(Judged::is_finite)
+                    && (line.held_in_psnr.iter().chain(&line.held_out_psnr))
+                        .chain([&line.cpu_seconds])
+                        .chain(line.keep.iter().chain(&line.tolerance_db))
+                        .all(|value| value.is_finite())
+            }
             Self::Tree(line) => {
                 let of_levels = line.levels.iter().flat_map(|level| level.away_psnr.into_iter().chain([level.psnr]));
                 let of_faces = line.faces.iter().flat_map(|faces| {
@@ -340,6 +418,13 @@ impl PartLine {
                     .chain(line.budgets.iter().flat_map(|of| of.psnr))
                     .flatten()
                     .all(f64::is_finite)
+            }
+            Self::Stability(line) => {
+                let figures =
+                    [line.psnr, line.street_psnr, line.fitted_psnr, line.ssim, line.depth_absrel, line.seam_db];
+                figures.into_iter().flatten().all(f64::is_finite)
+                    && line.cpu_seconds.is_finite()
+                    && line.judged.iter().all(Judged::is_finite)
             }
             Self::Scale(line) => line.job_seconds.is_finite() && line.cpu_seconds.is_finite(),
             Self::Ablation(line) => {

@@ -85,6 +85,8 @@ fn mean(last: &ResultLine, runs: &[&ResultLine], variant: String) -> Averaged {
         lpips: maybe(&|run| run.lpips),
         perceptual: maybe(&|run| run.perceptual),
         detections_kept: maybe(&|run| run.detections_kept),
+        // Counts of one training say nothing of the others.
+        judged: if runs.len() == 1 { last.judged.clone() } else { Vec::new() },
         depth_absrel: maybe(&|run| run.depth_absrel),
         depth_delta1: maybe(&|run| run.depth_delta1),
         aerial: mean_kind(runs, |run| run.aerial),

@@ -5,6 +5,8 @@
 //! | exposure drift | shots | the gain varies between ⅓ and 3 over some tens of seconds |
 //! | motion blur | shots | 1/15 s of exposure, and the mount shakes |
 //! | pose noise | shots | errors of reported poses of 0.5 m and 2° (1σ) |
+//! | clock skew | shots | the cameras' clocks differ: reported poses are of another time, 0.1 s off (1σ) |
+//! | wrong calibration | shots | errors of focal lengths of 2 %, and of mounts of 5 cm and 0.5° (1σ) |
 //! | sparse views | shots | nine of ten shots are missing |
 //! | sensor dropout | shots, sweeps | each sensor gives no data for half the time, in stretches of 2 s |
 //! | night | light, image | moonlight, lamps and lit rooms, sensor noise |
@@ -54,6 +56,10 @@ named_enum!(
         TexturelessRoad = "textureless-road",
         /// Spots on the lens.
         LensDirt = "lens-dirt",
+        /// Cameras whose clocks differ.
+        ClockSkew = "clock-skew",
+        /// Errors of the cameras' focal lengths and mounts.
+        WrongCalibration = "wrong-calibration",
     }
 );
 
@@ -97,6 +103,8 @@ pub fn degrade_shots(mut shots: Vec<Shot>, faults: &[Fault]) -> Vec<Shot> {
             FaultKind::ExposureDrift => shots.iter_mut().for_each(|shot| drift_exposure(shot, fault)),
             FaultKind::MotionBlur => shots.iter_mut().for_each(|shot| blur_motion(shot, fault)),
             FaultKind::PoseNoise => shots.iter_mut().for_each(|shot| perturb_pose(shot, fault)),
+            FaultKind::ClockSkew => shots.iter_mut().for_each(|shot| skew_clock(shot, fault)),
+            FaultKind::WrongCalibration => shots.iter_mut().for_each(|shot| miscalibrate(shot, fault)),
             FaultKind::SparseViews => {
                 shots.retain(|shot| named_random(fault, &shot.name).unit() >= 0.9 * fault.strength)
             }
@@ -151,13 +159,37 @@ fn blur_motion(shot: &mut Shot, fault: &Fault) {
 
 fn perturb_pose(shot: &mut Shot, fault: &Fault) {
     let mut random = named_random(fault, &shot.name);
-    let mut normal = || f64::from(random.normal());
     let strength = f64::from(fault.strength);
-    let shift = DVec3::new(normal(), normal(), normal()) * 0.5 * strength;
-    let turn = DVec3::new(normal(), normal(), normal()) * (2.0 * strength).to_radians();
+    let mut error = |scale: f64| normals(&mut random) * scale * strength;
+    let (shift, turn) = (error(0.5), error(2f64.to_radians()));
     let pose = shot.reported.camera_from_world.inverse();
     let rotation = (DQuat::from_scaled_axis(turn) * pose.rotation).normalize();
     shot.reported.camera_from_world = Rigid { rotation, translation: pose.translation + shift }.inverse();
+}
+
+fn normals(random: &mut Random) -> DVec3 {
+    let mut normal = || f64::from(random.normal());
+    DVec3::new(normal(), normal(), normal())
+}
+
+/// The pose of another time, the same time off in all shots of a sensor.
+fn skew_clock(shot: &mut Shot, fault: &Fault) {
+    let seconds = f64::from(named_random(fault, &shot.sensor).normal()) * 0.1 * f64::from(fault.strength);
+    let pose = shot.reported.camera_from_world.inverse();
+    shot.reported.camera_from_world = shot.motion.extrapolate(&pose, seconds).inverse();
+}
+
+/// The same errors in all shots of a sensor.
+fn miscalibrate(shot: &mut Shot, fault: &Fault) {
+    let mut random = named_random(fault, &shot.sensor);
+    let strength = f64::from(fault.strength);
+    let scale = 1.0 + 0.02 * f64::from(random.normal()) * strength;
+    let mut error = |scale: f64| normals(&mut random) * scale * strength;
+    let (shift, turn) = (error(0.05), error(0.5f64.to_radians()));
+    shot.reported.pinhole.fx *= scale;
+    shot.reported.pinhole.fy *= scale;
+    let wrong = Rigid { rotation: DQuat::from_scaled_axis(turn), translation: shift };
+    shot.reported.camera_from_world = wrong.compose(&shot.reported.camera_from_world);
 }
 
 #[cfg(test)]

@@ -22,7 +22,7 @@ use values::{minutes, seconds};
 
 pub(crate) use bench::{
     AblateArgs, AdaptiveArgs, BenchCommand, BenchDemoArgs, BenchPruneArgs, BenchTreeArgs, ChartArgs, IngestArgs,
-    KernelsArgs, ParetoArgs, ScaleArgs,
+    KernelsArgs, ParetoArgs, ScaleArgs, StabilityArgs,
 };
 pub(crate) use cluster::{
     Connection, CoordinatorArgs, JobArgs, JobsArgs, LogFormat, LogsArgs, RetryArgs, ServeArgs, StatusArgs, SubmitArgs,

@@ -23,6 +23,7 @@ mod remote;
 mod result_lines;
 mod run_record;
 mod signals;
+mod stability_cases;
 mod telemetry_setup;
 
 use std::process::ExitCode;
@@ -75,7 +76,8 @@ fn main() -> ExitCode {
         Command::Bench(BenchCommand::Chart(args)) => commands::bench::chart(args, &output),
         Command::Bench(BenchCommand::Kernels(args)) => commands::kernels::run(args, &output),
         Command::Bench(BenchCommand::Ingest(args)) => commands::bench::ingest(args, &output),
-        Command::Bench(BenchCommand::Prune(args)) => commands::prune::bench(args, &output),
+        Command::Bench(BenchCommand::Stability(args)) => commands::stability::run(args, &output),
+        Command::Bench(BenchCommand::Prune(args)) => commands::prune_orders::run(args, &output),
         Command::Bench(BenchCommand::Tree(args)) => commands::bench::tree(args, &output),
         Command::Bench(BenchCommand::Scale(args)) => commands::scale::scale(args, &output),
         Command::Bench(BenchCommand::Adaptive(args)) => commands::bench::adaptive(args, &output),

@@ -92,6 +92,7 @@ impl Record {
             perceptual: self.perceptual,
             zone_psnr: self.zone_psnr,
             detections_kept: self.detections_kept,
+            judged: Vec::new(),
             depth_absrel: None,
             depth_delta1: None,
             aerial: None,

@@ -10,6 +10,7 @@
 mod against_truth;
 mod birdseye;
 mod budgets;
+mod compared;
 mod correlation;
 mod depth;
 mod details;
@@ -41,6 +42,7 @@ pub mod seams;
 pub use against_truth::AgainstTruth;
 pub use birdseye::{birdseye_camera, oblique_camera};
 pub use budgets::BudgetFigures;
+pub use compared::side_by_side;
 pub use correlation::Correlation;
 pub use depth::{DepthFigures, DepthSummary};
 pub use details::{DetailOptions, Details, Levels};

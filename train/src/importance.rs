@@ -16,14 +16,16 @@ use crate::view::TrainView;
 
 /// An importance measure by which splats are ordered for pruning.
 ///
-/// Opacity, opacity times volume, Σ αT, largest αT (RadSplat), Σ αT times a power of the volume (LightGaussian), the
-/// determinant of the Fisher information (PUP 3D-GS) and the exact error of removing each splat alone gave worse
-/// results; see ARCHITECTURE.
+/// [`Order::Energy`] is used; the others are what it is compared with. More were tried (decision 0012).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Order {
     /// Opacity times surface area. Needs no views.
     Surface,
+    /// Opacity. Needs no views.
+    Opacity,
+    /// Σ αT over pixels and views, times a power of the volume (LightGaussian, Fan et al. 2024, equations 3 and 4).
+    LightGaussian,
     /// Σ (dI/dg)² over pixels and views, where g is the splat's projected value (Speedy-Splat, Hanson et al. 2025).
     Squared,
     /// Σ δ² over pixels and views, in units of each view's squared error, where δ is the change of the render without
@@ -33,12 +35,14 @@ pub enum Order {
 
 impl Order {
     /// All measures, in the order of tables.
-    pub const ALL: [Self; 3] = [Self::Surface, Self::Squared, Self::Energy];
+    pub const ALL: [Self; 5] = [Self::Surface, Self::Opacity, Self::LightGaussian, Self::Squared, Self::Energy];
 
     /// The name on the command line.
     pub fn name(self) -> &'static str {
         match self {
             Self::Surface => "surface",
+            Self::Opacity => "opacity",
+            Self::LightGaussian => "light-gaussian",
             Self::Squared => "squared",
             Self::Energy => "energy",
         }
@@ -48,11 +52,24 @@ impl Order {
 /// Opacity times surface area of each splat, up to a constant factor, m².
 pub fn surfaces(splats: &Splats) -> Vec<f64> {
     let area = |i: usize| {
-        let opacity = 1.0 / (1.0 + (-f64::from(splats.col(column::OPACITY)[i])).exp());
         let [a, b, c] = scales(splats, i);
-        opacity * (a * b + b * c + c * a)
+        opacity(splats, i) * (a * b + b * c + c * a)
     };
     (0..splats.len()).map(area).collect()
+}
+
+/// LightGaussian's factor for each splat: its volume as a share of one that nine of ten fall below, at most 1, to the
+/// power of 0.1.
+fn volume_factors(splats: &Splats) -> Vec<f64> {
+    let volumes: Vec<f64> = (0..splats.len()).map(|i| scales(splats, i).iter().product()).collect();
+    let mut sorted = volumes.clone();
+    sorted.sort_by(f64::total_cmp);
+    let large = sorted.get(splats.len() * 9 / 10).map_or(1.0, |volume| volume.max(f64::MIN_POSITIVE));
+    volumes.iter().map(|volume| (volume / large).min(1.0).powf(0.1)).collect()
+}
+
+fn opacity(splats: &Splats, i: usize) -> f64 {
+    1.0 / (1.0 + (-f64::from(splats.col(column::OPACITY)[i])).exp())
 }
 
 /// Standard deviations, metres.
@@ -146,19 +163,25 @@ impl<'a> EvaluationViews<'a> {
     /// # Errors
     /// A window that cannot be read.
     pub fn importance(&self, order: Order, splats: &Splats) -> Result<Vec<f64>, TrainError> {
-        if order == Order::Surface {
-            return Ok(surfaces(splats));
+        match order {
+            Order::Surface => return Ok(surfaces(splats)),
+            Order::Opacity => return Ok((0..splats.len()).map(|i| opacity(splats, i)).collect()),
+            _ => {}
         }
         let mut total = vec![0.0; splats.len()];
         self.compare(splats, None, |renderer, compared| {
             let contributions = renderer.contributions(compared.weights);
             let (values, unit) = match order {
                 Order::Squared => (&contributions.squared, 1.0),
+                Order::LightGaussian => (&contributions.weight, compared.square_gain.max(1e-9)),
                 _ => (&contributions.energy, (3.0 * compared.pixels * compared.mse).max(1e-9)),
             };
             let unit = unit / compared.square_gain.max(1e-9);
             total.iter_mut().zip(values).for_each(|(total, value)| *total += f64::from(*value) / unit);
         })?;
+        if order == Order::LightGaussian {
+            total.iter_mut().zip(volume_factors(splats)).for_each(|(total, factor)| *total *= factor);
+        }
         Ok(total)
     }
 

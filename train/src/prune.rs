@@ -100,9 +100,17 @@ pub struct Pruned {
     pub psnr: [f64; 2],
     /// Number of rounds whose result was kept, without the last.
     pub rounds: u32,
+    /// Training steps of all recoveries, including those of rounds that were left out.
+    pub steps: u32,
 }
 
 impl Pruning {
+    /// The same recovery, all of it after cuts.
+    fn without_warm_up(&self) -> Self {
+        let recovery_share = self.recovery_share * self.parts() as f32 / (self.rounds + 1) as f32;
+        Self { warm_up: 0, recovery_share, ..*self }
+    }
+
     /// Largest total number of recovery steps for a job of `steps` steps.
     pub fn steps(&self, steps: u32) -> u32 {
         self.fitted(steps).parts() * self.round_steps(steps)
@@ -166,7 +174,8 @@ pub fn within_tolerance(trained: Job, pruning: &Pruning, report: Report) -> Resu
     // The gain of recovery alone raises the floor, so that cuts cannot spend it.
     for round in 0..pruning.warm_up {
         let Some(recovered) = pruner.recover(best.clone(), round, report)? else {
-            let outcome = Pruned { splats: [owned; 2], psnr: [before, pruner.psnr(&best)?], rounds: 0 };
+            let psnr = [before, pruner.psnr(&best)?];
+            let outcome = Pruned { splats: [owned; 2], psnr, rounds: 0, steps: round * pruner.job.steps };
             return Ok((best, outcome));
         };
         best = recovered;
@@ -174,6 +183,7 @@ pub fn within_tolerance(trained: Job, pruning: &Pruning, report: Report) -> Resu
     let mut reached = pruner.psnr(&best)?;
     let floor = reached.max(before) - pruning.tolerance_db;
     let (mut drop_db, mut kept_rounds, mut stopped) = (pruning.drop_db, 0, false);
+    let mut recoveries = pruning.warm_up;
     for round in 0..pruning.rounds {
         let cut = pruner.cut(&best, reached - floor + drop_db, &pruner.probe)?;
         if ((best.len() - cut.len()) as f64) < MIN_CUT * pruner.owned(&best) as f64 {
@@ -183,6 +193,7 @@ pub fn within_tolerance(trained: Job, pruning: &Pruning, report: Report) -> Resu
             stopped = true;
             break;
         };
+        recoveries += 1;
         let psnr = pruner.psnr(&recovered)?;
         if psnr >= floor {
             (best, reached, kept_rounds) = (recovered, psnr, kept_rounds + 1);
@@ -193,30 +204,53 @@ pub fn within_tolerance(trained: Job, pruning: &Pruning, report: Report) -> Resu
     if !stopped {
         best = pruner.cut(&best, reached - floor, &pruner.measured)?;
         // Recovery after the last cut is for the held-out views, which lose more than the training views.
-        if let Some(recovered) = pruner.recover(best.clone(), pruning.warm_up + pruning.rounds, report)?
-            && pruner.psnr(&recovered)? >= floor
-        {
-            best = recovered;
+        if let Some(recovered) = pruner.recover(best.clone(), pruning.warm_up + pruning.rounds, report)? {
+            recoveries += 1;
+            if pruner.psnr(&recovered)? >= floor {
+                best = recovered;
+            }
         }
     }
-    let outcome =
-        Pruned { splats: [owned, pruner.owned(&best)], psnr: [before, pruner.psnr(&best)?], rounds: kept_rounds };
+    let outcome = Pruned {
+        splats: [owned, pruner.owned(&best)],
+        psnr: [before, pruner.psnr(&best)?],
+        rounds: kept_rounds,
+        steps: recoveries * pruner.job.steps,
+    };
     Ok((best, outcome))
 }
 
-/// Keeps this share of the counted splats and recovers once; otherwise as [`within_tolerance`].
+/// Keeps this share of the counted splats, in rounds that each remove the same share of the rest and recover.
+/// Otherwise as [`within_tolerance`].
 ///
 /// # Errors
 /// See [`TrainError`].
 pub fn to_share(trained: Job, pruning: &Pruning, share: f64, report: Report) -> Result<(Splats, Pruned), TrainError> {
-    let (pruner, splats) = Pruner::new(trained, &Pruning { warm_up: 0, rounds: 0, ..*pruning })?;
-    let before = [pruner.owned(&splats) as f64, pruner.psnr(&splats)?];
-    let importance = pruner.all.importance(pruning.order, &splats)?;
-    let cut = keep(&splats, &importance, share, pruner.job.counts);
-    let recovered = if cut.is_empty() { None } else { pruner.recover(cut.clone(), 0, report)? }.unwrap_or(cut);
-    let psnr = [before[1], pruner.psnr(&recovered)?];
-    let outcome = Pruned { splats: [before[0] as usize, pruner.owned(&recovered)], psnr, rounds: 1 };
-    Ok((recovered, outcome))
+    let (pruner, mut splats) = Pruner::new(trained, &pruning.without_warm_up())?;
+    let (before, psnr) = (pruner.owned(&splats), pruner.psnr(&splats)?);
+    let (rounds, mut recoveries, mut stopped) = (pruner.pruning.parts(), 0, false);
+    for round in 0..rounds {
+        // Where it was stopped, one cut is left.
+        let done = if stopped { 1.0 } else { f64::from(round + 1) / f64::from(rounds) };
+        let count = (before as f64 * share.clamp(0.0, 1.0).powf(done)).round();
+        let views = pruner.all.some(IMPORTANCE_VIEWS.for_steps(pruner.job.steps));
+        let importance = EvaluationViews { views: &views, ..pruner.all }.importance(pruning.order, &splats)?;
+        splats = keep(&splats, &importance, count / pruner.owned(&splats).max(1) as f64, pruner.job.counts);
+        if stopped || splats.is_empty() {
+            break;
+        }
+        match pruner.recover(splats.clone(), round, report)? {
+            Some(recovered) => (splats, recoveries) = (recovered, recoveries + 1),
+            None => stopped = true,
+        }
+    }
+    let outcome = Pruned {
+        splats: [before, pruner.owned(&splats)],
+        psnr: [psnr, pruner.psnr(&splats)?],
+        rounds: recoveries,
+        steps: recoveries * pruner.job.steps,
+    };
+    Ok((splats, outcome))
 }
 
 /// Keeps the given share of the counted splats, by importance, and all others. Rows keep their order.

@@ -2,7 +2,7 @@
 
 use std::fmt::Write;
 
-use crate::{CurvePoint, ResultLine};
+use crate::{CurvePoint, Judged, ResultLine};
 
 /// Height of a panel, pixels.
 pub(super) const ROW: f64 = 232.0;
@@ -28,6 +28,14 @@ pub(super) enum Measure {
     Ssimulacra2,
     /// Final LPIPS over CPU seconds.
     Lpips,
+    /// Share of the objects that detectors find on photos and also on renders, over splats.
+    KeptOverSplats,
+    /// Mean average precision over splats, mean of the detectors.
+    PrecisionOverSplats,
+    /// PSNR where photos have objects over splats, mean of the detectors.
+    ZonesOverSplats,
+    /// Share of the objects over CPU seconds.
+    KeptOverTime,
 }
 
 /// A point of a panel.
@@ -49,8 +57,18 @@ pub(super) struct Series {
 }
 
 impl Measure {
-    pub(super) const ALL: [Self; 6] =
-        [Self::PsnrOverTime, Self::Street, Self::Aerial, Self::PsnrOverSplats, Self::Ssimulacra2, Self::Lpips];
+    pub(super) const ALL: [Self; 10] = [
+        Self::PsnrOverTime,
+        Self::Street,
+        Self::Aerial,
+        Self::PsnrOverSplats,
+        Self::Ssimulacra2,
+        Self::Lpips,
+        Self::KeptOverSplats,
+        Self::PrecisionOverSplats,
+        Self::ZonesOverSplats,
+        Self::KeptOverTime,
+    ];
 
     pub(super) fn width(self) -> f64 {
         if matches!(self, Self::PsnrOverTime | Self::Street) { 400.0 } else { 250.0 }
@@ -64,15 +82,19 @@ impl Measure {
             Self::PsnrOverSplats => ("splats", "PSNR, dB"),
             Self::Ssimulacra2 => ("CPU time, seconds", "SSIMULACRA2"),
             Self::Lpips => ("CPU time, seconds", "LPIPS, lower is better"),
+            Self::KeptOverSplats => ("splats", "objects kept, share"),
+            Self::PrecisionOverSplats => ("splats", "mAP of detectors"),
+            Self::ZonesOverSplats => ("splats", "PSNR of objects, dB"),
+            Self::KeptOverTime => ("CPU time, seconds", "objects kept, share"),
         }
     }
 
     /// Minimum span of the axis, and digits of a figure.
     fn span(self) -> (f64, usize) {
         match self {
-            Self::PsnrOverTime | Self::Street | Self::Aerial | Self::PsnrOverSplats => (4.0, 2),
+            Self::PsnrOverTime | Self::Street | Self::Aerial | Self::PsnrOverSplats | Self::ZonesOverSplats => (4.0, 2),
             Self::Ssimulacra2 => (10.0, 1),
-            Self::Lpips => (0.1, 3),
+            Self::Lpips | Self::KeptOverSplats | Self::PrecisionOverSplats | Self::KeptOverTime => (0.1, 3),
         }
     }
 
@@ -98,6 +120,10 @@ impl Measure {
             Self::PsnrOverSplats => (line.splats? as f64, line.psnr),
             Self::Ssimulacra2 => (line.cpu_seconds, line.perceptual?),
             Self::Lpips => (line.cpu_seconds, line.lpips?),
+            Self::KeptOverSplats => (line.splats? as f64, kept(line)?),
+            Self::PrecisionOverSplats => (line.splats? as f64, mean(line, |of| of.map)?),
+            Self::ZonesOverSplats => (line.splats? as f64, mean(line, |of| of.zone_psnr)?),
+            Self::KeptOverTime => (line.cpu_seconds, kept(line)?),
         };
         let digits = self.span().1;
         let splats = line.splats.map(|n| format!(", {n} splats")).unwrap_or_default();
@@ -105,6 +131,18 @@ impl Measure {
         let title = format!("{}{variant}: {y:.digits$} after {:.1} CPU s{splats}", line.label, line.cpu_seconds);
         (x > 0.0).then_some(Point { x, y, title })
     }
+}
+
+/// Share of the objects on photos that are found on renders too, of all detectors.
+fn kept(line: &ResultLine) -> Option<f64> {
+    let sum = |count: fn(&Judged) -> u64| line.judged.iter().map(count).sum::<u64>() as f64;
+    let objects = sum(|of| of.objects);
+    (objects > 0.0).then(|| 1.0 - sum(|of| of.misses) / objects)
+}
+
+fn mean(line: &ResultLine, figure: fn(&Judged) -> Option<f64>) -> Option<f64> {
+    let sum = line.judged.iter().map(figure).sum::<Option<f64>>()?;
+    (!line.judged.is_empty()).then(|| sum / line.judged.len() as f64)
 }
 
 /// Maps values to the panel's pixels.

@@ -6,7 +6,7 @@ use crate::{
     City, CitySettings, Class,
     faults::{self, Fault, FaultKind},
     random::Random,
-    sense::{Shot, camera_towards, pinhole},
+    sense::{Motion, Shot, camera_towards, pinhole},
     test_scene,
 };
 
@@ -216,6 +216,7 @@ fn every_fault_changes_nothing_at_zero_and_something_at_one() {
         .map(|i| {
             let mut shot = shot(DVec3::new(-10.0, -12.0, 2.0), DVec3::new(-8.0, 0.0, 1.0), 2.0 + f64::from(i));
             shot.name = format!("test-{i}");
+            shot.motion = Motion { velocity: DVec3::new(9.0, 3.0, 0.0), spin: DVec3::ZERO };
             shot
         })
         .collect();
@@ -234,6 +235,15 @@ fn every_fault_changes_nothing_at_zero_and_something_at_one() {
             FaultKind::PoseNoise => {
                 let off = |s: &Shot| s.reported.centre().distance(s.camera.centre());
                 assert!(degraded.iter().all(|s| (0.01..3.0).contains(&off(s))) && full.rgb == plain.rgb);
+            }
+            FaultKind::ClockSkew => {
+                let off = |s: &Shot| s.reported.centre().distance(s.camera.centre());
+                assert!(degraded.iter().all(|s| off(s) > 0.01 && (off(s) - off(&degraded[0])).abs() < 1e-9));
+            }
+            FaultKind::WrongCalibration => {
+                let first = degraded[0].reported.pinhole;
+                assert!(first.fx != shots[0].reported.pinhole.fx && (first.fx / first.fy - 1.0).abs() < 1e-9);
+                assert!(degraded.iter().all(|s| s.reported.pinhole == first) && full.rgb == plain.rgb);
             }
             FaultKind::SparseViews => assert!((1..12).contains(&degraded.len()), "{}", degraded.len()),
             FaultKind::SensorDropout => assert!((8..32).contains(&degraded.len()), "{}", degraded.len()),

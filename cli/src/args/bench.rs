@@ -8,9 +8,10 @@ use train::importance::Order;
 
 use super::DemoArgs;
 use super::model::PruneCapture;
-use super::sweep::Sweep;
+use super::sweep::{Named, Sweep};
 use super::values::{Auto, Backend, Size, decibels, metres, order, share, views_per_step};
 use crate::ablation_variants::{self, VARIANTS, Variant};
+use crate::stability_cases::{self, CASES, Case};
 
 #[derive(Debug, Subcommand)]
 pub(crate) enum BenchCommand {
@@ -30,6 +31,8 @@ pub(crate) enum BenchCommand {
     Tree(BenchTreeArgs),
     /// Run a job on clusters of several sizes, made of processes on this machine, and append the times
     Scale(ScaleArgs),
+    /// Train on captures with known failures, without and with the counter-measure, and append the figures
+    Stability(StabilityArgs),
     /// Build the demo, and append its time and quality
     Demo(BenchDemoArgs),
     /// Train a city of which one half is a bare plain, as a tree of fixed depth and as an adaptive tree, and append both
@@ -53,9 +56,9 @@ pub(crate) struct ParetoArgs {
     /// Also measure the error of the rendered depth, see plat eval --help
     #[arg(long)]
     pub(crate) depth: bool,
-    /// Also count what this detector (ONNX) finds on photos and on renders, see plat eval --help
+    /// Also measure how far what this detector (ONNX) finds on renders is what it finds on photos, see plat eval --help. Repeatable
     #[arg(long, value_name = "FILE")]
-    pub(crate) detector: Option<PathBuf>,
+    pub(crate) detector: Vec<PathBuf>,
     #[command(flatten)]
     pub(crate) sweep: Sweep,
 }
@@ -76,6 +79,50 @@ pub(crate) struct IngestArgs {
 }
 
 #[derive(Debug, Clone, Args)]
+pub(crate) struct StabilityArgs {
+    /// Cases to run; all by default
+    #[arg(long = "case", value_name = "CASE,...", value_parser = stability_cases::named, value_delimiter = ',', default_values_t = CASES)]
+    pub(crate) cases: Vec<Case>,
+    /// Captures to use instead of generated ones, each with the case that it is for
+    #[arg(value_name = "CASE=PATH", value_parser = |text: &str| Ok::<_, String>(Named::from(PathBuf::from(text))))]
+    pub(crate) captures: Vec<Named>,
+    /// Folder for captures and models; captures that are there are used again
+    #[arg(long, value_name = "DIR")]
+    pub(crate) out: PathBuf,
+    /// Options of plat synth in all cases; those of a case replace them
+    #[arg(
+        long,
+        value_name = "OPTIONS",
+        allow_hyphen_values = true,
+        default_value = "--area-km2 0.03 --views 112 --size 320x180 --aerial 0.2 --spacing 4 --traffic light"
+    )]
+    pub(crate) synth: String,
+    /// Options of plat train in all cases; those of a case replace them
+    #[arg(
+        long,
+        value_name = "OPTIONS",
+        allow_hyphen_values = true,
+        default_value = "--steps 2000 --budget 20000 --levels 1 --threads 1"
+    )]
+    pub(crate) train: String,
+    /// Seeds of the trainings
+    #[arg(long = "seed", value_name = "S,...", value_delimiter = ',', default_value = "0,1,2")]
+    pub(crate) seeds: Vec<u64>,
+    /// Also measure how far what this detector (ONNX) finds on renders is what it finds on photos, see plat eval --help. Repeatable
+    #[arg(long, value_name = "FILE")]
+    pub(crate) detector: Vec<PathBuf>,
+    /// Folder for a picture of each case: photos, renders without and with the counter-measure
+    #[arg(long, value_name = "DIR")]
+    pub(crate) pictures: Option<PathBuf>,
+    /// File whose table between the markers is replaced by that of the cases
+    #[arg(long, value_name = "FILE")]
+    pub(crate) document: Option<PathBuf>,
+    /// Folder of result lines; these are appended to stability.jsonl
+    #[arg(long, value_name = "DIR", default_value = "bench/results")]
+    pub(crate) results: PathBuf,
+}
+
+#[derive(Debug, Clone, Args)]
 pub(crate) struct BenchPruneArgs {
     /// Folder that `plat train` wrote, or a model as PLY, SPZ, SOG, streamed SOG, RAD or 3D Tiles
     pub(crate) model: PathBuf,
@@ -84,10 +131,17 @@ pub(crate) struct BenchPruneArgs {
     /// Name of the capture in the lines; by default that of its folder
     #[arg(long)]
     pub(crate) scene: Option<String>,
-    /// Orders to compare; all by default
+    /// Orders to compare; all by default. With --detector or --zones also the order of plat prune with them
     #[arg(long, value_name = "ORDER", value_parser = order, value_delimiter = ',')]
     pub(crate) order: Vec<Order>,
-    /// Largest loss of PSNR, dB
+    /// Shares of the splats to prune to, as plat prune --keep does
+    #[arg(long, value_name = "F,...", value_parser = share, value_delimiter = ',', default_value = "0.5,0.25,0.1")]
+    pub(crate) keep: Vec<f64>,
+    /// Also measure how far what this detector (ONNX) finds on renders of held-out views is what it finds on their photos, see plat
+    /// eval --help. Repeatable
+    #[arg(long, value_name = "FILE")]
+    pub(crate) judge: Vec<PathBuf>,
+    /// Largest loss of PSNR, dB; 0 leaves this out
     #[arg(long, value_name = "X", value_parser = decibels, default_value_t = 0.1)]
     pub(crate) tolerance_db: f64,
     /// Rounds of cutting and recovery at most; by default as plat prune
@@ -195,7 +249,7 @@ pub(crate) struct ScaleArgs {
 
 #[derive(Debug, Clone, Args)]
 pub(crate) struct ChartArgs {
-    /// Folder of result lines; chart.svg is written there
+    /// Folder of result lines; chart.svg is written there, and prune.svg of the lines that detectors judged
     #[arg(long, value_name = "DIR", default_value = "bench/results")]
     pub(crate) results: PathBuf,
     /// Folder of other trainers' figures; by default bench/reference if it exists

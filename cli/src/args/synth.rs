@@ -116,7 +116,7 @@ fn around(text: &str) -> Result<VoxelRegion, String> {
 /// What `plat synth --help` adds to its options.
 const SYNTH_HELP: &str = "\
 Faults: exposure-drift, night, rain, fog, motion-blur, pose-noise, sparse-views, sensor-dropout, moving-unmasked,
-textureless-road, lens-dirt
+textureless-road, lens-dirt, clock-skew, wrong-calibration
 
 Files, of every photo NAME; the world is in metres, x east, y north, z up, the city centred on the origin:
   images/NAME.png        the photo

@@ -5,7 +5,7 @@ use std::path::Path;
 
 use ::bench::parts::{Ingest, Tree, TreeBudget, TreeFaces, TreeLevel};
 use ::bench::reference::read_references;
-use ::bench::{CurvePoint, PartLine, append_part, read_folder, replace_table, short_table, table};
+use ::bench::{CurvePoint, PartLine, append_part, read_folder, read_parts, replace_table, short_table, table};
 use city::CitySettings;
 use dataset::synth::Settings;
 use eval::cuts::CutFigures;
@@ -225,6 +225,10 @@ pub(crate) fn chart(args: &ChartArgs, output: &Output) -> Result<(), Failure> {
     let full = chapter.exists().then(|| with_table(&chapter, &table(&lines))).transpose()?;
     let path = args.results.join("chart.svg");
     save(&path, ::bench::chart(&runs, &references).as_bytes())?;
+    let pruned = args.results.join("prune.jsonl");
+    if let Some(drawn) = (if pruned.exists() { ::bench::pruning_chart(&read_parts(&pruned)?) } else { None }) {
+        save(&args.results.join("prune.svg"), drawn.as_bytes())?;
+    }
     save(&args.readme, readme.as_bytes())?;
     full.map_or(Ok(()), |document| save(&chapter, document.as_bytes()))?;
     let (count, others) = (runs.len(), references.len());

@@ -18,6 +18,7 @@ use crate::args::{Auto, Backend, Named, ParetoArgs, PlanOptions, TrainArgs};
 use crate::captures;
 use crate::clock;
 use crate::commands::eval::{Further, measure_trained, true_boxes};
+use crate::commands::prune_orders::judged;
 use crate::commands::train::{Trained, resolved, store_url, train};
 use crate::eval_report::{Evaluated, text};
 use crate::failure::{Failure, cannot};
@@ -45,11 +46,11 @@ struct Swept<'a> {
 
 pub(crate) fn run(args: &ParetoArgs, output: &Output) -> Result<(), Failure> {
     let lpips = args.lpips.as_deref().map(Lpips::load).transpose()?;
-    let detector = args.detector.as_deref().map(load_detector).transpose()?;
+    let detectors = args.detector.iter().map(|file| load_detector(file)).collect::<Result<Vec<_>, _>>()?;
     if args.sweep.train.plan.evaluate {
         return Err(BadInput::new("--evaluate", "measures what each run is measured on anyway", "leave it").into());
     }
-    let further = Further { lpips: lpips.as_ref(), detectors: detector.as_slice(), ..Further::default() };
+    let further = Further { lpips: lpips.as_ref(), detectors: &detectors, ..Further::default() };
     let runs = runs(args)?;
     let file = args.results.join(RUNS);
     let mut existing = if file.exists() { read(&file)? } else { Vec::new() };
@@ -158,7 +159,7 @@ fn known(
             && line.scene == run.scene
             && line.commit == commit()
             && line.machine == machine
-            && has_figures(line, args.depth, args.detector.is_some())
+            && has_figures(line, args.depth, args.detector.len())
     };
     if !existing.iter().any(|line| alike(&line)) {
         return Ok(None);
@@ -170,8 +171,8 @@ fn known(
 }
 
 /// Whether a line has the figures of `--depth` and `--detector` where they are asked for.
-fn has_figures(line: &ResultLine, depth: bool, detector: bool) -> bool {
-    (!depth || line.depth_delta1.is_some()) && (!detector || line.detections_kept.is_some())
+fn has_figures(line: &ResultLine, depth: bool, detectors: usize) -> bool {
+    (!depth || line.depth_delta1.is_some()) && line.judged.len() >= detectors
 }
 
 /// Trains and measures a run, with its depth if asked; returns its line and the figures as text.
@@ -201,6 +202,7 @@ fn train_and_measure(
     let line = ResultLine {
         depth_absrel: depth.and_then(|of| of.absrel),
         depth_delta1: depth.and_then(|of| of.delta1),
+        judged: evaluated.detections.iter().map(|of| judged(of.detector.clone(), &of.groups.held_out.all)).collect(),
         aerial,
         street,
         ..line_of(&run.label, &record, curve)
@@ -298,19 +300,18 @@ mod tests {
 
     #[test]
     fn a_line_without_the_figures_asked_for_does_not_stand_for_the_run() {
-        let line = |depth, kept| ResultLine {
+        let line = |depth, judges: usize| ResultLine {
             depth_delta1: depth,
-            detections_kept: kept,
+            judged: vec![judged("d.onnx".into(), &eval::DetectionSummary::default()); judges],
             ..line_of("l", &Record::new("train"), Vec::new())
         };
         let answers = |of: &ResultLine| {
-            [(false, false), (true, false), (false, true), (true, true)]
-                .map(|(depth, found)| has_figures(of, depth, found))
+            [(false, 0), (true, 0), (false, 1), (true, 2)].map(|(depth, judges)| has_figures(of, depth, judges))
         };
-        assert_eq!(answers(&line(None, None)), [true, false, false, false]);
-        assert_eq!(answers(&line(Some(0.5), None)), [true, true, false, false]);
-        assert_eq!(answers(&line(None, Some(1.0))), [true, false, true, false]);
-        assert_eq!(answers(&line(Some(0.5), Some(1.0))), [true; 4]);
+        assert_eq!(answers(&line(None, 0)), [true, false, false, false]);
+        assert_eq!(answers(&line(Some(0.5), 1)), [true, true, true, false]);
+        assert_eq!(answers(&line(None, 2)), [true, false, true, false]);
+        assert_eq!(answers(&line(Some(0.5), 2)), [true; 4]);
     }
 
     #[test]

@@ -1,10 +1,8 @@
-//! `plat prune` removes splats within a tolerance or down to a share; `plat bench prune` compares the orders to prune by.
+//! `plat prune` removes splats within a tolerance or down to a share.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::Arc;
 
-use ::bench::parts::Prune;
-use ::bench::{PartLine, append_part};
 use eval::{PhotoOptions, Photos, Pruner};
 use model::{Model, check_out, rewrite};
 use scene::{BadInput, Splats};
@@ -13,20 +11,16 @@ use train::Backend;
 use train::importance::{Order, surfaces};
 use train::prune::{self, Pruned, Pruning};
 
-use crate::args::{BenchPruneArgs, PruneArgs, PruneCapture};
+use crate::args::{PruneArgs, PruneCapture};
 use crate::captures;
 use crate::clock::{self, Stopwatch};
-use crate::failure::{Failure, make_folder};
+use crate::failure::Failure;
 use crate::observer::OutputObserver;
 use crate::output::Output;
-use crate::run_record::{Record, commit, invocation};
+use crate::run_record::Record;
 
 /// Default tolerance where no share is given, dB.
 const TOLERANCE_DB: f64 = 0.1;
-/// The file of comparisons.
-const LINES: &str = "prune.jsonl";
-/// Shares of the splats that `bench prune` cuts to without recovery.
-const SHARES: [f64; 3] = [0.8, 0.6, 0.4];
 
 #[derive(Debug, Serialize)]
 struct Report<'a> {
@@ -81,7 +75,12 @@ pub(crate) fn run(args: &PruneArgs, output: &Output) -> Result<(), Failure> {
     finish(args, model, splats, pruning.order, Some((pruned, held_out)), record, &clock, output)
 }
 
-fn photos(model: &Model, capture: &Path, options: &PruneCapture, output: &Output) -> Result<Photos, Failure> {
+pub(super) fn photos(
+    model: &Model,
+    capture: &Path,
+    options: &PruneCapture,
+    output: &Output,
+) -> Result<Photos, Failure> {
     let source = captures::open(capture, output)?;
     let PruneCapture { test_every, downscale, store, zones } = options;
     let from = captures::zone_source(zones, &source.capture)?;
@@ -136,85 +135,4 @@ fn finish(
         }
     }
     output.result(&report, &(text + &args.out.display().to_string()))
-}
-
-/// Compares the orders: cut to equal shares without recovery, and pruned within the tolerance.
-pub(crate) fn bench(args: &BenchPruneArgs, output: &Output) -> Result<(), Failure> {
-    let model = model::read(&args.model)?;
-    let photos = photos(&model, &args.capture, &args.photos, output)?;
-    let observer = OutputObserver::new(output);
-    let pruner = Pruner::new(&model, &photos, &observer)?;
-    let psnr = |splats: &Splats| -> Result<[f64; 2], Failure> {
-        let held_in = pruner.held_in_psnr(splats)?;
-        let held_out = pruner.held_out_psnr(splats)?;
-        let none = || BadInput::new("--test-every", "holds out no view", "give a number from 1 to that of the views");
-        Ok([held_in, held_out.ok_or_else(none)?])
-    };
-    let before = psnr(&model.splats)?;
-    make_folder(&args.results)?;
-    let file: PathBuf = args.results.join(LINES);
-    let mut text =
-        format!("{} splats: {:.2} dB held in, {:.2} dB held out\n", model.splats.len(), before[0], before[1]);
-    let mut lines = Vec::new();
-    let orders = if args.order.is_empty() { Order::ALL.to_vec() } else { args.order.clone() };
-    for order in orders {
-        let mut add_line = |keep: Option<f64>, splats: &Splats, tolerance_db: Option<f64>, clock: &Stopwatch| {
-            let cpu_seconds = clock.cpu_seconds();
-            let after = psnr(splats)?;
-            let line = Prune {
-                commit: commit().to_owned(),
-                machine: ::bench::machine(),
-                scene: args.scene.clone().unwrap_or_else(|| captures::name_of(&args.capture)),
-                downscale: photos.downscale,
-                order: order.name().to_owned(),
-                keep,
-                tolerance_db,
-                splats_before: model.splats.len() as u64,
-                splats: splats.len() as u64,
-                held_in_psnr: [before[0], after[0]],
-                held_out_psnr: [before[1], after[1]],
-                cpu_seconds,
-                command: invocation(),
-            };
-            let row = described(&line);
-            output.note(&row);
-            text += &(row + "\n");
-            let line = PartLine::Prune(line);
-            append_part(&file, &line)?;
-            lines.push(line);
-            Ok::<_, Failure>(())
-        };
-        let clock = Stopwatch::start();
-        let importance = pruner.importance(order)?;
-        for keep in SHARES {
-            add_line(Some(keep), &prune::keep(&model.splats, &importance, keep, &|_| true), None, &clock)?;
-        }
-        let clock = Stopwatch::start();
-        let standard = Pruning::within(args.tolerance_db);
-        let pruning = Pruning {
-            order,
-            rounds: args.rounds.unwrap_or(standard.rounds),
-            recovery_share: args.healing.unwrap_or(standard.recovery_share),
-            drop_db: args.drop_db.unwrap_or(standard.drop_db),
-            ..standard
-        };
-        let (splats, _) = pruner.prune(&pruning, None, &observer)?;
-        add_line(None, &splats, Some(pruning.tolerance_db), &clock)?;
-    }
-    output.result(&lines, &format!("{text}appended to {}", file.display()))
-}
-
-/// A comparison as text.
-fn described(line: &Prune) -> String {
-    let what = line.keep.map_or("tolerance".to_owned(), |keep| format!("keep {keep}"));
-    let [[in_before, held_in], [out_before, held_out]] = [line.held_in_psnr, line.held_out_psnr];
-    format!(
-        "{:<8} {what:<9} {:>8} splats ({:+6.1} %) {held_in:>6.2} dB held in ({:+.2}) {held_out:>6.2} dB held out ({:+.2}) {:>6.1} s",
-        line.order,
-        line.splats,
-        100.0 * (line.splats as f64 / line.splats_before as f64 - 1.0),
-        held_in - in_before,
-        held_out - out_before,
-        line.cpu_seconds,
-    )
 }

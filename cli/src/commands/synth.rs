@@ -1,6 +1,6 @@
 //! `plat synth`: writes a synthetic capture of a generated city.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use city::CitySettings;
 use city::faults::Fault;
@@ -34,11 +34,10 @@ pub(crate) fn run(args: &SynthArgs, output: &Output) -> Result<(), Failure> {
         drop(stages);
         return output.result(&Drawn { gallery: file.clone() }, &file.display().to_string());
     }
+    drop(stages);
     let out =
         args.out.clone().ok_or_else(|| Failure::Input("--out: is missing; give a folder for the capture".into()))?;
-    output.note(format!("building a city of {} km² and taking {} photos of it", args.area_km2, args.views));
-    let summary = synth::write(&out, &settings, &progress)?;
-    drop(stages);
+    let summary = write(args, &out, output)?;
     let text = format!(
         "{} photos of {} objects, {} of them moving, in {} triangles; {} sparse points, each in {:.1} views\n{}\n\
          the capture         {} (plat train reads it)\n\
@@ -54,6 +53,14 @@ pub(crate) fn run(args: &SynthArgs, output: &Output) -> Result<(), Failure> {
         out.join("manifest.json").display(),
     );
     output.result(&Shown { out, summary }, &text)
+}
+
+/// Writes a capture into a folder, with progress.
+pub(super) fn write(args: &SynthArgs, out: &Path, output: &Output) -> Result<Summary, Failure> {
+    output.note(format!("building a city of {} km² and taking {} photos of it", args.area_km2, args.views));
+    let stages = output.stages();
+    let progress = |what, done, total| stages.at(what, done as u64, total as u64, "");
+    Ok(synth::write(out, &settings(args), &progress)?)
 }
 
 /// What the cars drove, in a line.

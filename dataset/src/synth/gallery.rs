@@ -53,7 +53,9 @@ pub fn gallery(settings: &Settings, progress: Progress) -> Result<RgbImage, Synt
         let faults = [Fault { kind, strength: 1.0, seed: settings.city.seed }];
         let (caption, tile) = match kind {
             FaultKind::ExposureDrift => ("most, least", drift(&world, &shot, &faults)?),
-            FaultKind::PoseNoise => ("reported over true", blended_poses(&world, &shot, &faults)?),
+            FaultKind::PoseNoise | FaultKind::ClockSkew | FaultKind::WrongCalibration => {
+                ("reported over true", blended_poses(&world, &shot, &faults)?)
+            }
             FaultKind::SparseViews | FaultKind::SensorDropout => ("red is lost", map(&world, settings, &faults)?),
             FaultKind::MovingUnmasked => ("red is forgotten", {
                 highlighted(&take(&world, &shot, &faults)?, |frame, i| frame.moves[i] != 0 && frame.mask[i] == 0)

@@ -1,0 +1,184 @@
+//! The cases of `plat bench stability`: failures that methods of this field are known for, each with what plat has against it.
+//!
+//! Options are those of the command line, so every run of a case can be repeated by hand.
+
+use std::fmt;
+
+/// A capture on which methods fail.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Case {
+    /// Its name on the command line and in lines.
+    pub(crate) name: &'static str,
+    /// What goes wrong, for the table.
+    pub(crate) about: &'static str,
+    /// Options of `plat synth` beside those of all cases.
+    pub(crate) synth: &'static str,
+    pub(crate) counter: Counter,
+    /// Options of `plat train` without and with the counter-measure.
+    pub(crate) train: [&'static str; 2],
+    /// Options of `plat eval`.
+    pub(crate) eval: &'static str,
+    pub(crate) photos: MeasuredOn,
+}
+
+/// A counter-measure.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Counter {
+    /// None is known here; the case shows what the failure costs.
+    Missing,
+    /// Options of training.
+    Options(&'static str),
+    /// A better capture: the same photos without the fault of the case.
+    Capture(&'static str),
+    /// The capture is refused.
+    Refusal,
+}
+
+/// What photos and cameras the models are measured on.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum MeasuredOn {
+    /// Those that they were trained on a part of.
+    Own,
+    /// Those without the fault.
+    Clean,
+}
+
+impl fmt::Display for Case {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name)
+    }
+}
+
+impl Counter {
+    /// Its name in the table.
+    pub(crate) fn name(self) -> Option<&'static str> {
+        match self {
+            Self::Missing => None,
+            Self::Options(name) | Self::Capture(name) => Some(name),
+            Self::Refusal => Some("a check when it is opened"),
+        }
+    }
+}
+
+const LIDAR: Counter = Counter::Options("lidar: initial points and depths");
+const LIDAR_TRAIN: [&str; 2] = ["--no-lidar", "--depth-weight 0.1"];
+const POSES: Counter = Counter::Options("poses refined");
+const POSES_TRAIN: [&str; 2] = ["", "--refine-poses"];
+
+/// A layout of streets, or a fault of light, that depths help with.
+const fn depths(name: &'static str, about: &'static str, synth: &'static str) -> Case {
+    let (counter, train, photos) = (LIDAR, LIDAR_TRAIN, MeasuredOn::Own);
+    Case { name, about, synth, counter, train, eval: "--depth", photos }
+}
+
+/// A fault of cameras, measured with the true ones.
+const fn cameras(name: &'static str, about: &'static str, synth: &'static str) -> Case {
+    let (counter, train, photos) = (POSES, POSES_TRAIN, MeasuredOn::Clean);
+    Case { name, about, synth, counter, train, eval: "", photos }
+}
+
+/// A fault of pictures that nothing is done against, measured without it.
+const fn pictures(name: &'static str, about: &'static str, synth: &'static str) -> Case {
+    let (counter, train, photos) = (Counter::Missing, ["", ""], MeasuredOn::Clean);
+    Case { name, about, synth, counter, train, eval: "", photos }
+}
+
+/// All cases.
+pub(crate) const CASES: [Case; 20] = [
+    depths(
+        "curved-corridor",
+        "street that bends: every view is seen from few others",
+        "--layout curved-corridor --lidar --truth",
+    ),
+    depths("alley", "walls a few metres away: large motion in the picture", "--layout alley --lidar --truth"),
+    depths("winding", "winding road: short sight", "--layout winding --lidar --truth"),
+    depths("deck", "road under a deck: two levels, little light", "--layout deck --lidar --truth"),
+    depths(
+        "textureless-road",
+        "road of one colour: no points to start from",
+        "--fault textureless-road --lidar --truth",
+    ),
+    depths("sparse-views", "six of ten photos are missing", "--fault sparse-views=0.67 --lidar --truth"),
+    depths("sensor-dropout", "cameras and lidar are silent for seconds", "--fault sensor-dropout=0.6 --lidar --truth"),
+    depths("night", "moonlight, lamps, grain", "--fault night --lidar --truth"),
+    depths("rain", "wet ground and streaks", "--fault rain --lidar --truth"),
+    depths("fog", "a visibility of 200 m", "--fault fog=0.5 --lidar --truth"),
+    Case {
+        name: "exposure-drift",
+        about: "the gain wanders between photos",
+        synth: "--fault exposure-drift=0.6",
+        counter: Counter::Options("an exposure for each photo"),
+        train: ["", "--exposure"],
+        eval: "--fit-exposure",
+        photos: MeasuredOn::Clean,
+    },
+    cameras("pose-noise", "poses off by 5 cm and 0.2°", "--fault pose-noise=0.1"),
+    cameras("clock-skew", "cameras' clocks differ by 50 ms", "--fault clock-skew=0.5"),
+    cameras(
+        "wrong-calibration",
+        "focal lengths off by 0.5 %, mounts by 1 cm and 0.1°",
+        "--fault wrong-calibration=0.25",
+    ),
+    Case {
+        name: "moving-unmasked",
+        about: "moving objects in the photos",
+        synth: "--traffic heavy --fault moving-unmasked",
+        counter: Counter::Capture("masks of what moves"),
+        train: ["", ""],
+        eval: "",
+        photos: MeasuredOn::Clean,
+    },
+    pictures("motion-blur", "open for 1/30 s, on a shaking mount", "--fault motion-blur=0.5"),
+    pictures("lens-dirt", "spots and a veil on the lenses", "--fault lens-dirt=0.6"),
+    Case {
+        name: "starved-blocks",
+        about: "blocks that few photos see",
+        synth: "--views 48 --plain 0.4",
+        counter: Counter::Options("a tree: blocks start from their parent"),
+        train: ["--blocks flat --levels 2", "--blocks tree --levels 2"],
+        eval: "",
+        photos: MeasuredOn::Own,
+    },
+    Case {
+        name: "seams",
+        about: "blocks trained apart differ at their faces",
+        synth: "",
+        counter: Counter::Options("a tree: blocks train beside their neighbours'"),
+        train: ["--blocks flat --levels 1 --residual 0", "--blocks tree --levels 1 --residual 0"],
+        eval: "--seams",
+        photos: MeasuredOn::Own,
+    },
+    Case {
+        name: "nan-poses",
+        about: "a pose that is not a number",
+        synth: "",
+        counter: Counter::Refusal,
+        train: ["", ""],
+        eval: "",
+        photos: MeasuredOn::Own,
+    },
+];
+
+/// The case of this name.
+pub(crate) fn named(name: &str) -> Result<Case, String> {
+    let names = || CASES.map(|case| case.name).join(", ");
+    CASES.into_iter().find(|case| case.name == name).ok_or_else(|| format!("give one of {}", names()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn cases_have_names_of_their_own_and_counter_measures_that_change_something() {
+        for (i, case) in CASES.iter().enumerate() {
+            assert_eq!(named(case.name).unwrap().about, case.about);
+            assert!(CASES[..i].iter().all(|before| before.name != case.name), "{} is twice there", case.name);
+            let changes_options = case.train[0] != case.train[1];
+            assert_eq!(matches!(case.counter, Counter::Options(_)), changes_options, "{}", case.name);
+            let needs_fault = case.photos == MeasuredOn::Clean || matches!(case.counter, Counter::Capture(_));
+            assert!(!needs_fault || case.synth.contains("--fault"), "{}", case.name);
+        }
+        assert!(named("hail").unwrap_err().contains("pose-noise"));
+    }
+}
