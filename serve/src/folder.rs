@@ -143,7 +143,8 @@ pub(crate) fn load(feed: &Feed, folder: &Path) -> Result<(), BadInput> {
             TaskChanged { task, state: leased, attempt: line.attempt, worker: "local".into(), ..Default::default() };
         let ReportLine { step, steps, cpu_seconds, wall_seconds, splats, loss, psnr, merged_splats, attempt, .. } =
             line;
-        let report = Report { step, steps, loss, splats, cpu_seconds, wall_seconds, psnr, merged_splats };
+        let report =
+            Report { step, steps, loss, splats, cpu_seconds, wall_seconds, psnr, merged_splats, ..Report::default() };
         board.update(now, JOB, &Update::Changed(changed));
         board.update(now, JOB, &Update::Reported(TaskReported { task, attempt, report: Some(report) }));
     }
