@@ -25,4 +25,10 @@ pub struct ReportLine {
     pub psnr: Option<f64>,
     /// Splats of that model.
     pub merged_splats: Option<u64>,
+    /// Mean of the perception-aligned loss since the last line, over windows with objects; left out if it was not computed.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub aligned_loss: Option<f64>,
+    /// CPU milliseconds that it took in a step, mean since the last line.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub aligned_cpu_ms: Option<f64>,
 }

@@ -14,7 +14,7 @@ use crate::ground::{Ground, HALO_SCALE};
 use crate::lod::{Cut, training_order};
 
 /// The format version of [`Plan`] that this program reads and writes.
-pub const VERSION: u32 = 9;
+pub const VERSION: u32 = 10;
 /// The frame kind of a plan.
 pub const PLAN: Kind = Kind(*b"plan", VERSION);
 /// The maximum depth of a plan: 65,536 blocks a side.
@@ -85,6 +85,8 @@ pub struct PlanSettings {
     pub depth_weight: f64,
     /// Additional weight of pixels in the capture's zones, in training and in pruning; 0: they count as others do.
     pub zone_weight: f64,
+    /// Weight of the perception-aligned loss of [`Plan::detector`], λ_perc of equation 7 of perception-aware 3DGS; 0 leaves it out.
+    pub aligned_weight: f64,
     /// Whether tasks of the job measure the merged model on the held-out views after training.
     pub evaluate: bool,
     /// Width of the stretches of streets of which about one in ten is held out as well, metres; see [`crate::Split`]. 0: none.
@@ -112,6 +114,7 @@ impl Default for PlanSettings {
             label_blocks: false,
             depth_weight: 0.0,
             zone_weight: 0.0,
+            aligned_weight: 0.0,
             evaluate: false,
             test_stretches: 0.0,
             refine_poses: false,
@@ -251,6 +254,8 @@ pub struct Plan {
     pub capture: ArtefactId,
     /// The objects on its photos, if anyone looked for them.
     pub zones: Option<ArtefactId>,
+    /// The detector whose loss is in training, if [`PlanSettings::aligned_weight`] is not 0.
+    pub detector: Option<ArtefactId>,
     /// The user's settings.
     pub settings: PlanSettings,
     /// Full name of the backend that every task must run on.
@@ -298,14 +303,17 @@ impl Plan {
         if self.version != VERSION {
             return bad(format!("has version {}; this program reads version {VERSION}", self.version));
         }
-        let PlanSettings { sh_degree, views_per_step, depth_weight, zone_weight, test_stretches, .. } = self.settings;
+        let PlanSettings { sh_degree, views_per_step, depth_weight, zone_weight, aligned_weight, .. } = self.settings;
         let is_batch = (1..=MAX_VIEWS_PER_STEP).contains(&views_per_step);
-        let are_positive =
-            [depth_weight, zone_weight, test_stretches].iter().all(|value| value.is_finite() && *value >= 0.0);
+        let weights = [depth_weight, zone_weight, aligned_weight, self.settings.test_stretches];
+        let are_positive = weights.iter().all(|value| value.is_finite() && *value >= 0.0);
         if !self.ground.is_sane() || self.levels > MAX_LEVELS || sh_degree > 3 || !is_batch || !are_positive {
             return bad(
                 "has a ground, depth, SH degree, number of views per step, weight or stretches out of range".into()
             );
+        }
+        if aligned_weight > 0.0 && self.detector.is_none() {
+            return bad("has a weight for the loss of a detector and no detector".into());
         }
         let sane = |rho: &f64| rho.is_finite() && *rho > 0.0;
         if self.rho_metres.len() != usize::from(self.levels) + 1 || !self.rho_metres.iter().all(sane) {

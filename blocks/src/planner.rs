@@ -104,6 +104,7 @@ pub fn plan(
         version: VERSION,
         capture: capture_id,
         zones: None,
+        detector: None,
         settings: settings.clone(),
         backend: backend.to_owned(),
         ground,

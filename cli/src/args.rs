@@ -33,7 +33,7 @@ pub(crate) use plan::{Blocks, DepthKind, PlanOptions, RESIDUAL};
 pub(crate) use sweep::Named;
 pub(crate) use synth::{Rig, SynthArgs};
 pub(crate) use values::{Auto, Backend, Size};
-pub(crate) use zones::ZoneOptions;
+pub(crate) use zones::{AlignedOptions, ZoneOptions};
 
 /// Trains Gaussian-splat models of whole cities from photos with poses.
 ///
@@ -175,6 +175,9 @@ pub(crate) struct TrainArgs {
     #[command(flatten)]
     #[serde(flatten)]
     pub(crate) zones: ZoneOptions,
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub(crate) aligned: AlignedOptions,
     /// Backend to train on
     #[arg(long, value_enum, default_value = "auto")]
     pub(crate) backend: Backend,

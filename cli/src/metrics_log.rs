@@ -155,6 +155,8 @@ impl MetricsLog {
             loss: report.loss,
             psnr: report.psnr,
             merged_splats: report.merged_splats,
+            aligned_loss: report.aligned_loss,
+            aligned_cpu_ms: report.aligned_cpu_seconds.map(|seconds| 1e3 * seconds),
         };
         if let Some(psnr) = report.psnr {
             self.totals.last_psnr = Some(psnr);

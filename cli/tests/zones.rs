@@ -67,9 +67,7 @@ fn pixels_of_zones_change_training_and_pruning_reproducibly() {
     );
 
     // A network of random weights finds something; the second run reads what the first one recorded.
-    let tiny = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../perceive/tests/yolov8_tiny.onnx");
-    fs::copy(tiny, at.join("tiny.onnx")).unwrap();
-    fs::write(at.join("tiny.toml"), "classes = ['car', 'person', 'bench']\nscore = 0.5").unwrap();
+    write_tiny(at);
     let detector = ["--detector", "tiny.onnx", "--zone-weight", "2"];
     let (_, zones, found) = train("detected", &detector);
     let recorded = fs::read_dir(at.join("detected/store/names/zones")).map_or(0, Iterator::count);
@@ -78,6 +76,52 @@ fn pixels_of_zones_change_training_and_pruning_reproducibly() {
         train("detected-again", &[&detector[..], &["--store", "detected/store"]].concat()),
         (capture, zones, found)
     );
+}
+
+/// A small detector of random weights, with its card.
+fn write_tiny(at: &Path) -> Vec<u8> {
+    let onnx = fs::read(PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../perceive/tests/yolov8_tiny.onnx")).unwrap();
+    fs::write(at.join("tiny.onnx"), &onnx).unwrap();
+    fs::write(at.join("tiny.toml"), "classes = ['car', 'person', 'bench']\nscore = 0.5").unwrap();
+    onnx
+}
+
+#[test]
+fn a_detectors_loss_changes_training_reproducibly() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    city(at, 16, 96, 64);
+    let onnx = write_tiny(at);
+    let train = |out: &str, more: &[&str]| {
+        done(at, &[&TRAIN[..], &["--detector", "tiny.onnx", "--zone-weight", "0", "--out", out], more].concat());
+        let plan: Value = serde_json::from_slice(&fs::read(at.join(out).join("plan.json")).unwrap()).unwrap();
+        (plan["detector"].clone(), fs::read(at.join(out).join("merged.ply")).unwrap())
+    };
+    let (none, plain) = train("plain", &["--aligned-weight", "0"]);
+    let (network, aligned) = train("aligned", &["--aligned-weight", "0.1"]);
+    assert!(none.is_null() && !network.is_null() && plain != aligned);
+    let more = ["--aligned-weight", "0.1", "--threads", "1", "--workers", "2"];
+    assert!(train("again", &more) == (network.clone(), aligned.clone()), "the same plan gives another model");
+    assert!(train("configured", &["--config", "aligned/config.toml"]) == (network, aligned));
+    let log = fs::read_to_string(at.join("aligned/metrics.jsonl")).unwrap();
+    let lines = log.lines().map(|line| serde_json::from_str::<Value>(line).unwrap());
+    let computed: Vec<Value> = lines.filter(|line| !line["aligned_cpu_ms"].is_null()).collect();
+    let has_loss = |line: &Value| line["aligned_loss"].as_f64().is_some_and(|loss| loss > 0.0);
+    assert!(!computed.is_empty() && computed.iter().any(has_loss), "{log}");
+
+    let refused_with = |more: &[&str], says: &str| refused(at, &[&TRAIN[..], &["--out", "o"], more].concat(), says);
+    refused_with(&["--aligned-weight", "0.1"], "--detector");
+    for weight in ["-1", "1001", "nan", "much"] {
+        refused_with(&["--detector", "tiny.onnx", &format!("--aligned-weight={weight}")], "--aligned-weight");
+    }
+    refused_with(&["--detector", "tiny.onnx", "--aligned-weight", "0.1", "--backend", "gpu"], "--backend");
+    // A detector that runs, but whose gradient is not known.
+    let mut other = onnx;
+    let places: Vec<usize> = (0..other.len() - 4).filter(|&i| &other[i..i + 4] == b"Tanh").collect();
+    places.into_iter().for_each(|i| other[i..i + 4].copy_from_slice(b"Ceil"));
+    fs::write(at.join("other.onnx"), other).unwrap();
+    fs::copy(at.join("tiny.toml"), at.join("other.toml")).unwrap();
+    refused_with(&["--detector", "other.onnx", "--aligned-weight", "0.1"], "Ceil");
 }
 
 #[test]

@@ -57,7 +57,7 @@ pub use images::{frame_image, photo_image, write_png};
 pub use judges::{DepthReport, DetectionReport};
 pub use label_colours::coloured_by;
 pub use lpips::Lpips;
-pub use networks::{load_detector, load_identified_detector};
+pub use networks::{DetectorFile, load_detector, load_identified_detector};
 pub use observer::{Observer, Seconds};
 pub use photos::{PhotoOptions, Photos};
 pub use pruning::Pruner;

@@ -20,8 +20,42 @@ pub(crate) fn read_network(path: &Path, advice: &'static str) -> Result<Vec<u8>,
     read(path, FILE_LIMIT, advice)
 }
 
-/// Loads a detector from an ONNX file, with the model card of its name and the extension `toml` if there is one beside
-/// it.
+/// A detector's ONNX file with the model card of its name and the extension `toml`, if there is one beside it.
+pub struct DetectorFile {
+    /// The path, as messages name it.
+    pub name: String,
+    /// The bytes of the ONNX file.
+    pub onnx: Vec<u8>,
+    /// The text of the card.
+    pub card: Option<String>,
+}
+
+impl DetectorFile {
+    /// Reads both files.
+    ///
+    /// # Errors
+    /// A file that cannot be read or is too large.
+    pub fn read(path: &Path) -> Result<Self, BadInput> {
+        let onnx = read_network(path, "give a detector in an ONNX file")?;
+        let beside = path.with_extension("toml");
+        let card = if beside.is_file() {
+            let advice = "correct this model card or remove it";
+            let text = String::from_utf8(read(&beside, CARD_LIMIT, advice)?);
+            Some(text.map_err(|_| BadInput::new(beside.display().to_string(), "is not text", advice))?)
+        } else {
+            None
+        };
+        Ok(Self { name: path.display().to_string(), onnx, card })
+    }
+
+    /// The hash of the network and its card.
+    pub fn id(&self) -> ArtefactId {
+        let card = self.card.as_deref().unwrap_or_default().as_bytes();
+        ArtefactId::of(&[&self.onnx[..], card].map(|bytes| ArtefactId::of(bytes).0).concat())
+    }
+}
+
+/// Loads a detector from an ONNX file, with the model card beside it.
 ///
 /// # Errors
 /// A file that cannot be read, or a network that is not a detector whose output is understood.
@@ -34,18 +68,10 @@ pub fn load_detector(path: &Path) -> Result<Detector, BadInput> {
 /// # Errors
 /// As [`load_detector`].
 pub fn load_identified_detector(path: &Path) -> Result<(Detector, ArtefactId), BadInput> {
-    let bytes = read_network(path, "give a detector in an ONNX file")?;
-    let beside = path.with_extension("toml");
-    let card = if beside.is_file() {
-        let advice = "correct this model card or remove it";
-        let text = String::from_utf8(read(&beside, CARD_LIMIT, advice)?);
-        Some(text.map_err(|_| BadInput::new(beside.display().to_string(), "is not text", advice))?)
-    } else {
-        None
-    };
-    let hashes = [ArtefactId::of(&bytes), ArtefactId::of(card.as_deref().unwrap_or_default().as_bytes())];
-    let detector = Detector::load(&path.display().to_string(), bytes, card.as_deref())?;
-    Ok((detector, ArtefactId::of(&hashes.map(|hash| hash.0).concat())))
+    let file = DetectorFile::read(path)?;
+    let id = file.id();
+    let DetectorFile { name, onnx, card } = file;
+    Ok((Detector::load(&name, onnx, card.as_deref())?, id))
 }
 
 fn read(path: &Path, limit: u64, advice: &'static str) -> Result<Vec<u8>, BadInput> {

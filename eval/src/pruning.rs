@@ -127,6 +127,7 @@ impl<'a> Pruner<'a> {
             trains_poses: false,
             recipe: &recipe,
             source: &self.weighted,
+            picture_loss: None,
             backend: &Backend::Cpu,
         };
         let mut report = |now: PruneProgress| {

@@ -75,6 +75,7 @@ fn plan(levels: u8, sh_degree: u8, seed: u64, splats: u64) -> Plan {
         version: blocks::plan::VERSION,
         capture: ArtefactId::of(b"city of blocks"),
         zones: None,
+        detector: None,
         settings,
         backend: "none".into(),
         ground,

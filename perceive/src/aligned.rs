@@ -95,6 +95,22 @@ impl Targets {
     pub fn is_empty(&self) -> bool {
         self.objects.is_empty()
     }
+
+    /// Keeps the objects for whose box (left, top, right, bottom in pixels of the photo, not cut at its edges) this holds.
+    pub fn retain(&mut self, mut holds: impl FnMut([f32; 4]) -> bool) {
+        // The best anchor is the first.
+        self.objects.retain(|object| holds(object.anchors[0].2.corners.map(|corner| corner as f32)));
+    }
+
+    /// Size in memory, bytes.
+    pub fn bytes(&self) -> usize {
+        let anchors = self.objects.iter().flat_map(|object| &object.anchors);
+        let scores: usize = anchors.clone().map(|(.., anchor)| size_of_val(&anchor.scores[..])).sum();
+        size_of::<Self>()
+            + size_of_val(&self.objects[..])
+            + anchors.count() * size_of::<(usize, f64, Anchor)>()
+            + scores
+    }
 }
 
 impl Aligned {

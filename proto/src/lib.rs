@@ -100,8 +100,9 @@ pub fn one_line(message: &str) -> String {
 impl Report {
     /// Whether all numbers are finite, which the protocol requires.
     pub fn is_finite(&self) -> bool {
-        let optional = |value: Option<f64>| value.is_none_or(f64::is_finite);
-        self.cpu_seconds.is_finite() && self.wall_seconds.is_finite() && optional(self.loss) && optional(self.psnr)
+        let optional = [self.loss, self.psnr, self.aligned_loss, self.aligned_cpu_seconds];
+        let all = [self.cpu_seconds, self.wall_seconds].into_iter().chain(optional.into_iter().flatten());
+        all.into_iter().all(f64::is_finite)
     }
 }
 

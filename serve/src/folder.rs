@@ -151,7 +151,8 @@ fn load(feed: &Feed, number: u64, folder: &Path) -> Result<(), BadInput> {
             TaskChanged { task, state: leased, attempt: line.attempt, worker: "local".into(), ..Default::default() };
         let ReportLine { step, steps, cpu_seconds, wall_seconds, splats, loss, psnr, merged_splats, attempt, .. } =
             line;
-        let report = Report { step, steps, loss, splats, cpu_seconds, wall_seconds, psnr, merged_splats };
+        let report =
+            Report { step, steps, loss, splats, cpu_seconds, wall_seconds, psnr, merged_splats, ..Report::default() };
         board.update(now, number, &Update::Changed(changed));
         board.update(now, number, &Update::Reported(TaskReported { task, attempt, report: Some(report) }));
     }

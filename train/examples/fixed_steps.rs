@@ -59,6 +59,7 @@ fn steps() -> Splats {
         trains_poses: false,
         recipe: &recipe,
         source: &photos,
+        picture_loss: None,
         backend: &Backend::Cpu,
     };
     train(job, &mut |_| Flow::Continue).expect("the views see the splats")

@@ -15,6 +15,7 @@ use scene::Splats;
 use self::step::TrainDevice;
 use crate::checkpoint::State;
 use crate::error::TrainError;
+use crate::picture_loss::PictureLoss;
 use crate::pose::GivenPoses;
 
 /// Which device computes training steps. Equal names give equal bits.
@@ -39,21 +40,27 @@ impl Backend {
     }
 
     /// Sets up a device that continues from `state`; the CPU works on the host's state directly. `lambda` is the weight of D-SSIM
-    /// in the loss. `context` are frozen splats of other blocks, rendered but not trained. `given` are the poses that displacements
-    /// of the state refer to.
+    /// in the loss, `picture_loss` another loss beside it. `context` are frozen splats of other blocks, rendered but not trained.
+    /// `given` are the poses that displacements of the state refer to.
     ///
     /// # Errors
-    /// A GPU that fails or has too little memory.
+    /// A GPU that fails or has too little memory, or a picture loss on a GPU.
     #[cfg_attr(not(feature = "gpu"), allow(unused_variables))]
     pub(crate) fn open<'a>(
         &self,
         state: &State,
         lambda: f32,
+        picture_loss: Option<&'a dyn PictureLoss>,
         context: Option<&'a Splats>,
         given: &Arc<GivenPoses>,
     ) -> Result<Box<dyn TrainDevice + 'a>, TrainError> {
         Ok(match self {
-            Self::Cpu => Box::new(cpu::CpuDevice::new(lambda, context, given)),
+            Self::Cpu => Box::new(cpu::CpuDevice::new(lambda, picture_loss, context, given)),
+            // Such a step would wait for a read-back, and its last bits depend on the CPU, which a GPU's name does not tell.
+            #[cfg(feature = "gpu")]
+            Self::Gpu(_) if picture_loss.is_some() => {
+                return Err(TrainError::Device("a loss of whole pictures is computed on the CPU backend only".into()));
+            }
             #[cfg(feature = "gpu")]
             Self::Gpu(gpu) => Box::new(gpu::GpuDevice::new(gpu, state, lambda, context, given)?),
         })

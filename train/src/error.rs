@@ -15,6 +15,9 @@ pub enum TrainError {
     /// The device has too little memory for the block. A larger device may train it.
     #[error("{0}")]
     OutOfMemory(String),
+    /// A loss from outside could not be computed.
+    #[error("{0}")]
+    PictureLoss(String),
     /// All splats were removed after this number of steps.
     #[error("every splat was removed after {0} steps: the views and the points do not agree, or poses are wrong")]
     Empty(u32),

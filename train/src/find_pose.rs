@@ -64,7 +64,7 @@ impl<'a> PoseFinder<'a> {
             splats: splats.clone(),
             loss: f64::NAN,
         };
-        let device = Backend::Cpu.open(&state, Recipe::default().lambda, None, &given)?;
+        let device = Backend::Cpu.open(&state, Recipe::default().lambda, None, None, &given)?;
         Ok(Self { device, state, antialiased, source })
     }
 
@@ -87,7 +87,8 @@ impl<'a> PoseFinder<'a> {
             let Some((mip, rect, camera)) = view.at(coarser) else { continue };
             let photo = self.source.window(view.view, mip, rect).map_err(TrainError::Source)?;
             for _ in 0..if coarser == 0 { FINEST_STEPS } else { of_mip } {
-                let sample = ViewSample { view: view.view, photo: Arc::clone(&photo), camera, exposure: None };
+                let sample =
+                    ViewSample { view: view.view, mip, rect, photo: Arc::clone(&photo), camera, exposure: None };
                 let progress = done as f32 / all as f32;
                 let step = Step {
                     samples: vec![sample],
@@ -98,6 +99,7 @@ impl<'a> PoseFinder<'a> {
                     },
                     rates: None,
                     depth_weight: 0.0,
+                    picture_weight: 0.0,
                     exposure_rate: 0.0,
                     pose_rates: Some(PoseRates {
                         rate: FIRST_RATE * (last_rate / FIRST_RATE).powf(progress),

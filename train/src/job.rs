@@ -5,6 +5,7 @@ use scene::{Exposures, Splats};
 
 use crate::device::Backend;
 use crate::free_space::FreeSpace;
+use crate::picture_loss::PictureLoss;
 use crate::recipe::Recipe;
 use crate::source::WindowSource;
 use crate::view::TrainView;
@@ -43,6 +44,8 @@ pub struct Job<'a> {
     pub recipe: &'a Recipe,
     /// Photos.
     pub source: &'a dyn WindowSource,
+    /// A loss of the windows' pictures beside the photometric one, with the recipe's weight.
+    pub picture_loss: Option<&'a dyn PictureLoss>,
     /// Device.
     pub backend: &'a Backend,
 }

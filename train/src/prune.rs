@@ -379,6 +379,7 @@ fn recovery_recipe(recipe: &Recipe) -> Recipe {
         opacity: again(recipe.opacity),
         sh_dc: again(recipe.sh_dc),
         sh_from: [0.0; 3],
+        picture_from: 0.0,
         coarse: Vec::new(),
         growth: recipe.growth.none(),
         ..recipe.clone()

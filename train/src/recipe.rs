@@ -13,6 +13,16 @@ pub struct Recipe {
     /// Weight of the depth loss, for windows with target depths; 0 leaves it out.
     #[serde(default)]
     pub depth_weight: f32,
+    /// Weight of the picture loss of a job that has one; 0 leaves it out.
+    #[serde(default)]
+    pub picture_weight: f32,
+    /// Share of the steps before the picture loss. A detector sees nothing in the first renders, and where splats are still
+    /// added its slopes say little about those that come.
+    #[serde(default)]
+    pub picture_from: f32,
+    /// The picture loss is in every n-th step: a detector costs more than a step.
+    #[serde(default)]
+    pub picture_every: u32,
     /// Learning rate of means, in units of each splat's size.
     pub mean: [f32; 2],
     /// Learning rate of ln(scale).
@@ -70,6 +80,9 @@ impl Default for Recipe {
         Self {
             lambda: 0.2,
             depth_weight: 0.0,
+            picture_weight: 0.0,
+            picture_from: 0.7,
+            picture_every: 1,
             mean: [0.05, 0.005],
             log_scale: [0.017, 0.0085],
             quat: [0.0034, 0.0017],

@@ -171,7 +171,7 @@ impl<'a> Trainer<'a> {
         });
         // A finished job needs no upload.
         let backend = if state.step < steps { job.backend } else { &Backend::Cpu };
-        let device = backend.open(&state, recipe.lambda, context, &given)?;
+        let device = backend.open(&state, recipe.lambda, job.picture_loss, context, &given)?;
         let first_stage = state.coarse_to_fine.stage;
         let missing_detail = (first_stage..recipe.coarse.len() as u8)
             .map(|stage| match recipe.detail_factor > 0.0 {
@@ -212,6 +212,8 @@ impl<'a> Trainer<'a> {
 
         let has_depth = samples.iter().any(|sample| sample.photo.depth.is_some());
         let depth_weight = if has_depth { recipe.depth_weight } else { 0.0 };
+        let is_due = progress >= recipe.picture_from
+            && (step..step + count).any(|step| step.is_multiple_of(recipe.picture_every.max(1)));
         let sh_degree = recipe.sh_from.iter().filter(|&&from| progress >= from).count() as u8;
         let options = Options {
             antialiased: self.job.antialiased,
@@ -226,6 +228,7 @@ impl<'a> Trainer<'a> {
             options,
             rates: Some(learning_rates(recipe, progress, (count as f32).sqrt(), self.log_scale_bounds)),
             depth_weight,
+            picture_weight: if is_due { recipe.picture_weight } else { 0.0 },
             exposure_rate: geometric(recipe.exposure, progress) / visits,
             pose_rates: (self.job.trains_poses && progress >= recipe.pose_from).then(|| PoseRates {
                 rate: geometric(recipe.pose, progress) / visits,
@@ -254,7 +257,7 @@ impl<'a> Trainer<'a> {
             let (mip, rect, camera) = window(view);
             let photo = source.window(view.view, mip, rect).map_err(TrainError::Source)?;
             let exposure = exposures.and_then(|exposures| exposures.of(view.view).copied());
-            Ok(ViewSample { view: view.view, photo, camera, exposure })
+            Ok(ViewSample { view: view.view, mip, rect, photo, camera, exposure })
         };
         let samples =
             (step..step + count).map(|step| sample(&views[self.order.of(step)])).collect::<Result<Vec<_>, _>>()?;

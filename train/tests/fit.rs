@@ -305,6 +305,7 @@ fn reports_can_stop_training_and_errors_name_the_cause() {
         trains_poses: false,
         recipe: &Recipe::default(),
         source: &photos,
+        picture_loss: None,
         backend: &Backend::Cpu,
     };
     assert_eq!(train(job, &mut |_| Flow::Continue), Err(TrainError::NoViews));
@@ -351,6 +352,7 @@ fn announced_windows_are_read() {
             trains_poses: false,
             recipe: &recipe,
             source: &source,
+            picture_loss: None,
             backend: &Backend::Cpu,
         };
         let trained = train(job, &mut |now| {
@@ -442,6 +444,7 @@ fn target_depths_pull_splats_to_a_depth_that_photos_leave_ambiguous() {
             trains_poses: false,
             recipe: &recipe,
             source: &photos,
+            picture_loss: None,
             backend: &Backend::Cpu,
         };
         mean_depth(&train(job, &mut |_| Flow::Continue).unwrap())

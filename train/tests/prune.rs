@@ -119,6 +119,7 @@ fn with_job<R>(
         trains_poses: false,
         recipe: &recipe,
         source: photos,
+        picture_loss: None,
         backend: &Backend::Cpu,
     })
 }

@@ -155,6 +155,8 @@ fn to_wire(report: Report) -> proto::Report {
         wall_seconds: finite(report.wall_seconds),
         psnr: report.psnr.filter(|psnr| psnr.is_finite()),
         merged_splats: report.merged_splats,
+        aligned_loss: report.aligned.and_then(|aligned| aligned.loss).filter(|loss| loss.is_finite()),
+        aligned_cpu_seconds: report.aligned.map(|aligned| finite(aligned.cpu_seconds)),
     }
 }
 

@@ -48,6 +48,7 @@ pub(crate) fn evaluate(
             wall_seconds: stopwatch.wall_seconds(),
             psnr: None,
             merged_splats: None,
+            aligned: None,
         });
         overrun = memory.as_mut().filter(|_| (done as u64) < steps).and_then(MemoryBudget::overrun);
         report == Flow::Continue && overrun.is_none()

@@ -15,13 +15,13 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use blocks::{CONCURRENT_FETCHES, EvalTask, Plan, PlannedTask, Task};
 use bytes::Bytes;
 use dataset::byte_lru::ByteLru;
-use dataset::ingest::IngestError;
 use dataset::windows::{SharedTileCache, WindowReader};
 use scene::frame::{self, TrainingInfo};
 use scene::{ArtefactId, BlockId, Capture, Exposures, Poses, Splats, Zones};
 use store::BlockingStore;
 use train::Backend;
 
+use crate::aligned::AlignedLoss;
 use crate::block::Block;
 use crate::clock::Stopwatch;
 use crate::evaluate::{Evaluation, evaluate};
@@ -132,8 +132,7 @@ impl Assignment<'_> {
 /// The objects on the photos, if they count more than their surroundings.
 fn zones(plan: &Plan, capture: &Capture, store: &BlockingStore) -> Result<Option<Arc<Zones>>, ExecuteError> {
     let id = plan.zones.filter(|_| plan.settings.zone_weight > 0.0);
-    let load = |id| dataset::zones::load(store, id, capture).map(Arc::new).map_err(ingest_failure);
-    id.map(load).transpose()
+    Ok(id.map(|id| dataset::zones::load(store, id, capture).map(Arc::new)).transpose()?)
 }
 
 impl PlanExecutor {
@@ -173,6 +172,7 @@ impl PlanExecutor {
             Some(id) => Some(Poses::from_frame(&store.get(id)?).map_err(ExecuteError::work)?),
             None => None,
         };
+        let aligned = AlignedLoss::of(plan, store)?;
         drop(fetching);
         let (given_exposures, given_poses, given_residual) = (exposures.as_ref(), poses.as_ref(), given.residual);
         let block = Block {
@@ -182,6 +182,7 @@ impl PlanExecutor {
             task,
             capture,
             reader: &reader,
+            aligned: aligned.as_ref(),
             cache,
             given_exposures,
             given_poses,
@@ -275,6 +276,7 @@ impl PlanExecutor {
             wall_seconds: stopwatch.wall_seconds(),
             psnr: evaluated.map(|(psnr, _)| psnr),
             merged_splats: evaluated.map(|(_, count)| count),
+            aligned: None,
         });
     }
 
@@ -317,7 +319,7 @@ impl PlanExecutor {
         }
         // Dropped first, so that two captures are never in memory together.
         *cached = None;
-        let capture = dataset::ingest::load_capture(&self.context.store, id).map_err(ingest_failure)?;
+        let capture = dataset::ingest::load_capture(&self.context.store, id)?;
         let (capture, tiles) = (Arc::new(capture), Arc::new(SharedTileCache::new(self.remote_bytes)));
         *cached = Some((id, capture.clone(), tiles.clone()));
         Ok((capture, tiles))
@@ -370,12 +372,5 @@ impl PlanExecutor {
             }
         }
         Ok(())
-    }
-}
-
-fn ingest_failure(error: IngestError) -> ExecuteError {
-    match error {
-        IngestError::Store(error) => error.into(),
-        IngestError::BadInput(error) => ExecuteError::work(error),
     }
 }

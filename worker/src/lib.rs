@@ -9,6 +9,7 @@
 //! Architecture invariant: a worker keeps no state between tasks and decides nothing. Each of its calls names an attempt, and the
 //! coordinator may refuse it. Heartbeats and reports run beside the compute and never block it.
 
+mod aligned;
 mod attempt;
 mod block;
 pub mod clock;

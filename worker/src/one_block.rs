@@ -102,6 +102,7 @@ impl OneBlockTraining<'_> {
             task,
             capture,
             reader: &reader,
+            aligned: None,
             cache: None,
             given_exposures: None,
             given_poses: None,
@@ -139,6 +140,7 @@ impl OneBlockTraining<'_> {
             trains_poses: false,
             recipe: &recipe,
             source: &reader,
+            picture_loss: None,
             backend: &self.backend,
         };
         train::train_from(job, None, &mut |mut now| {

@@ -13,6 +13,7 @@ pub(crate) fn recipe_of(plan: &Plan, task: &Task) -> Recipe {
         None => Recipe::default(),
     };
     let depth_weight = settings.depth_weight as f32;
-    let recipe = Recipe { views_per_step: settings.views_per_step, depth_weight, ..recipe };
+    let picture_weight = settings.aligned_weight as f32;
+    let recipe = Recipe { views_per_step: settings.views_per_step, depth_weight, picture_weight, ..recipe };
     if settings.residual > 0.0 { recipe } else { recipe.fixed_schedule(from_points) }
 }

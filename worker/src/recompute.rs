@@ -26,7 +26,8 @@ pub(crate) fn recompute(
 ) -> Result<Bytes, ExecuteError> {
     tracing::warn!(task, "recomputing its result {wanted}, which is lost or damaged");
     let steps = plan.planned(order.task).map_or(0, |task| task.steps());
-    let mut heartbeat = |of: Report| report(Report { step: 0, steps, psnr: None, merged_splats: None, ..of });
+    let mut heartbeat =
+        |of: Report| report(Report { step: 0, steps, psnr: None, merged_splats: None, aligned: None, ..of });
     let recomputed = result_of(executor, plan, order, task, &mut heartbeat)?;
     if recomputed != wanted {
         let hint =

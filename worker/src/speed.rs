@@ -57,6 +57,7 @@ fn step_seconds() -> f64 {
         trains_poses: false,
         recipe: &recipe,
         source: &Photo,
+        picture_loss: None,
         backend: &Backend::Cpu,
     };
     let mut started = 0.0;

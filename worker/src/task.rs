@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 
+use dataset::ingest::IngestError;
 use proto::FailureKind;
 use scene::ArtefactId;
 use store::StoreError;
@@ -45,6 +46,17 @@ pub struct Report {
     pub psnr: Option<f64>,
     /// Splats of the model that was evaluated.
     pub merged_splats: Option<u64>,
+    /// The perception-aligned loss since the last report, if it was computed.
+    pub aligned: Option<AlignedReport>,
+}
+
+/// What the perception-aligned loss was and took in some steps.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct AlignedReport {
+    /// Mean over the windows with objects, without its weight; `None` without any.
+    pub loss: Option<f64>,
+    /// CPU seconds that it took in a step, mean. With several workers in one process those of all.
+    pub cpu_seconds: f64,
 }
 
 /// The answer to a report.
@@ -74,6 +86,15 @@ impl ExecuteError {
     /// A failure of the work itself: another attempt may succeed.
     pub(crate) fn work(message: impl ToString) -> Self {
         Self::of(FailureKind::Work, message)
+    }
+}
+
+impl From<IngestError> for ExecuteError {
+    fn from(error: IngestError) -> Self {
+        match error {
+            IngestError::Store(error) => error.into(),
+            IngestError::BadInput(error) => Self::work(error),
+        }
     }
 }
 

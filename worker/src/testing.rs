@@ -28,6 +28,7 @@ pub(crate) fn plan_of(mode: Mode, tasks: Vec<Task>) -> Plan {
         version: blocks::plan::VERSION,
         capture: ArtefactId([1; 32]),
         zones: None,
+        detector: None,
         settings: PlanSettings { mode, ..PlanSettings::default() },
         backend: "none".into(),
         ground: Ground {

@@ -8,8 +8,9 @@ use proto::FailureKind;
 use scene::{BlockId, Exposures, Poses, Splats};
 use train::importance::EvaluationViews;
 use train::prune::{self, Pruning};
-use train::{Backend, Job, Recipe, TrainError, TrainView, Trained};
+use train::{Backend, Job, PictureLoss, Recipe, TrainError, TrainView, Trained};
 
+use crate::aligned::AlignedLoss;
 use crate::block::Block;
 use crate::clock::Stopwatch;
 use crate::initial_splats::InitialSplats;
@@ -81,6 +82,7 @@ impl Block<'_> {
             trains_poses: plan.settings.refine_poses && task.parent.is_none(),
             recipe: &recipe,
             source: self.reader,
+            picture_loss: self.aligned.map(|aligned| aligned as &dyn PictureLoss),
             backend: &self.context.backend,
         };
         let mut progress = Progress::new(self, &views, evaluator, stopwatch, report);
@@ -282,7 +284,7 @@ impl Block<'_> {
     /// The failure class of a training error.
     fn failure(&self, error: TrainError) -> ExecuteError {
         let kind = match error {
-            TrainError::NoViews | TrainError::Empty(_) => FailureKind::Input,
+            TrainError::NoViews | TrainError::Empty(_) | TrainError::PictureLoss(_) => FailureKind::Input,
             TrainError::Device(_) => FailureKind::Work,
             TrainError::OutOfMemory(_) => FailureKind::OutOfMemory,
             // Windows carry checksums: an unreadable one is unreachable or damaged, which the input does not explain.
@@ -381,6 +383,7 @@ impl<'a> Progress<'a> {
             wall_seconds,
             psnr: evaluated.map(|(psnr, _)| psnr),
             merged_splats: evaluated.map(|(_, splats)| splats),
+            aligned: self.block.aligned.and_then(AlignedLoss::report),
         });
         self.is_cancelled |= flow == Flow::Stop && !is_last;
         self.overrun = self.memory.as_mut().filter(|_| !is_last).and_then(MemoryBudget::overrun);

@@ -10,7 +10,7 @@ use scene::BlockId;
 
 use super::plan::PlanOptions;
 use super::values::{Auto, Backend, seconds};
-use super::zones::ZoneOptions;
+use super::zones::{AlignedOptions, ZoneOptions};
 
 /// How to reach a coordinator and authenticate to it.
 #[derive(Debug, Clone, Args)]
@@ -174,6 +174,8 @@ pub(crate) struct SubmitArgs {
     pub(crate) plan: PlanOptions,
     #[command(flatten)]
     pub(crate) zones: ZoneOptions,
+    #[command(flatten)]
+    pub(crate) aligned: AlignedOptions,
     /// Backend of the job
     #[arg(long, value_enum, default_value = "auto")]
     pub(crate) backend: Backend,

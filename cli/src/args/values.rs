@@ -123,6 +123,11 @@ pub(super) fn weight(text: &str) -> Result<f64, String> {
     value.ok_or_else(|| "give a weight from 0, such as 0.1".into())
 }
 
+pub(super) fn aligned_weight(text: &str) -> Result<f64, String> {
+    let value = text.parse().ok().filter(|weight: &f64| (0.0..=1000.0).contains(weight));
+    value.ok_or_else(|| "give a weight from 0 to 1000, such as 0.1".into())
+}
+
 pub(super) fn residual(text: &str) -> Result<f64, String> {
     let value = text.parse().ok().filter(|share: &f64| (0.0..1.0).contains(share));
     value.ok_or_else(|| "give a share from 0 to 1, such as 0.25".into())

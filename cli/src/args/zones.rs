@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use clap::{ArgGroup, Args};
 use serde::Serialize;
 
-use super::values::weight;
+use super::values::{aligned_weight, weight};
 
 /// The weight where `--zone-weight` is not given.
 const ZONE_WEIGHT: f64 = 4.0;
@@ -39,5 +39,22 @@ impl ZoneOptions {
     /// Whether anybody looks for objects.
     pub(crate) fn is_given(&self) -> bool {
         self.zone_detector.is_some() || self.zones.is_some()
+    }
+}
+
+#[derive(Debug, Clone, Default, PartialEq, Args, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub(crate) struct AlignedOptions {
+    /// Weight of the perception-aligned loss in the last 30 % of the steps: what --detector sees in renders shall be what it sees in the
+    /// photos. From 0, the default, which leaves it out, to 1000; above 0.01 pictures suffer. On the CPU only
+    #[arg(long, value_name = "A", value_parser = aligned_weight, requires = "zone_detector")]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(crate) aligned_weight: Option<f64>,
+}
+
+impl AlignedOptions {
+    /// The weight of the loss; 0 without it.
+    pub(crate) fn weight(&self) -> f64 {
+        self.aligned_weight.unwrap_or(0.0)
     }
 }

@@ -13,7 +13,7 @@ use scene::Capture;
 use serde::Serialize;
 use store::Store;
 
-use crate::args::{Auto, Backend, Blocks, DemoArgs, DepthKind, PlanOptions, TrainArgs, ZoneOptions};
+use crate::args::{AlignedOptions, Auto, Backend, Blocks, DemoArgs, DepthKind, PlanOptions, TrainArgs, ZoneOptions};
 use crate::commands::eval::{Further, measure_trained};
 use crate::commands::train::{Report, train};
 use crate::dashboard::Dashboard;
@@ -153,6 +153,7 @@ pub(crate) fn settings(args: &DemoArgs) -> (Settings, TrainArgs) {
             downscale: 1,
         },
         zones: ZoneOptions::default(),
+        aligned: AlignedOptions::default(),
         backend: Backend::Auto,
         workers: 1,
         threads: Auto(None),

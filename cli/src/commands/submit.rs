@@ -17,7 +17,7 @@ use telemetry::traced;
 use tracing::field::Empty;
 
 use crate::args::{Backend, SubmitArgs};
-use crate::captures::{self, find_zones, ingest_photos, zone_source};
+use crate::captures::{self, aligned_network, find_zones, ingest_photos, zone_source};
 use crate::clock::Stopwatch;
 use crate::eval_results;
 use crate::failure::{Failure, make_folder};
@@ -57,6 +57,7 @@ pub(crate) fn run(args: &SubmitArgs, output: &Output) -> Result<(), Failure> {
     let about = remote.call(async |client: &mut Client| client.about(proto::AboutRequest {}).await)?;
     let backend = backend_of(args, &about, output)?;
     let plan = Plan { backend: backend.clone(), ..plan };
+    let network = aligned_network(&args.zones, &args.aligned, &plan.backend)?;
     check_plan(&plan, &planned_for, output)?;
     if let Some(out) = &args.out {
         make_folder(out)?;
@@ -64,8 +65,10 @@ pub(crate) fn run(args: &SubmitArgs, output: &Output) -> Result<(), Failure> {
     let store = remote.store(&about)?;
     let Ingested { capture, id, .. } = ingest_photos(&source, &store.blocking(), args.plan.downscale, output)?;
     let zones = zones.map(|from| find_zones(&capture, &from, &store.blocking(), output)).transpose()?;
-    let settings = PlanSettings { zone_weight: args.zones.weight(), ..plan.settings };
-    let plan = Plan { capture: id, zones: zones.map(|(_, id)| id), settings, ..plan };
+    let detector = network.map(|network| store.blocking().put(network)).transpose()?;
+    let (zone_weight, aligned_weight) = (args.zones.weight(), args.aligned.weight());
+    let settings = PlanSettings { zone_weight, aligned_weight, ..plan.settings };
+    let plan = Plan { capture: id, zones: zones.map(|(_, id)| id), detector, settings, ..plan };
     let plan_id = store.blocking().put(plan.to_frame())?;
     let request = proto::SubmitRequest { plan: plan_id.0.to_vec(), store_url: store.url().into() };
     let job = remote.call(async |client: &mut Client| client.submit(traced(request)).await)?;

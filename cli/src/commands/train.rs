@@ -25,7 +25,7 @@ use worker::time_limit::TimeLimit;
 use worker::{PlanExecutor, Shared, TrainerOptions};
 
 use crate::args::TrainArgs;
-use crate::captures::{find_zones, ingest_photos, zone_source};
+use crate::captures::{aligned_network, find_zones, ingest_photos, zone_source};
 use crate::clock::Stopwatch;
 use crate::dashboard::Dashboard;
 use crate::eval_results;
@@ -193,6 +193,7 @@ fn prepare(args: &TrainArgs, clock: &Stopwatch, output: &Output) -> Result<Prepa
     let zones = zone_source(&args.zones, &planned_for)?;
     let backend = backend::open(args.backend)?;
     let plan = Plan { backend: backend.name(), ..plan };
+    let network = aligned_network(&args.zones, &args.aligned, &plan.backend)?;
     check_plan(&plan, &planned_for, output)?;
     make_folder(&args.out)?;
     let store = Store::open(&store_url(args))?;
@@ -201,8 +202,10 @@ fn prepare(args: &TrainArgs, clock: &Stopwatch, output: &Output) -> Result<Prepa
 
     let Ingested { capture, id: capture_id, .. } = ingested;
     let zones = zones.map(|from| find_zones(&capture, &from, &store.blocking(), output)).transpose()?;
-    let settings = PlanSettings { zone_weight: args.zones.weight(), ..plan.settings };
-    let plan = Plan { capture: capture_id, zones: zones.map(|(_, id)| id), settings, ..plan };
+    let detector = network.map(|network| store.blocking().put(network)).transpose()?;
+    let (zone_weight, aligned_weight) = (args.zones.weight(), args.aligned.weight());
+    let settings = PlanSettings { zone_weight, aligned_weight, ..plan.settings };
+    let plan = Plan { capture: capture_id, zones: zones.map(|(_, id)| id), detector, settings, ..plan };
     let (config_text, config_hash) = resolved(args, &plan);
     save(&args.out.join("config.toml"), config_text.as_bytes())?;
     save_json(&args.out.join("plan.json"), &plan)?;

@@ -41,6 +41,7 @@ pub(crate) fn plan_of(levels: u8, tasks: Vec<Task>) -> Plan {
         version: blocks::plan::VERSION,
         capture: ArtefactId([1; 32]),
         zones: None,
+        detector: None,
         settings: PlanSettings::default(),
         backend: BACKEND.into(),
         ground: Ground {

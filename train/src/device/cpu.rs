@@ -13,6 +13,7 @@ use crate::depth_loss::depth_loss;
 use crate::error::TrainError;
 use crate::exposure::{expose, expose_backward};
 use crate::loss::PhotometricLoss;
+use crate::picture_loss::{PictureLoss, add_picture_loss};
 use crate::pose::GivenPoses;
 
 /// The renderer, the loss and their buffers.
@@ -21,6 +22,7 @@ pub(crate) struct CpuDevice<'a> {
     given: Arc<GivenPoses>,
     renderer: Renderer,
     loss: PhotometricLoss,
+    picture_loss: Option<&'a dyn PictureLoss>,
     upstream: Upstream,
     exposed: Vec<f32>,
     weights: Vec<f32>,
@@ -30,13 +32,19 @@ pub(crate) struct CpuDevice<'a> {
 
 impl<'a> CpuDevice<'a> {
     /// `lambda` is the weight of D-SSIM in the loss.
-    pub(crate) fn new(lambda: f32, context: Option<&'a Splats>, given: &Arc<GivenPoses>) -> Self {
+    pub(crate) fn new(
+        lambda: f32,
+        picture_loss: Option<&'a dyn PictureLoss>,
+        context: Option<&'a Splats>,
+        given: &Arc<GivenPoses>,
+    ) -> Self {
         let isa = Isa::detect();
         Self {
             context,
             given: Arc::clone(given),
             renderer: Renderer::new(isa),
             loss: PhotometricLoss::new(isa, lambda),
+            picture_loss,
             upstream: Upstream::default(),
             exposed: Vec::new(),
             weights: Vec::new(),
@@ -47,12 +55,13 @@ impl<'a> CpuDevice<'a> {
 
 impl TrainDevice for CpuDevice<'_> {
     fn step(&mut self, state: &mut State, step: Step) -> Result<(), TrainError> {
-        let Step { samples, options, rates, depth_weight, exposure_rate, pose_rates } = step;
+        let Step { samples, options, rates, depth_weight, picture_weight, exposure_rate, pose_rates } = step;
         let several = samples.len() > 1;
         let before = several.then(|| state.densification.clone());
         let (mut loss, mut errors, mut visible_sum) = (0.0, Vec::new(), 0);
         let (mut by_exposure, mut by_pose) = (Vec::new(), Vec::new());
-        for ViewSample { view, photo, camera, exposure } in &samples {
+        for sample in &samples {
+            let ViewSample { view, photo, camera, exposure, .. } = sample;
             let camera = state.poses.as_ref().map_or(*camera, |poses| poses.apply(*view, camera));
             let frame = self.renderer.forward(&state.splats, self.context, &camera, &options);
             pixel_weights(frame, photo, self.context.is_some(), &mut self.weights);
@@ -70,6 +79,10 @@ impl TrainDevice for CpuDevice<'_> {
                     self.upstream.depth.clear();
                     self.upstream.transmittance.clear();
                 }
+            }
+            if let Some(of_picture) = self.picture_loss.filter(|_| picture_weight > 0.0) {
+                let (weights, gradient) = (&self.weights, &mut self.upstream.colour);
+                value.total += add_picture_loss(of_picture, picture_weight, sample, shown, weights, gradient)?;
             }
             loss += value.total / samples.len() as f64;
             if !value.total.is_finite() {

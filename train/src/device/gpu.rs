@@ -166,7 +166,8 @@ impl GpuDevice {
     /// Submits a step.
     fn submit(&mut self, step: &Step) -> Result<(), GpuError> {
         let gpu = Arc::clone(&self.gpu);
-        let Step { samples, options, rates, depth_weight, exposure_rate, pose_rates } = step;
+        // Without a picture loss, which `Backend::open` refuses.
+        let Step { samples, options, rates, depth_weight, picture_weight: _, exposure_rate, pose_rates } = step;
         let (photos, bytes) = self.photos(samples, options.extras, *depth_weight);
         let area: usize = samples.iter().map(|sample| sample.photo.area()).sum();
         let (of_photos, tiles) = (photos.tiles, 3 * photos.tiles);

@@ -7,7 +7,7 @@
 use std::sync::Arc;
 
 use render::Options;
-use scene::{Camera, Exposure, Pixels};
+use scene::{Camera, Exposure, Pixels, Rect};
 
 use crate::checkpoint::State;
 use crate::error::TrainError;
@@ -27,6 +27,8 @@ pub(crate) struct Step {
     pub(crate) rates: Option<LearningRates>,
     /// Weight of the depth loss. Above 0 a sample has target depths and the options ask for the planes that they need.
     pub(crate) depth_weight: f32,
+    /// Weight of the picture loss; 0 leaves it out.
+    pub(crate) picture_weight: f32,
     /// Learning rate of exposures, where they are trained.
     pub(crate) exposure_rate: f32,
     /// Rates of poses, where they are trained in this step.
@@ -38,6 +40,10 @@ pub(crate) struct Step {
 pub(crate) struct ViewSample {
     /// Index of the view in the capture.
     pub(crate) view: u32,
+    /// Mip of the window.
+    pub(crate) mip: u8,
+    /// The window, in pixels of that mip.
+    pub(crate) rect: Rect,
     /// Pixels of the window.
     pub(crate) photo: Arc<Pixels>,
     /// Camera of the window, with the given pose.

@@ -10,7 +10,8 @@ use render::cpu::Renderer;
 use scene::splats::SH_C0;
 use scene::{Camera, Exposures, Pinhole, Pixels, Rect, Rigid, Splat, Splats};
 use train::{
-    Backend, Flow, Job, Recipe, State, TrainError, TrainView, Trained, WindowSource, metrics, random, train_from,
+    Backend, Flow, Job, PictureLoss, Recipe, State, TrainError, TrainView, Trained, WindowSource, metrics, random,
+    train_from,
 };
 
 pub const WIDTH: u32 = 64;
@@ -137,6 +138,7 @@ pub struct Setup<'a> {
     pub exposures: Option<&'a Exposures>,
     pub trains_exposures: bool,
     pub trains_poses: bool,
+    pub picture_loss: Option<&'a dyn PictureLoss>,
     pub backend: Backend,
     pub views: Vec<TrainView>,
 }
@@ -158,6 +160,7 @@ impl<'a> Setup<'a> {
             exposures,
             trains_exposures,
             trains_poses,
+            picture_loss: None,
             backend,
             views: views(),
         }
@@ -198,6 +201,7 @@ impl<'a> Setup<'a> {
             trains_poses: self.trains_poses,
             recipe: &self.recipe,
             source: self.photos,
+            picture_loss: self.picture_loss,
             backend: &self.backend,
         };
         train_from(job, from, report)

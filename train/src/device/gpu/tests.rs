@@ -51,7 +51,8 @@ fn sample(masked: bool, key: u64, [width, height]: [u32; 2], translation: DVec3)
     let pinhole = Pinhole { width, height, fx: 70.0, fy: 72.0, cx: 37.0, cy: 27.0 };
     let camera_from_world = Rigid { rotation: DQuat::IDENTITY, translation };
     let photo = Arc::new(Pixels { width, height, rgb, mask, weights: None, depth: None });
-    ViewSample { view: 0, photo, camera: Camera { pinhole, camera_from_world }, exposure: None }
+    let camera = Camera { pinhole, camera_from_world };
+    ViewSample { view: 0, mip: 0, rect: camera.full(), photo, camera, exposure: None }
 }
 
 /// A step with one sample whose size is no multiple of a tile.
@@ -72,6 +73,7 @@ fn step(masked: bool, extras: bool, key: u64) -> Step {
             log_scale_bounds: [-5.0, -1.0],
         }),
         depth_weight: 0.0,
+        picture_weight: 0.0,
         exposure_rate: 0.0,
         pose_rates: None,
     }
@@ -233,7 +235,7 @@ fn several_samples_agree_with_the_cpu(depth_weight: f32) {
         device.download(&mut state, StatePart::All).unwrap();
         state
     };
-    let cpu = run(&mut super::super::cpu::CpuDevice::new(0.2, Some(&context), &none()), &samples);
+    let cpu = run(&mut super::super::cpu::CpuDevice::new(0.2, None, Some(&context), &none()), &samples);
     let gpu_device = || GpuDevice::new(&gpu, &begin, 0.2, Some(&context), &none()).unwrap();
     let on_gpu = run(&mut gpu_device(), &samples);
     assert!(words(&on_gpu) == words(&run(&mut gpu_device(), &samples)), "the same bits");
@@ -266,7 +268,7 @@ fn several_samples_agree_with_the_cpu(depth_weight: f32) {
     }
     // A loss that is not finite skips the whole step.
     let mut gpu_nan = GpuDevice::new(&gpu, &begin, f32::NAN, Some(&context), &none()).unwrap();
-    let mut cpu_nan = super::super::cpu::CpuDevice::new(f32::NAN, Some(&context), &none());
+    let mut cpu_nan = super::super::cpu::CpuDevice::new(f32::NAN, None, Some(&context), &none());
     for device in [&mut gpu_nan as &mut dyn TrainDevice, &mut cpu_nan] {
         let skipped = run(device, &samples);
         assert_eq!((skipped.skipped, skipped.coarse_to_fine.tally.count, skipped.adam.parts().0), (1, 0, 0));
@@ -307,7 +309,7 @@ fn fixed_exposures_agree_with_the_cpu() {
         device.download(&mut state, StatePart::All).unwrap();
         state
     };
-    let cpu = run(&mut super::super::cpu::CpuDevice::new(0.2, None, &none()), &exposed);
+    let cpu = run(&mut super::super::cpu::CpuDevice::new(0.2, None, None, &none()), &exposed);
     let mut device = GpuDevice::new(&gpu, &begin, 0.2, None, &none()).unwrap();
     let on_gpu = run(&mut device, &exposed);
     assert_eq!(on_gpu.exposures, None);
@@ -336,7 +338,7 @@ fn trained_exposures_agree_with_the_cpu() {
     let views = views.map(|view| view as u32).to_vec();
     cpu.exposures = Some(ExposureTraining { views, steps, values: [values, rows(51, 1e-3), rows(52, 1e-6)] });
     let mut on_gpu = cpu.clone();
-    let mut cpu_device = super::super::cpu::CpuDevice::new(0.2, None, &none());
+    let mut cpu_device = super::super::cpu::CpuDevice::new(0.2, None, None, &none());
     let mut device = GpuDevice::new(&gpu, &cpu, 0.2, None, &none()).unwrap();
     for n in 0..3 {
         // Later steps have fewer samples, so that buffers are larger than the step needs.
@@ -387,7 +389,7 @@ fn trained_poses_agree_with_the_cpu() {
     let values = [rows(51, 0.04), rows(52, 1e-2), second];
     cpu.poses = Some(PoseTraining { views: given.views.clone(), steps: vec![7, 0, 1, 3, 2], values });
     let mut on_gpu = cpu.clone();
-    let mut cpu_device = super::super::cpu::CpuDevice::new(0.2, None, &given);
+    let mut cpu_device = super::super::cpu::CpuDevice::new(0.2, None, None, &given);
     let mut device = GpuDevice::new(&gpu, &cpu, 0.2, None, &given).unwrap();
     let pose_rates = Some(PoseRates { rate: 2e-3, decay: 0.01 });
     for n in 0..3 {
