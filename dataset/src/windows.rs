@@ -128,7 +128,7 @@ impl WindowReader {
         self.with(depth, self.shared.zones.clone())
     }
 
-    /// A new reader like this one whose windows weigh pixels of zones `1 + weight`, and others 1.
+    /// A new reader like this one whose windows weigh pixels of zones more, `1 + weight` for one of usual size, and others 1.
     #[must_use]
     pub fn with_zones(self, zones: Arc<Zones>, weight: f32) -> Self {
         let depth = self.shared.depth.is_some().then(|| TargetDepth::new(&self.shared.capture));

@@ -24,7 +24,8 @@ pub(crate) struct ZoneOptions {
     #[arg(long, value_name = "FILE")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) zones: Option<PathBuf>,
-    /// Pixels of objects count 1 + W times, with --detector or --zones; 4 if it is not given
+    /// Pixels of objects that cover a hundredth of the photo count 1 + W times, with --detector or --zones, those of smaller objects more
+    /// and those of larger ones less; 4 if it is not given
     #[arg(long, value_name = "W", value_parser = weight, requires = "zone_source")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) zone_weight: Option<f64>,

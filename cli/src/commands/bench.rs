@@ -226,7 +226,8 @@ pub(crate) fn chart(args: &ChartArgs, output: &Output) -> Result<(), Failure> {
     let path = args.results.join("chart.svg");
     save(&path, ::bench::chart(&runs, &references).as_bytes())?;
     let pruned = args.results.join("prune.jsonl");
-    if let Some(drawn) = (if pruned.exists() { ::bench::pruning_chart(&read_parts(&pruned)?) } else { None }) {
+    let lines_of_parts = if pruned.exists() { read_parts(&pruned)? } else { Vec::new() };
+    if let Some(drawn) = ::bench::pruning_chart(&lines_of_parts) {
         save(&args.results.join("prune.svg"), drawn.as_bytes())?;
     }
     save(&args.readme, readme.as_bytes())?;
