@@ -153,7 +153,7 @@ fn stage<'a>(case: &'a Case, args: &StabilityArgs, output: &Output) -> Result<St
     }
     let folder = |kind: &str| args.out.join("captures").join(format!("{}-{kind}", case.name));
     let make = |to: &Path, options: &str| -> Result<(), Failure> {
-        if !to.join("manifest.json").exists() {
+        if !is_complete(to) {
             synth::write(&synth_args(to, options)?, to, output)?;
         }
         Ok(())
@@ -175,6 +175,13 @@ fn stage<'a>(case: &'a Case, args: &StabilityArgs, output: &Output) -> Result<St
     let better = if matches!(case.counter, Counter::Capture(_)) { clean.clone() } else { own.clone() };
     let measured_on = if case.photos == MeasuredOn::Clean { clean } else { own.clone() };
     Ok(Stage { case, capture_name: GENERATED.to_owned(), trained_on: [own, better], measured_on, synth })
+}
+
+/// Whether all of a generated capture is there.
+fn is_complete(capture: &Path) -> bool {
+    let manifest = fs::read(capture.join("manifest.json")).ok();
+    let manifest = manifest.and_then(|bytes| serde_json::from_slice::<serde_json::Value>(&bytes).ok());
+    manifest.is_some_and(|manifest| manifest["complete"] == true)
 }
 
 /// The options without `--fault` and its value.
@@ -375,17 +382,19 @@ fn row(case: &Case, lines: &[Stability]) -> Row {
 
 /// Which of the figures that a case is about are better with the counter-measure.
 fn verdict(case: &Case, off: &Means, on: &Means) -> String {
-    let psnr = |of: &Means| of.street_psnr.or(of.psnr);
-    let figures: &[(&str, &dyn Fn(&Means) -> Option<f64>)] = match case.eval {
-        "--seams" => &[("seams", &|of| of.seam_db), ("PSNR", &psnr)],
-        "--fit-exposure" => &[("PSNR after the fit", &|of| of.fitted_psnr)],
-        "--depth" => &[("PSNR", &psnr), ("depth", &|of| of.depth_absrel.map(|error| -error))],
-        _ => &[("PSNR", &psnr)],
+    type Figure = (&'static str, fn(&Means) -> Option<f64>);
+    const PSNR: Figure = ("PSNR", |of| of.street_psnr.or(of.psnr));
+    let figures: &[Figure] = match case.eval {
+        "--seams" => &[("seams", |of| of.seam_db), PSNR],
+        "--fit-exposure" => &[("PSNR after the fit", |of| of.fitted_psnr)],
+        "--depth" => &[PSNR, ("depth", |of| of.depth_absrel.map(|error| -error))],
+        _ => &[PSNR],
     };
-    let (better, worse): (Vec<_>, Vec<_>) = figures.iter().partition(|(_, figure)| figure(on) > figure(off));
-    let names =
-        |of: &[&(&str, &dyn Fn(&Means) -> Option<f64>)]| of.iter().map(|of| of.0).collect::<Vec<_>>().join(", ");
-    let (better, worse) = (names(&better.iter().collect::<Vec<_>>()), names(&worse.iter().collect::<Vec<_>>()));
+    let names = |is_better: bool| {
+        let of_kind = figures.iter().filter(|(_, figure)| (figure(on) > figure(off)) == is_better);
+        of_kind.map(|(name, _)| *name).collect::<Vec<_>>().join(", ")
+    };
+    let (better, worse) = (names(true), names(false));
     match (better.is_empty(), worse.is_empty()) {
         (_, true) => "yes".to_owned(),
         (true, _) => "**no**".to_owned(),
