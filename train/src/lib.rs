@@ -24,6 +24,7 @@ mod pose;
 pub mod prune;
 pub mod random;
 mod recipe;
+mod size_limit;
 pub mod source;
 mod trainer;
 mod view;

@@ -23,6 +23,7 @@ use crate::optimiser::{Adam, LearningRates};
 use crate::pose::{GivenPoses, PoseRates, PoseTraining};
 use crate::random;
 use crate::recipe::Recipe;
+use crate::size_limit::SizeLimit;
 use crate::source::AHEAD;
 use crate::view::TrainView;
 
@@ -142,6 +143,7 @@ struct Trainer<'a> {
     device: Box<dyn TrainDevice + 'a>,
     given: Arc<GivenPoses>,
     log_scale_bounds: [f32; 2],
+    size_limit: SizeLimit,
     /// Detail that each coarse mip lacks, from `first_stage` on.
     missing_detail: Vec<f64>,
     first_stage: u8,
@@ -187,6 +189,7 @@ impl<'a> Trainer<'a> {
             device,
             given,
             log_scale_bounds,
+            size_limit: SizeLimit::of(views),
             missing_detail,
             first_stage,
             order,
@@ -337,6 +340,7 @@ impl<'a> Trainer<'a> {
             if let Some(free) = free_space {
                 free.clip(&mut grown);
             }
+            self.size_limit.clip(&mut grown);
             state.splats = grown;
             self.device.rearrange(state, &rows)?;
         }

@@ -106,12 +106,12 @@ impl Block<'_> {
         train::random::bits(self.plan.settings.seed, place)
     }
 
-    /// Smallest and largest standard deviation of a splat, metres: from a twentieth of a pixel of the block's level to three times the
-    /// initial size of a backdrop splat. A backdrop splat that grows much larger becomes a haze over every photo that sees it. Only the
-    /// root has a backdrop.
+    /// Smallest and largest standard deviation of a splat, metres: from a twentieth of a pixel of the block's level to one and a half
+    /// times the initial size of a backdrop splat. A backdrop splat that grows much larger becomes a haze over every photo that sees it,
+    /// and a hole in the sky of viewers that leave it out. Only the root has a backdrop.
     pub(crate) fn size_bounds_metres(&self, views: &[TrainView]) -> [f32; 2] {
         let largest = match self.task.parent {
-            None => 3.0 * train::init::backdrop_size_metres(self.backdrop_sphere(views).1),
+            None => 1.5 * train::init::backdrop_size_metres(self.backdrop_sphere(views).1),
             Some(_) => 0.5 * self.plan.ground.edge_metres,
         };
         [self.task.rho_metres as f32 * 0.05, largest as f32]
