@@ -24,6 +24,7 @@ mod result_lines;
 mod run_record;
 mod signals;
 mod stability_cases;
+mod stability_table;
 mod telemetry_setup;
 
 use std::process::ExitCode;
