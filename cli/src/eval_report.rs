@@ -154,14 +154,13 @@ fn summaries(evaluated: &Evaluated) -> Vec<(String, Summary)> {
 }
 
 fn depth(report: &DepthReport) -> String {
-    let [absrel, rmse, delta, empty, pixels] = ["AbsRel", "RMSE m", "δ<1.25", "empty", "pixels"];
-    let mut text =
-        format!("{absrel:>8} {rmse:>8} {delta:>8} {empty:>8} {pixels:>11}  depth against {}\n", report.source);
+    let heads = ["AbsRel", "RMSE m", "δ<1.25", "empty", "normal °", "n<30°"].map(|head| format!("{head:>8} ")).concat();
+    let mut text = format!("{heads}{:>11}  depth against {}\n", "pixels", report.source);
     for (name, of) in report.groups.named() {
-        let [absrel, delta1, empty] = [of.absrel, of.delta1, of.empty].map(|value| figure(value, 4));
-        let rmse = figure(of.rmse, 2);
-        text +=
-            &format!("{absrel:>8} {rmse:>8} {delta1:>8} {empty:>8} {:>11}  {name}: {} views\n", of.pixels, of.views);
+        let figures =
+            [(of.absrel, 4), (of.rmse, 2), (of.delta1, 4), (of.empty, 4), (of.normal_degrees, 1), (of.normal_30, 4)];
+        text += &figures.map(|(value, digits)| format!("{:>8} ", figure(value, digits))).concat();
+        text += &format!("{:>11}  {name}: {} views\n", of.pixels, of.views);
     }
     text
 }

@@ -104,7 +104,7 @@ impl<'a> Judges<'a> {
     ) -> Result<(), BadInput> {
         if let Some(depth) = &mut self.depth {
             let truth = depth.views.of_view(view, photo.mask.as_deref())?;
-            depth.figures.push((part, index, DepthFigures::new(&view.name, frame, &truth)));
+            depth.figures.push((part, index, DepthFigures::new(&view.name, frame, &truth, &view.camera.pinhole)));
         }
         if self.detectors.is_empty() {
             return Ok(());

@@ -27,6 +27,7 @@ mod label_colours;
 mod lpips;
 mod metric_maps;
 mod networks;
+mod normals;
 mod observer;
 mod photos;
 mod pruning;
