@@ -100,8 +100,18 @@ struct Comparison<'a> {
     mse: f64,
     /// Sum of the pixel weights.
     pixels: f64,
+    /// Errors over all pixels and over those of the photo's zones, without the weights of zones.
+    parts: [Squares; 2],
     /// Factor by which the view's exposure scales the square of a change.
     square_gain: f64,
+}
+
+/// Squared errors over pixels and channels.
+#[derive(Clone, Copy, Default)]
+struct Squares {
+    sum: f64,
+    /// Sum of the pixels' weights.
+    pixels: f64,
 }
 
 /// Fixed pixel weights of a set of views, 0 to 255; empty where all are 1. Recomputing them after pruning would give a
@@ -127,19 +137,23 @@ impl<'a> EvaluationViews<'a> {
         Ok(weights)
     }
 
-    /// Mean over the views of the weighted PSNR, dB.
+    /// PSNR over all pixels and over those of zones, dB, each a mean over the views that have such pixels. Without any zone both are the
+    /// same.
     ///
     /// # Errors
     /// A window that cannot be read.
-    pub fn psnr(&self, splats: &Splats, weights: &OwnershipWeights) -> Result<f64, TrainError> {
-        let (mut sum, mut count) = (0.0, 0.0f64);
+    pub fn psnr(&self, splats: &Splats, weights: &OwnershipWeights) -> Result<[f64; 2], TrainError> {
+        let mut sums = [(0.0, 0.0f64); 2];
         self.compare(splats, Some(weights), |_, compared| {
-            if compared.pixels >= 1.0 {
-                sum += psnr_of(compared.mse);
-                count += 1.0;
+            for ((sum, count), part) in sums.iter_mut().zip(compared.parts) {
+                if part.pixels >= 1.0 {
+                    *sum += psnr_of(part.sum / (3.0 * part.pixels));
+                    *count += 1.0;
+                }
             }
         })?;
-        Ok(sum / count.max(1.0))
+        let [all, zones] = sums.map(|(sum, count)| sum / count.max(1.0));
+        Ok([all, if sums[1].1 > 0.0 { zones } else { all }])
     }
 
     /// Root of the weighted mean squared error over all views, 0 to 1; `None` where the weights sum to less than 64
@@ -219,14 +233,39 @@ impl<'a> EvaluationViews<'a> {
             // Clamped to the range of a display.
             let pairs = shown.iter().map(|colour| colour.clamp(0.0, 1.0)).zip(&photo.rgb);
             let squares = pairs.map(|(colour, photo)| f64::from(colour - f32::from(*photo) / 255.0).powi(2));
-            let error: f64 = squares.enumerate().map(|(i, square)| weight(i) * square).sum();
             let pixels = if weights.is_empty() { area as f64 } else { weights.iter().map(|w| f64::from(*w)).sum() };
+            let (error, parts) = match &photo.weights {
+                None => {
+                    let sum = squares.enumerate().map(|(i, square)| weight(i) * square).sum();
+                    (sum, [Squares { sum, pixels }, Squares::default()])
+                }
+                Some(of_photo) => by_zones(squares, of_photo, weight),
+            };
             let mse = error / (3.0 * pixels).max(1e-9);
             let square_gain = exposure.map_or(1.0, |exposure| f64::from(square_gain(exposure)));
-            visit(&mut renderer, Comparison { weights: &weights, mse, pixels, square_gain });
+            visit(&mut renderer, Comparison { weights: &weights, mse, pixels, parts, square_gain });
         }
         Ok(())
     }
+}
+
+/// The weighted sum of the squares (three planes), and the squares of all pixels and of those in zones without the photo's weights.
+fn by_zones(
+    squares: impl Iterator<Item = f64>,
+    of_photo: &[f32],
+    weight: impl Fn(usize) -> f64,
+) -> (f64, [Squares; 2]) {
+    let (mut error, mut parts) = (0.0, [Squares::default(); 2]);
+    for (i, square) in squares.enumerate() {
+        let of_photo = f64::from(of_photo[i % of_photo.len()]);
+        let own = weight(i) / of_photo;
+        error += weight(i) * square;
+        for part in &mut parts[..if of_photo > 1.0 { 2 } else { 1 }] {
+            part.sum += own * square;
+            part.pixels += own / 3.0;
+        }
+    }
+    (error, parts)
 }
 
 /// The share of each pixel that the trainable splats explain, 0 to 255.

@@ -8,7 +8,8 @@
 //! ```
 //! The floor is the PSNR after a recovery without pruning, minus the tolerance. A model that was not trained to
 //! convergence improves by recovery alone. Spending that gain on pruning cost held-out views two to three times the
-//! tolerance. Recovery regains most of what a cut costs at first, so each cut goes deeper than the tolerance. No result
+//! tolerance. Where photos have zones, the PSNR of their pixels has a floor of its own, as objects are few of all pixels.
+//! Recovery regains most of what a cut costs at first, so each cut goes deeper than the tolerance. No result
 //! is below the floor.
 
 mod search;
@@ -51,7 +52,7 @@ pub fn steps_before(steps: u32) -> u32 {
 /// Parameters of pruning.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Pruning {
-    /// Allowed loss of PSNR on the job's training views, dB.
+    /// Allowed loss of PSNR on the job's training views, over all pixels and over those of zones alike, dB.
     pub tolerance_db: f64,
     /// Importance measure that orders the splats.
     pub order: Order,
@@ -169,23 +170,23 @@ pub type Report<'a> = &'a mut dyn FnMut(PruneProgress) -> Flow;
 pub fn within_tolerance(trained: Job, pruning: &Pruning, report: Report) -> Result<(Splats, Pruned), TrainError> {
     let (pruner, mut best) = Pruner::new(trained, pruning)?;
     let pruning = pruner.pruning;
-    let before = pruner.psnr(&best)?;
+    let before = pruner.quality(&best)?;
     let owned = pruner.owned(&best);
     // The gain of recovery alone raises the floor, so that cuts cannot spend it.
     for round in 0..pruning.warm_up {
         let Some(recovered) = pruner.recover(best.clone(), round, report)? else {
-            let psnr = [before, pruner.psnr(&best)?];
+            let psnr = [before.psnr(), pruner.quality(&best)?.psnr()];
             let outcome = Pruned { splats: [owned; 2], psnr, rounds: 0, steps: round * pruner.job.steps };
             return Ok((best, outcome));
         };
         best = recovered;
     }
-    let mut reached = pruner.psnr(&best)?;
-    let floor = reached.max(before) - pruning.tolerance_db;
+    let mut reached = pruner.quality(&best)?;
+    let floor = reached.or_better(before).less(pruning.tolerance_db);
     let (mut drop_db, mut kept_rounds, mut stopped) = (pruning.drop_db, 0, false);
     let mut recoveries = pruning.warm_up;
     for round in 0..pruning.rounds {
-        let cut = pruner.cut(&best, reached - floor + drop_db, &pruner.probe)?;
+        let cut = pruner.cut(&best, floor.less(drop_db).below(reached), &pruner.probe)?;
         if ((best.len() - cut.len()) as f64) < MIN_CUT * pruner.owned(&best) as f64 {
             break;
         }
@@ -194,26 +195,26 @@ pub fn within_tolerance(trained: Job, pruning: &Pruning, report: Report) -> Resu
             break;
         };
         recoveries += 1;
-        let psnr = pruner.psnr(&recovered)?;
-        if psnr >= floor {
-            (best, reached, kept_rounds) = (recovered, psnr, kept_rounds + 1);
+        let quality = pruner.quality(&recovered)?;
+        if quality.reaches(floor) {
+            (best, reached, kept_rounds) = (recovered, quality, kept_rounds + 1);
         } else {
             drop_db *= 0.5;
         }
     }
     if !stopped {
-        best = pruner.cut(&best, reached - floor, &pruner.measured)?;
+        best = pruner.cut(&best, floor.below(reached), &pruner.measured)?;
         // Recovery after the last cut is for the held-out views, which lose more than the training views.
         if let Some(recovered) = pruner.recover(best.clone(), pruning.warm_up + pruning.rounds, report)? {
             recoveries += 1;
-            if pruner.psnr(&recovered)? >= floor {
+            if pruner.quality(&recovered)?.reaches(floor) {
                 best = recovered;
             }
         }
     }
     let outcome = Pruned {
         splats: [owned, pruner.owned(&best)],
-        psnr: [before, pruner.psnr(&best)?],
+        psnr: [before.psnr(), pruner.quality(&best)?.psnr()],
         rounds: kept_rounds,
         steps: recoveries * pruner.job.steps,
     };
@@ -227,7 +228,7 @@ pub fn within_tolerance(trained: Job, pruning: &Pruning, report: Report) -> Resu
 /// See [`TrainError`].
 pub fn to_share(trained: Job, pruning: &Pruning, share: f64, report: Report) -> Result<(Splats, Pruned), TrainError> {
     let (pruner, mut splats) = Pruner::new(trained, &pruning.without_warm_up())?;
-    let (before, psnr) = (pruner.owned(&splats), pruner.psnr(&splats)?);
+    let (before, psnr) = (pruner.owned(&splats), pruner.quality(&splats)?.psnr());
     let (rounds, mut recoveries, mut stopped) = (pruner.pruning.parts(), 0, false);
     for round in 0..rounds {
         // Where it was stopped, one cut is left.
@@ -246,7 +247,7 @@ pub fn to_share(trained: Job, pruning: &Pruning, share: f64, report: Report) -> 
     }
     let outcome = Pruned {
         splats: [before, pruner.owned(&splats)],
-        psnr: [psnr, pruner.psnr(&splats)?],
+        psnr: [psnr, pruner.quality(&splats)?.psnr()],
         rounds: recoveries,
         steps: recoveries * pruner.job.steps,
     };
@@ -284,6 +285,38 @@ struct Pruner<'a> {
     probe: Evaluator,
 }
 
+/// PSNR over all pixels and over those of zones, dB; without zones both are the same.
+#[derive(Clone, Copy)]
+struct Quality([f64; 2]);
+
+impl Quality {
+    /// Over all pixels.
+    fn psnr(self) -> f64 {
+        self.0[0]
+    }
+
+    fn with(self, other: Self, f: impl Fn(f64, f64) -> f64) -> Self {
+        Self([0, 1].map(|part| f(self.0[part], other.0[part])))
+    }
+
+    fn or_better(self, other: Self) -> Self {
+        self.with(other, f64::max)
+    }
+
+    fn less(self, db: f64) -> Self {
+        Self(self.0.map(|psnr| psnr - db))
+    }
+
+    /// How far this lies below the other, dB.
+    fn below(self, other: Self) -> [f64; 2] {
+        other.with(self, |high, low| high - low).0
+    }
+
+    fn reaches(self, floor: Self) -> bool {
+        self.0.iter().zip(floor.0).all(|(psnr, floor)| *psnr >= floor)
+    }
+}
+
 /// Views to measure PSNR on, with pixel weights from the unpruned splats.
 struct Evaluator {
     views: Vec<TrainView>,
@@ -297,8 +330,8 @@ impl Evaluator {
         Ok(Self { views, weights })
     }
 
-    fn psnr(&self, all: &EvaluationViews, splats: &Splats) -> Result<f64, TrainError> {
-        EvaluationViews { views: &self.views, ..*all }.psnr(splats, &self.weights)
+    fn quality(&self, all: &EvaluationViews, splats: &Splats) -> Result<Quality, TrainError> {
+        EvaluationViews { views: &self.views, ..*all }.psnr(splats, &self.weights).map(Quality)
     }
 }
 
@@ -322,26 +355,32 @@ impl<'a> Pruner<'a> {
         (0..splats.len()).filter(|&i| (self.job.counts)(splats.mean(i))).count()
     }
 
-    fn psnr(&self, splats: &Splats) -> Result<f64, TrainError> {
-        self.measured.psnr(&self.all, splats)
+    fn quality(&self, splats: &Splats) -> Result<Quality, TrainError> {
+        self.measured.quality(&self.all, splats)
     }
 
-    /// The fewest splats that lose at most `loss_db` on the evaluator's views, within one percent of the number or a
-    /// tenth of the loss.
-    fn cut(&self, splats: &Splats, loss_db: f64, evaluator: &Evaluator) -> Result<Splats, TrainError> {
-        let before = evaluator.psnr(&self.all, splats)?;
+    /// The fewest splats that lose at most `loss_db` over all pixels and over those of zones on the evaluator's views, within one percent
+    /// of the number or a tenth of the loss.
+    fn cut(&self, splats: &Splats, loss_db: [f64; 2], evaluator: &Evaluator) -> Result<Splats, TrainError> {
+        let before = evaluator.quality(&self.all, splats)?;
         let views = self.all.some(IMPORTANCE_VIEWS.for_steps(self.job.steps));
         let importance = EvaluationViews { views: &views, ..self.all }.importance(self.pruning.order, splats)?;
         let order = ranking(splats, &importance, self.job.counts);
-        let increase = |psnr: f64| 10f64.powf((before - psnr) / 10.0) - 1.0;
+        // Increases of the mean squared error.
+        let increase = |loss_db: f64| 10f64.powf(loss_db / 10.0) - 1.0;
+        let allowed = loss_db.map(|loss| increase(loss.max(0.0)).max(1e-9));
+        let spent = |cut: Quality| {
+            let parts = cut.below(before).into_iter().zip(allowed);
+            parts.map(|(loss, allowed)| increase(loss) / allowed).fold(f64::MIN, f64::max)
+        };
         let ordered = order.iter().map(|&i| importance[i as usize]);
         // Energy is in units of each view's squared error.
-        let factor = (self.pruning.order == Order::Energy).then(|| 1.0 / views.len() as f64);
-        let mut search = Search::new(ordered, increase(before - loss_db), factor);
+        let factor = (self.pruning.order == Order::Energy).then(|| 1.0 / (views.len() as f64 * allowed[0]));
+        let mut search = Search::new(ordered, 1.0, factor);
         let mut best = splats.clone();
         while let Some(count) = search.next() {
             let cut = without(splats, &order[..count]);
-            if search.record(count, increase(evaluator.psnr(&self.all, &cut)?)) {
+            if search.record(count, spent(evaluator.quality(&self.all, &cut)?)) {
                 best = cut;
             }
         }

@@ -215,6 +215,28 @@ fn masked_pixels_protect_no_splats() {
 }
 
 #[test]
+fn zones_have_a_tolerance_of_their_own() {
+    const TOLERANCE_DB: f64 = 1.0;
+    let ground_truth = cloud(11, 120, 0.8);
+    let all = photos(&ground_truth);
+    let model = with_faint_splats(&ground_truth);
+    let in_zone = |i: usize| (20..26).contains(&(i % WIDTH as usize)) && (14..20).contains(&(i / WIDTH as usize));
+    let of_all =
+        |change: &dyn Fn(&Pixels) -> Pixels| Photos(all.0.iter().map(|photo| Arc::new(change(photo))).collect());
+    // A weight that changes next to nothing but says where the zone is.
+    let weights: Vec<f32> = (0..AREA).map(|i| if in_zone(i) { 1.001 } else { 1.0 }).collect();
+    let with_zones = of_all(&|photo| Pixels { weights: Some(weights.clone()), ..photo.clone() });
+    let zone: Vec<u8> = (0..AREA).map(|i| if in_zone(i) { 255 } else { 0 }).collect();
+    let zone_only = of_all(&|photo| Pixels { mask: Some(zone.clone()), ..photo.clone() });
+    let [plain, aware] = [&all, &with_zones].map(|photos| prune(&model, photos, &|_| true, TOLERANCE_DB).0);
+    let [before, of_plain, of_aware] = [&model, &plain, &aware].map(|splats| psnr(splats, &zone_only));
+    println!("zone {before:.2} dB, {of_plain:.2} of {} splats, {of_aware:.2} of {}", plain.len(), aware.len());
+    assert!(of_plain < before - TOLERANCE_DB, "the zone must be at risk: {before} {of_plain}");
+    assert!(of_aware >= before - TOLERANCE_DB - 1e-3, "{before} {of_aware}");
+    assert!(psnr(&aware, &all) >= psnr(&model, &all) - TOLERANCE_DB - 1e-3 && aware.len() < model.len());
+}
+
+#[test]
 fn the_most_important_share_is_kept() {
     let ground_truth = cloud(6, 60, 0.8);
     let photos = photos(&ground_truth);
