@@ -7,12 +7,18 @@ use scene::BadInput;
 
 use crate::args::Backend;
 
-/// The backend of this choice. `auto` is the CPU: GPUs have not been measured against it yet.
+/// The backend of this choice. `auto` is a GPU with memory of its own, else the CPU: software on the CPU is far slower than its SIMD
+/// (docs/src/performance.md), and no GPU that shares the CPU's memory has been measured.
 pub(crate) fn open(backend: Backend) -> Result<train::Backend, BadInput> {
     match backend {
-        Backend::Auto | Backend::Cpu => Ok(train::Backend::Cpu),
+        Backend::Auto => Ok(dedicated_gpu().map_or(train::Backend::Cpu, train::Backend::Gpu)),
+        Backend::Cpu => Ok(train::Backend::Cpu),
         Backend::Gpu => open_gpu().map(train::Backend::Gpu),
     }
+}
+
+fn dedicated_gpu() -> Option<Arc<Gpu>> {
+    Gpu::open().ok().filter(|gpu| ["discrete", "virtual"].contains(&gpu.class()))
 }
 
 /// The adapter that the environment chooses.
