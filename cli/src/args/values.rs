@@ -67,7 +67,7 @@ impl FromStr for Size {
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, ValueEnum, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub(crate) enum Backend {
-    /// The CPU, as GPUs have not been measured against it yet; for `plat submit` the backend of most workers
+    /// A GPU with memory of its own, else the CPU; for `plat submit` the backend of most workers
     #[default]
     Auto,
     /// SIMD and threads

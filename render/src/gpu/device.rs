@@ -48,11 +48,25 @@ impl Gpu {
     /// # Errors
     /// If no adapter matches, or the adapter's limits are too small for the stages.
     pub fn open_with(options: &GpuOptions) -> Result<Arc<Self>, GpuError> {
+        Self::open_one_of(options, |_| true)
+    }
+
+    /// Opens a device with the options of the environment on a GPU that has memory of its own, also where the machine is a virtual one.
+    ///
+    /// # Errors
+    /// As [`open`](Self::open); without such a GPU, that no adapter matches.
+    pub fn open_dedicated() -> Result<Arc<Self>, GpuError> {
+        use wgpu::DeviceType::{DiscreteGpu, VirtualGpu};
+        Self::open_one_of(&GpuOptions::from_env()?, |kind| matches!(kind, DiscreteGpu | VirtualGpu))
+    }
+
+    fn open_one_of(options: &GpuOptions, suits: fn(wgpu::DeviceType) -> bool) -> Result<Arc<Self>, GpuError> {
         let instance = wgpu::Instance::new(wgpu::InstanceDescriptor::new_without_display_handle());
         let mut adapters = pollster::block_on(instance.enumerate_adapters(wgpu::Backends::PRIMARY));
         if let Some(wanted) = &options.adapter {
             adapters.retain(|adapter| adapter.get_info().name.to_lowercase().contains(&wanted.to_lowercase()));
         }
+        adapters.retain(|adapter| suits(adapter.get_info().device_type));
         let power = |adapter: &wgpu::Adapter| match adapter.get_info().device_type {
             wgpu::DeviceType::DiscreteGpu => 0,
             wgpu::DeviceType::VirtualGpu => 1,
