@@ -1,4 +1,4 @@
-//! Finds the true depths and boxes of captures that `plat synth --truth` wrote.
+//! Finds the true depths, boxes and instances of captures that `plat synth --truth` wrote.
 
 use std::fs::File;
 use std::io::Read;
@@ -13,8 +13,9 @@ use super::files::{CaptureRoot, show};
 const MANIFEST: &str = "manifest.json";
 /// Manifests of the largest cities have 20 kB.
 const MANIFEST_BYTES: u64 = 1 << 20;
-/// The folder of true depths.
+/// The folder of true depths, and that of true instances.
 const DEPTH: &str = "depth";
+const INSTANCE: &str = "instance";
 /// The objects of each photo, and the cameras as they were.
 const BOXES: [&str; 2] = ["boxes3d.json", "truth/transforms.json"];
 
@@ -33,13 +34,26 @@ fn manifest_of(root: &CaptureRoot) -> Result<Option<Value>, BadInput> {
 /// # Errors
 /// A path that is no capture, or a manifest that promises depths that are not there.
 pub(crate) fn truth_folder(path: &Path) -> Result<Option<PathBuf>, BadInput> {
+    folder_of(path, DEPTH)
+}
+
+/// The folder of the capture's true instances: for each photo NAME a NAME.png of 24-bit numbers, red first; `None` unless
+/// its manifest says that it has them.
+///
+/// # Errors
+/// A path that is no capture, or a manifest that promises instances that are not there.
+pub(crate) fn truth_instances(path: &Path) -> Result<Option<PathBuf>, BadInput> {
+    folder_of(path, INSTANCE)
+}
+
+fn folder_of(path: &Path, name: &str) -> Result<Option<PathBuf>, BadInput> {
     let root = CaptureRoot::new(path)?;
     if manifest_of(&root)?.is_none_or(|manifest| manifest["settings"]["truth"] != Value::Bool(true)) {
         return Ok(None);
     }
-    let folder = root.path(DEPTH).canonicalize().ok().filter(|folder| folder.is_dir());
+    let folder = root.path(name).canonicalize().ok().filter(|folder| folder.is_dir());
     folder.filter(|folder| folder.starts_with(root.path(""))).map(Some).ok_or_else(|| {
-        let problem = format!("has no folder {DEPTH}, which its {MANIFEST} says it has");
+        let problem = format!("has no folder {name}, which its {MANIFEST} says it has");
         BadInput::new(show(path), problem, "write the capture again with plat synth --truth")
     })
 }
