@@ -386,4 +386,4 @@ fn geo_origin(root: &CaptureRoot) -> Result<Option<GeoOrigin>, BadInput> {
 }
 
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;

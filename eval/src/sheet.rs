@@ -115,10 +115,13 @@ pub(crate) fn text_width(text: &str) -> u32 {
 pub(crate) fn draw_text(image: &mut RgbImage, x: u32, y: u32, text: &str, colour: Rgb<u8>) {
     for (i, letter) in text.chars().enumerate() {
         let glyph = BASIC_LEGACY[if letter.is_ascii() { letter as usize } else { '?' as usize }];
-        let left = x + i as u32 * 8 * DOT;
+        let left = x.saturating_add(i as u32 * 8 * DOT);
+        if left >= image.width() {
+            break;
+        }
         for (dy, bits) in glyph.iter().enumerate() {
             for dx in (0..8u32).filter(|dx| bits >> dx & 1 == 1) {
-                fill(image, left + dx * DOT, y + dy as u32 * DOT, DOT, DOT, colour);
+                fill(image, left + dx * DOT, y.saturating_add(dy as u32 * DOT), DOT, DOT, colour);
             }
         }
     }

@@ -134,7 +134,7 @@ mod tests {
             zones(whole, 0, f32::NAN),
             Zones::default(),
             Zones { of_views: vec![Vec::new(); 2], ..zones(whole, 0, 1.0) },
-            Zones { of_views: vec![zones(whole, 0, 1.0).of(0).repeat(1001)], ..zones(whole, 0, 1.0) },
+            Zones { of_views: vec![vec![zones(whole, 0, 1.0).of(0)[0].clone(); 1001]], ..zones(whole, 0, 1.0) },
         ] {
             assert!(bad.check(&views).is_err(), "{bad:?}");
         }

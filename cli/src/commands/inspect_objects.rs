@@ -49,7 +49,7 @@ pub(super) fn objects(args: &InspectArgs, output: &Output) -> Result<Option<Obje
     let url = args.store.clone().unwrap_or_else(|| folder.path().display().to_string());
     let store = Store::open(&url)?.blocking();
     let capture = ingest_photos(&source, &store, args.plan.downscale, output)?.capture;
-    let (zones, _) = find_zones(&capture, &from, &store, &Output::silent())?;
+    let (zones, _) = find_zones(&capture, &from, &store, output)?;
     if let Some(out) = &args.draw {
         let names = stems(&args.capture, capture.views.iter().map(|view| view.name.as_str()))?;
         let files: Vec<PathBuf> = names.iter().map(|name| out.join(name).with_added_extension("png")).collect();

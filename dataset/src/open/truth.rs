@@ -8,6 +8,7 @@ use scene::BadInput;
 use serde_json::Value;
 
 use super::files::{CaptureRoot, show};
+use super::{nuscenes, waymo};
 
 /// The manifest of a synthetic capture.
 const MANIFEST: &str = "manifest.json";
@@ -18,6 +19,12 @@ const DEPTH: &str = "depth";
 const INSTANCE: &str = "instance";
 /// The objects of each photo, and the cameras as they were.
 const BOXES: [&str; 2] = ["boxes3d.json", "truth/transforms.json"];
+
+/// The folder of a capture; `None` of a scene of nuScenes or a segment of Waymo, whose paths are no folders.
+fn root_of(path: &Path) -> Result<Option<CaptureRoot>, BadInput> {
+    let is_named = nuscenes::named_scene(path).is_some() || waymo::named_segment(path).is_some();
+    if is_named { Ok(None) } else { CaptureRoot::new(path).map(Some) }
+}
 
 /// The manifest of a synthetic capture; `None` of other captures, whose manifests are no error.
 fn manifest_of(root: &CaptureRoot) -> Result<Option<Value>, BadInput> {
@@ -47,7 +54,7 @@ pub(crate) fn truth_instances(path: &Path) -> Result<Option<PathBuf>, BadInput> 
 }
 
 fn folder_of(path: &Path, name: &str) -> Result<Option<PathBuf>, BadInput> {
-    let root = CaptureRoot::new(path)?;
+    let Some(root) = root_of(path)? else { return Ok(None) };
     if manifest_of(&root)?.is_none_or(|manifest| manifest["settings"]["truth"] != Value::Bool(true)) {
         return Ok(None);
     }
@@ -64,7 +71,7 @@ fn folder_of(path: &Path, name: &str) -> Result<Option<PathBuf>, BadInput> {
 /// # Errors
 /// A path that is no capture.
 pub(crate) fn truth_boxes(path: &Path) -> Result<Option<[PathBuf; 2]>, BadInput> {
-    let root = CaptureRoot::new(path)?;
+    let Some(root) = root_of(path)? else { return Ok(None) };
     if manifest_of(&root)?.is_none_or(|manifest| manifest["complete"] != Value::Bool(true)) {
         return Ok(None);
     }

@@ -68,3 +68,54 @@ impl LabelMaps {
         Ok(Zones { classes: names, of_views })
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+
+    use image::{GrayImage, Luma, RgbImage};
+    use serde_json::json;
+    use store::Store;
+
+    use super::super::photos::Photos;
+    use super::*;
+    use crate::ingest::{IngestOptions, ingest};
+    use crate::open::{OpenOptions, open};
+
+    #[test]
+    fn labels_are_undistorted_as_masks_are() {
+        let folder = tempfile::tempdir().unwrap();
+        let at = |name: &str| folder.path().join(name);
+        let frame = |name: &str, x: f64| {
+            let pose = [[1.0, 0.0, 0.0, x], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]];
+            json!({"file_path": name, "transform_matrix": pose})
+        };
+        let lens = json!({"w": 80, "h": 60, "fl_x": 60, "fl_y": 60, "cx": 40, "cy": 30, "k1": -0.2, "k2": 0.05,
+            "frames": [frame("a.png", 0.0), frame("b.png", 0.1)]});
+        fs::write(at("transforms.json"), lens.to_string()).unwrap();
+        fs::create_dir(at("maps")).unwrap();
+        fs::create_dir(at("masks")).unwrap();
+        RgbImage::new(80, 60).save(at("a.png")).unwrap();
+        RgbImage::new(80, 60).save(at("b.png")).unwrap();
+        let is_object = |x: u32, y: u32| x * x + 3 * y * y > 2000 && (x / 8 + y / 8) % 2 == 0;
+        let image = |value: u8| GrayImage::from_fn(80, 60, |x, y| Luma([if is_object(x, y) { value } else { 0 }]));
+        image(255).save(at("masks/a.png")).unwrap();
+        image(26).save(at("maps/a.png")).unwrap();
+
+        let source = open(folder.path(), &OpenOptions::default()).unwrap();
+        let store = Store::open("memory://").unwrap().blocking();
+        let maps = LabelMaps::open(&at("maps"), &source).unwrap();
+        let capture = ingest(&source, &store, &IngestOptions { downscale: 1, threads: 1 }, &|_, _| ()).unwrap().capture;
+        assert_ne!(capture.views[0].camera.pinhole.width, 80, "the lens distorts");
+        let zones = maps.zones(&capture, &|_, _| ()).unwrap();
+        zones.check(&capture.views).unwrap();
+        let ([zone], []) = (zones.of(0), zones.of(1)) else { panic!("{zones:?}") };
+        assert_eq!(zones.classes[usize::from(zone.class)], "car");
+        let photo = Photos::new(&capture, &store).whole(0).unwrap();
+        let mut shown = vec![0; photo.area()];
+        for (y, x) in zone.mask.iter().flat_map(|mask| mask.spans(photo.width)) {
+            shown[(y * photo.width) as usize..][x.start as usize..x.end as usize].fill(255);
+        }
+        assert!(Some(shown) == photo.mask && zone.area() > 500.0);
+    }
+}

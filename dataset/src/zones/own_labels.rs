@@ -8,7 +8,7 @@ use scene::{BadInput, Capture, MaskBuilder, View, Zone, Zones};
 use super::id_map::IdMap;
 use crate::box_masks::covered;
 use crate::open::{LabelledBox, Photo, Source, truth_instances};
-use crate::true_boxes::TrueBoxes;
+use crate::true_boxes::{SeenObject, TrueBoxes};
 
 /// The labels of a capture.
 pub struct OwnLabels {
@@ -108,7 +108,7 @@ fn visible(
         }
         _ => None,
     };
-    let zone = |of: &crate::true_boxes::SeenObject| {
+    let zone = |of: &SeenObject| {
         let (corners, mask) = match &masks {
             None => (of.corners, None),
             // An object may have no pixel left in a smaller photo.
@@ -128,4 +128,74 @@ fn projected(view: &View, of: &LabelledBox, numbers: &mut Numbers) -> Option<Zon
     covered(&of.corners, pinhole).for_each(|(row, columns)| builder.push(row, columns));
     let (mask, corners) = builder.finish()?;
     Some(Zone { corners, class: numbers.of(&of.class)?, score: 1.0, mask: Some(mask) })
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+
+    use perceive::iou;
+
+    use super::*;
+    use crate::open::tests::shared;
+    use crate::open::{OpenOptions, open};
+    use crate::synth::{self, Settings};
+
+    #[test]
+    fn boxes_of_a_drive_cover_the_objects_that_its_photos_show() {
+        let folder = tempfile::tempdir().unwrap();
+        let (aerial, nuscenes, spacing) = (0.0, true, Some(12.0));
+        let settings =
+            Settings { aerial, nuscenes, spacing, views: 60, width: 192, height: 128, ..Settings::default() };
+        synth::write(folder.path(), &settings, &|_, _, _| ()).unwrap();
+        let objects = TrueBoxes::open(folder.path()).unwrap().unwrap();
+        let drives = folder.path().join("nuscenes");
+        let scenes: Vec<serde_json::Value> =
+            serde_json::from_slice(&fs::read(drives.join("v1.0-mini/scene.json")).unwrap()).unwrap();
+        let (mut found, mut all) = (0, 0);
+        for scene in scenes {
+            let path = drives.join(scene["name"].as_str().unwrap());
+            let source = open(&path, &OpenOptions::default()).unwrap();
+            let zones = OwnLabels::open(&path, &source).unwrap().zones(&source.capture, &|_, _| ()).unwrap();
+            zones.check(&source.capture.views).unwrap();
+            assert!(zones.classes.iter().any(|class| class == "vehicle.car"), "{:?}", zones.classes);
+            for (view, zones) in source.capture.views.iter().zip(&zones.of_views) {
+                let name = view.name.rsplit_once('/').unwrap().1.to_owned();
+                let objects = objects.of_view(&View { name, ..view.clone() }).unwrap();
+                let is_plain = |of: &&SeenObject| of.visible > 0.8 && of.class == "car";
+                for object in objects.iter().filter(is_plain) {
+                    all += 1;
+                    found += usize::from(zones.iter().any(|zone| iou(zone.corners, object.corners) > 0.6));
+                }
+            }
+        }
+        assert!(all > 20 && 10 * found >= 9 * all, "{found} of {all}");
+    }
+
+    #[test]
+    fn a_real_drive_has_its_labels() {
+        let Some(path) = shared("drive_dgp_scene_01") else { return };
+        let source = open(&path, &OpenOptions::default()).unwrap();
+        let zones = OwnLabels::open(&path, &source).unwrap().zones(&source.capture, &|_, _| ()).unwrap();
+        zones.check(&source.capture.views).unwrap();
+        let car = zones.classes.iter().position(|class| class == "Car").unwrap();
+        let cars = zones.of_views.iter().flatten().filter(|zone| usize::from(zone.class) == car);
+        assert!(cars.count() > 50 && zones.of_views.iter().all(|zones| !zones.is_empty()));
+        // A box seen from outside covers more than half of its bounds.
+        assert!(zones.of_views.iter().flatten().all(|zone| {
+            let [left, top, right, bottom] = zone.corners;
+            zone.area() >= 0.3 * (right - left) * (bottom - top)
+        }));
+    }
+
+    #[test]
+    fn a_capture_without_labels_is_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let settings = Settings { views: 24, width: 48, height: 32, ..Settings::default() };
+        synth::write(folder.path(), &settings, &|_, _, _| ()).unwrap();
+        fs::remove_file(folder.path().join("manifest.json")).unwrap();
+        let source = open(folder.path(), &OpenOptions::default()).unwrap();
+        let line = OwnLabels::open(folder.path(), &source).err().unwrap().to_string();
+        assert!(line.contains("has no labels of its own"), "{line}");
+    }
 }

@@ -54,7 +54,6 @@ fn what_is_no_mask_is_refused() {
     };
     refused("[[0, 0, 9, 0, 0, 4]]", "9, 0 outside");
     refused("[[0, 0, 1e30, 0, 0, 4]]", "outside");
-    refused("[[0, 0, 1e300, 0, 0, 4]]", "inf, 0 outside");
     refused("[[0, 0, 4, 0, 0, 4, 1]]", "without its y");
     refused(r#"{"size": [6, 4], "counts": [24]}"#, "of 4×6 pixels, its image 6×4");
     refused(r#"{"size": [4, 6], "counts": [23]}"#, "23 pixels in all, its image 24");
@@ -64,7 +63,17 @@ fn what_is_no_mask_is_refused() {
     }
     let zigzag: Vec<String> = (0..600_000).map(|i| format!("{},{}", i % 6, i % 2 * 4)).collect();
     refused(&format!("[[{}]]", zigzag.join(",")), "wind too often");
-    for text in ["3", "\"a\"", "[3]", "[[null, 1]]", "[[NaN, 1]]", "{}", r#"{"size": [4, 6]}"#, r#"{"counts": [24]}"#] {
+    for text in [
+        "3",
+        "\"a\"",
+        "[3]",
+        "[[null, 1]]",
+        "[[NaN, 1]]",
+        "[[1e300, 1]]",
+        "{}",
+        r#"{"size": [4, 6]}"#,
+        r#"{"counts": [24]}"#,
+    ] {
         assert!(serde_json::from_str::<Segmentation>(text).is_err(), "{text}");
     }
     for counts in ["[-1]", "[1.5]", "[4294967296]", "null", "{}"] {
