@@ -139,8 +139,11 @@ impl CocoFile {
     }
 }
 
-/// An object's corners and mask in a photo of this size; `None` if no pixel is left. An error says what the file has.
-fn placed(of: &Annotation, image: &Image, photo: [u32; 2]) -> Result<Option<([f32; 4], Option<ZoneMask>)>, String> {
+/// The corners of an object, and its mask if it has one.
+type Placed = ([f32; 4], Option<ZoneMask>);
+
+/// An object in a photo of this size; `None` if no pixel is left. An error says what the file has.
+fn placed(of: &Annotation, image: &Image, photo: [u32; 2]) -> Result<Option<Placed>, String> {
     let size = [image.width, image.height];
     let name = &image.file_name;
     let boxed = of.bbox.map(|bbox| corners(bbox, size, photo).ok_or(bbox)).transpose().map_err(|bbox| {
