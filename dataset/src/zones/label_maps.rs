@@ -97,7 +97,7 @@ mod tests {
         fs::create_dir(at("masks")).unwrap();
         RgbImage::new(80, 60).save(at("a.png")).unwrap();
         RgbImage::new(80, 60).save(at("b.png")).unwrap();
-        let is_object = |x: u32, y: u32| x * x + 3 * y * y > 2000 && (x / 8 + y / 8) % 2 == 0;
+        let is_object = |x: u32, y: u32| x * x + 3 * y * y > 2000 && (x / 8 + y / 8).is_multiple_of(2);
         let image = |value: u8| GrayImage::from_fn(80, 60, |x, y| Luma([if is_object(x, y) { value } else { 0 }]));
         image(255).save(at("masks/a.png")).unwrap();
         image(26).save(at("maps/a.png")).unwrap();
