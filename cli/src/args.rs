@@ -33,7 +33,7 @@ pub(crate) use plan::{Blocks, DepthKind, PlanOptions, RESIDUAL};
 pub(crate) use sweep::Named;
 pub(crate) use synth::{Rig, SynthArgs};
 pub(crate) use values::{Auto, Backend, Size};
-pub(crate) use zones::{AlignedOptions, ZoneOptions};
+pub(crate) use zones::{AlignedOptions, OWN_LABELS, ZoneFinder, ZoneOptions};
 
 /// Trains Gaussian-splat models of whole cities from photos with poses.
 ///
@@ -137,6 +137,15 @@ pub(crate) struct InspectArgs {
     /// Draw where too few photos see the ground from nearby, over cameras and points
     #[arg(long, value_name = "FILE")]
     pub(crate) svg: Option<PathBuf>,
+    #[command(flatten)]
+    pub(crate) finder: ZoneFinder,
+    /// Folder for pictures of the photos with the objects of --detector or --zones: NAME.png of each, at most 1280 pixels a side, and
+    /// objects.png, a sheet of some of them
+    #[arg(long, value_name = "DIR", requires = "zone_source")]
+    pub(crate) draw: Option<PathBuf>,
+    /// Store that keeps the photos and what --detector finds, as that of plat train; by default a temporary one
+    #[arg(long, value_name = "URL", requires = "zone_source")]
+    pub(crate) store: Option<String>,
     #[command(flatten)]
     pub(crate) plan: PlanOptions,
 }

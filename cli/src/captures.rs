@@ -1,19 +1,20 @@
 //! Opens captures, ingests their photos, and reads cameras.
 
-use std::path::Path;
+use std::collections::BTreeSet;
+use std::path::{Component, Path, PathBuf};
 
 use dataset::depth_maps::DepthMapOptions;
 use dataset::ingest::{IngestOptions, Ingested, downscaled, ingest};
 use dataset::mips::MIN_MIP_SIDE;
 use dataset::open::{OpenOptions, Source};
-use dataset::zones::{BoxesFile, ZoneSource};
+use dataset::zones::{CocoFile, LabelMaps, OwnLabels, ZoneSource};
 use eval::{DetectorFile, PhotoOptions, Photos, load_identified_detector};
 use model::Model;
 use perceive::aligned::{Aligned, Weights};
 use scene::{ArtefactId, BadInput, Camera, Capture, Pinhole, Zones};
 use store::BlockingStore;
 
-use crate::args::{AlignedOptions, DepthKind, PlanOptions, ZoneOptions};
+use crate::args::{AlignedOptions, DepthKind, OWN_LABELS, PlanOptions, ZoneFinder, ZoneOptions};
 use crate::failure::Failure;
 use crate::observer::OutputObserver;
 use crate::output::Output;
@@ -89,21 +90,29 @@ pub(crate) fn name_of(path: &Path) -> String {
     path.file_name().unwrap_or_default().to_string_lossy().into_owned()
 }
 
-/// Where the options say that objects on the photos of a capture come from.
+/// Where the options say that objects on the photos of a capture, opened from this path, come from.
 ///
 /// # Errors
-/// A file that is no detector, or has no boxes that fit the photos.
-pub(crate) fn zone_source(options: &ZoneOptions, capture: &Capture) -> Result<Option<ZoneSource>, BadInput> {
-    match (&options.zone_detector, &options.zones) {
+/// A file that is no detector, objects that do not fit the photos, or a capture without labels.
+pub(crate) fn zone_source(
+    finder: &ZoneFinder,
+    capture: &Path,
+    source: &Source,
+) -> Result<Option<ZoneSource>, BadInput> {
+    match (&finder.zone_detector, &finder.zones) {
         (Some(path), _) => {
             let (detector, id) = load_identified_detector(path)?;
             Ok(Some(ZoneSource::Detector(Box::new(detector), id)))
         }
+        (None, Some(path)) if path.as_os_str() == OWN_LABELS => {
+            Ok(Some(ZoneSource::OwnLabels(OwnLabels::open(capture, source)?)))
+        }
+        (None, Some(path)) if path.is_dir() => Ok(Some(ZoneSource::LabelMaps(LabelMaps::open(path, source)?))),
         (None, Some(path)) => {
-            let file = BoxesFile::read(path)?;
+            let file = CocoFile::read(path)?;
             // Before any photo is read.
-            file.zones(capture)?;
-            Ok(Some(ZoneSource::Boxes(file)))
+            file.zones(&source.capture)?;
+            Ok(Some(ZoneSource::Coco(file)))
         }
         (None, None) => Ok(None),
     }
@@ -118,7 +127,7 @@ pub(crate) fn aligned_network(
     aligned: &AlignedOptions,
     backend: &str,
 ) -> Result<Option<Vec<u8>>, BadInput> {
-    let Some(path) = zones.zone_detector.as_ref().filter(|_| aligned.weight() > 0.0) else { return Ok(None) };
+    let Some(path) = zones.finder.zone_detector.as_ref().filter(|_| aligned.weight() > 0.0) else { return Ok(None) };
     if !backend.starts_with("cpu-") {
         let problem = format!("is computed on the CPU, and the job is for {backend}");
         return Err(BadInput::new("--aligned-weight", problem, "give --backend cpu, or leave the loss out"));
@@ -205,4 +214,45 @@ pub(crate) fn resized(camera: &Camera, width: u32, height: u32) -> Camera {
 pub(crate) fn read_cameras(path: &Path) -> Result<Vec<(String, Camera)>, BadInput> {
     let source = dataset::open::open(path, &OpenOptions { cameras_only: true, ..OpenOptions::default() })?;
     Ok(source.capture.views.into_iter().map(|view| (view.name, view.camera)).collect())
+}
+
+/// Paths of the views' files below an output folder: their names without extensions.
+///
+/// # Errors
+/// A name that leads out of the folder, or two views with one path.
+pub(crate) fn stems<'a>(capture: &Path, names: impl Iterator<Item = &'a str>) -> Result<Vec<PathBuf>, BadInput> {
+    let stems = names.map(stem).collect::<Result<Vec<_>, _>>()?;
+    let mut taken = BTreeSet::new();
+    match stems.iter().find(|stem| !taken.insert(*stem)) {
+        None => Ok(stems),
+        Some(twice) => {
+            let problem = format!("two views would both be written as {}.png", twice.display());
+            Err(BadInput::new(capture.display().to_string(), problem, "rename one of them"))
+        }
+    }
+}
+
+fn stem(name: &str) -> Result<PathBuf, BadInput> {
+    let path: PathBuf = Path::new(name).components().filter(|part| *part != Component::CurDir).collect();
+    let inside = path.components().all(|part| matches!(part, Component::Normal(_)));
+    if !inside || path.as_os_str().is_empty() {
+        let advice = "name views by relative paths without ..";
+        return Err(BadInput::new(format!("view '{name}'"), "has a name that leaves the output folder", advice));
+    }
+    Ok(path.with_extension(""))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_stay_inside_the_output_folder() {
+        assert_eq!(stem("./left/0001.v2.jpg").unwrap(), Path::new("left/0001.v2"));
+        assert_eq!(stem("plain").unwrap(), Path::new("plain"));
+        for bad in ["../up.png", "/etc/x.png", "a/../../b.png", "", "."] {
+            assert!(stem(bad).is_err(), "{bad}");
+        }
+        assert!(stems(Path::new("city"), ["a.png", "a.jpg"].into_iter()).is_err());
+    }
 }

@@ -1,4 +1,4 @@
-//! Objects on photos that count more, as scripts use them.
+//! Objects on photos that count more, as scripts use them: found by a detector or listed in a file. Masks are in `masks.rs`.
 
 mod common;
 
@@ -146,10 +146,19 @@ fn boxes_that_do_not_fit_are_refused_in_one_line() {
         &|b| b["images"] = json!([{"id": 0, "file_name": "x.png", "width": 9, "height": 9}]),
         "x.png",
     );
-    change("empty.json", &|b| b["images"][0]["width"] = json!(0), "no pixels");
+    change("empty.json", &|b| b["images"][0]["width"] = json!(0), "0×64 pixels");
+    change("huge.json", &|b| b["images"][0]["width"] = json!(u32::MAX), "4294967295×64 pixels");
+    let mask = |b: &mut Value, mask: Value| b["annotations"][0]["segmentation"] = mask;
+    change("far.json", &|b| mask(b, json!([[0, 0, 99, 0, 0, 60]])), "a polygon with the point 99, 0 outside");
+    change("odd.json", &|b| mask(b, json!([[0, 0, 9, 0, 0, 60, 1]])), "an x without its y");
+    change("runs.json", &|b| mask(b, json!({"size": [64, 96], "counts": [u32::MAX, 9]})), "4294967304 pixels in all");
+    change("size.json", &|b| mask(b, json!({"size": [96, 64], "counts": [6144]})), "run lengths of 64×96 pixels");
+    change("letters.json", &|b| mask(b, json!({"size": [64, 96], "counts": "ooooooooo"})), "damaged string");
+    change("kind.json", &|b| mask(b, json!("mask")), "kind.json: has no objects to use");
+    change("none.json", &|b| b["annotations"][0]["bbox"] = json!(null), "neither bbox nor segmentation");
     change("bbox.json", &|b| b["annotations"][0]["bbox"] = json!([1, 2, 3]), "bbox.json");
     let many = |b: &mut Value| b["annotations"] = vec![b["annotations"][0].clone(); 10_000].into();
-    change("many.json", &many, "more than 1000 boxes");
+    change("many.json", &many, "more than 1000 objects");
     fs::write(at.join("text.json"), "no boxes").unwrap();
     for (name, says) in [("text.json", "text.json"), ("missing.json", "missing.json")] {
         refused(at, &[&TRAIN[..], &["--out", "out", "--zones", name]].concat(), says);

@@ -1,4 +1,6 @@
-//! Excludes boxes of moving objects from a photo.
+//! The pixels that boxes of objects cover on a photo, and their exclusion.
+
+use std::ops::Range;
 
 use glam::{DVec2, DVec3};
 use scene::Pinhole;
@@ -13,28 +15,34 @@ const NEAR_METRES: f64 = 0.1;
 /// the three sides.
 pub(crate) fn exclude(mask: &mut [u8], pinhole: &Pinhole, boxes: &[[DVec3; 8]]) {
     for corners in boxes {
-        let outline = outline(&grown(corners), pinhole);
-        let bound =
-            |pick: fn(&DVec2) -> f64, start: f64, fold: fn(f64, f64) -> f64| outline.iter().map(pick).fold(start, fold);
-        let top = bound(|p| p.y, f64::INFINITY, f64::min).floor().max(0.0) as u32;
-        let bottom = bound(|p| p.y, 0.0, f64::max).ceil().min(f64::from(pinhole.height)) as u32;
-        for y in top..bottom {
-            // The convex hull's extent in a row is that of the lines between all pairs of points.
-            let row = f64::from(y) + 0.5;
-            let (mut left, mut right) = (f64::INFINITY, f64::NEG_INFINITY);
-            for (i, a) in outline.iter().enumerate() {
-                for b in outline[i + 1..].iter().filter(|b| (a.y - row) * (b.y - row) <= 0.0 && a.y != b.y) {
-                    let x = a.x + (b.x - a.x) * (row - a.y) / (b.y - a.y);
-                    (left, right) = (left.min(x), right.max(x));
-                }
-            }
-            let column = |x: f64| x.clamp(0.0, f64::from(pinhole.width)) as usize;
-            let start = y as usize * pinhole.width as usize;
-            if left <= right {
-                mask[start + column(left.floor())..start + column(right.ceil())].fill(0);
-            }
+        for (row, columns) in covered(&grown(corners), pinhole) {
+            let start = row as usize * pinhole.width as usize;
+            mask[start + columns.start as usize..start + columns.end as usize].fill(0);
         }
     }
+}
+
+/// The pixels that a box covers, the convex hull of its picture: for each row from the top the columns.
+pub(crate) fn covered(corners: &[DVec3; 8], pinhole: &Pinhole) -> impl Iterator<Item = (u32, Range<u32>)> {
+    let outline = outline(corners, pinhole);
+    let bound =
+        |pick: fn(&DVec2) -> f64, start: f64, fold: fn(f64, f64) -> f64| outline.iter().map(pick).fold(start, fold);
+    let top = bound(|p| p.y, f64::INFINITY, f64::min).floor().max(0.0) as u32;
+    let bottom = bound(|p| p.y, 0.0, f64::max).ceil().min(f64::from(pinhole.height)) as u32;
+    let width = f64::from(pinhole.width);
+    (top..bottom).filter_map(move |y| {
+        // The convex hull's extent in a row is that of the lines between all pairs of points.
+        let row = f64::from(y) + 0.5;
+        let (mut left, mut right) = (f64::INFINITY, f64::NEG_INFINITY);
+        for (i, a) in outline.iter().enumerate() {
+            for b in outline[i + 1..].iter().filter(|b| (a.y - row) * (b.y - row) <= 0.0 && a.y != b.y) {
+                let x = a.x + (b.x - a.x) * (row - a.y) / (b.y - a.y);
+                (left, right) = (left.min(x), right.max(x));
+            }
+        }
+        let column = |x: f64| x.clamp(0.0, width) as u32;
+        (left <= right).then(|| (y, column(left.floor())..column(right.ceil())))
+    })
 }
 
 fn grown(corners: &[DVec3; 8]) -> [DVec3; 8] {

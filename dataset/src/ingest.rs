@@ -25,7 +25,7 @@ pub use self::error::IngestError;
 pub use self::from_map::Used;
 use self::photo_files::{PhotoFiles, read};
 pub use self::true_depth::{TrueDepth, ViewDepths};
-use self::undistorter::{LastUndistorter, undistorter};
+pub(crate) use self::undistorter::{LastUndistorter, undistorter};
 use crate::open::{Photo, Source};
 use crate::photo::DecodedPhoto;
 use crate::undistortion::Undistorter;
@@ -222,13 +222,14 @@ impl Job<'_> {
     /// Mip 0: undistorted and downscaled. A mask that excludes nothing is dropped.
     fn finest(&self, mut photo: DecodedPhoto, source: &Photo, undistorter: &Undistorter) -> Pixels {
         if !undistorter.is_identity() {
-            photo.mask = photo.mask.map(|mask| undistorter.mask(&mask));
+            photo.mask = photo.mask.map(|mask| undistorter.nearest(&mask));
             photo.rgb = undistorter.rgb(&photo.rgb);
         }
         let Pinhole { width, height, .. } = undistorter.pinhole();
-        if !source.moving.is_empty() {
+        let moving = source.moving();
+        if !moving.is_empty() {
             let all = || vec![255; width as usize * height as usize];
-            box_masks::exclude(photo.mask.get_or_insert_with(all), &undistorter.pinhole(), &source.moving);
+            box_masks::exclude(photo.mask.get_or_insert_with(all), &undistorter.pinhole(), &moving);
         }
         let mut pixels =
             Pixels { width, height, rgb: photo::planes(&photo.rgb), mask: photo.mask, weights: None, depth: None };
@@ -259,7 +260,7 @@ impl Job<'_> {
     fn record_name(&self, photo: &Photo, bytes: &[u8], mask: Option<&[u8]>) -> String {
         let mask = mask.map(ArtefactId::of);
         let key = (FORMAT, ArtefactId::of(bytes), mask, photo.model, photo.width, photo.height, self.downscale);
-        let key = match photo.moving.as_slice() {
+        let key = match photo.moving().as_slice() {
             [] => frame::encode(RECORD, &key, &[]),
             moving => frame::encode(RECORD, &(key, moving), &[]),
         };

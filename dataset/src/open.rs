@@ -7,6 +7,7 @@
 //! Files are opened only inside the capture's folder: a path that leads out of it, by `..` or by a symbolic link, is refused.
 //! Missing photos are skipped and reported, because captures are often shared without all of them.
 
+mod annotated_boxes;
 mod colmap;
 mod depths;
 mod dgp;
@@ -15,9 +16,9 @@ mod frustum_points;
 mod kitti;
 mod kitti360;
 mod kitti_raw;
+mod label_maps;
 mod lidar;
 mod masks;
-mod moving_boxes;
 mod nuscenes;
 mod opensfm;
 mod parsed;
@@ -34,9 +35,10 @@ use scene::transforms::{Focal, Intrinsics};
 use scene::{BadInput, Camera, CameraModel, Capture, GeoOrigin, Pinhole, View};
 
 use self::files::{CaptureRoot, Found};
-pub use self::parsed::OpenOptions;
+pub(crate) use self::label_maps::LabelMapFiles;
+pub use self::parsed::{LabelledBox, OpenOptions};
 use self::parsed::{ParsedCapture, PosedImage};
-pub(crate) use self::truth::{truth_boxes, truth_folder};
+pub(crate) use self::truth::{truth_boxes, truth_folder, truth_instances};
 use crate::depth_maps::DepthFile;
 use crate::lidar::Sweep;
 use crate::lidar::seeds::{Seeds, seeds};
@@ -59,11 +61,16 @@ pub struct Photo {
     pub height: u32,
     /// Its depth map, if it has one that is used.
     pub depth: Option<DepthFile>,
-    /// Boxes of moving objects, which are left out like masked pixels: corners in the camera's axes.
-    pub moving: Vec<[DVec3; 8]>,
+    /// The annotated objects that it may show. Those that move are left out like masked pixels.
+    pub boxes: Vec<LabelledBox>,
 }
 
 impl Photo {
+    /// The boxes of the objects that move: corners in the camera's axes.
+    pub fn moving(&self) -> Vec<[DVec3; 8]> {
+        self.boxes.iter().filter(|of| of.moves).map(|of| of.corners).collect()
+    }
+
     /// Its file, and its row if it is in a table, for messages.
     pub(crate) fn shown(&self) -> String {
         let file = files::show(&self.path);
@@ -259,7 +266,7 @@ fn photo(
                 width,
                 height,
                 depth: None,
-                moving: Vec::new(),
+                boxes: Vec::new(),
             }));
         }
     };
@@ -285,7 +292,7 @@ fn photo(
         None => masks::find(root, masks, &image.file, &path, options),
     };
     let depth = maps.map(|maps| maps.find(root, image)).transpose()?.flatten();
-    Ok(Some(Photo { path, row: image.row, mask, model, width, height, depth, moving: image.moving.clone() }))
+    Ok(Some(Photo { path, row: image.row, mask, model, width, height, depth, boxes: image.boxes.clone() }))
 }
 
 /// The lens in pixels of a photo of this size. The photo may be a uniformly scaled copy of the camera's image; `None` for another
@@ -329,7 +336,7 @@ fn views(images: &[PosedImage], photos: &[Photo]) -> Result<Vec<View>, BadInput>
             name: image.name.clone(),
             camera,
             mips: Vec::new(),
-            masked: photo.mask.is_some() || !photo.moving.is_empty(),
+            masked: photo.mask.is_some() || photo.boxes.iter().any(|of| of.moves),
             depth: None,
         })
     };
@@ -379,4 +386,4 @@ fn geo_origin(root: &CaptureRoot) -> Result<Option<GeoOrigin>, BadInput> {
 }
 
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;

@@ -20,6 +20,8 @@ const NEAR: f64 = 0.05;
 /// An object in a photo.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SeenObject {
+    /// Its number, that of its pixels in the maps of instances.
+    pub instance: u32,
     /// As `plat synth` names it: `car`, `person`, `rider` …
     pub class: String,
     /// Left, top, right, bottom of its visible pixels, in pixels of the view.
@@ -46,6 +48,7 @@ struct Line {
 
 #[derive(Deserialize)]
 struct Object {
+    instance: u32,
     class: String,
     centre: DVec3,
     size: DVec3,
@@ -119,7 +122,7 @@ fn camera(frame: &Frame) -> Option<Camera> {
     Some(Camera { pinhole, camera_from_world: frame.camera_from_world })
 }
 
-fn seen(Object { class, centre, size, rotation, box2d }: Object, camera: &Camera) -> SeenObject {
+fn seen(Object { instance, class, centre, size, rotation, box2d }: Object, camera: &Camera) -> SeenObject {
     let corners = box2d.map(|side| side as f32);
     let area = |[left, top, right, bottom]: [f64; 4]| (right - left).max(0.0) * (bottom - top).max(0.0);
     let mut whole = [f64::INFINITY, f64::INFINITY, f64::NEG_INFINITY, f64::NEG_INFINITY];
@@ -133,7 +136,7 @@ fn seen(Object { class, centre, size, rotation, box2d }: Object, camera: &Camera
     let visible = if is_ahead { area(box2d.map(f64::from)) / area(whole) } else { 0.0 };
     // An object without extent has no share.
     let visible = if visible.is_finite() { visible.clamp(0.0, 1.0) as f32 } else { 0.0 };
-    SeenObject { class, corners, visible }
+    SeenObject { instance, class, corners, visible }
 }
 
 #[cfg(test)]
@@ -184,7 +187,7 @@ mod tests {
         let camera = Camera { pinhole, camera_from_world: scene::Rigid::IDENTITY };
         let cube = |z: f64, box2d: [u32; 4]| {
             let (centre, size, rotation) = (DVec3::new(0.0, 0.0, z), DVec3::splat(2.0), DQuat::IDENTITY);
-            seen(Object { class: "car".into(), centre, size, rotation, box2d }, &camera).visible
+            seen(Object { instance: 1, class: "car".into(), centre, size, rotation, box2d }, &camera).visible
         };
         assert_eq!([cube(10.0, [40, 40, 60, 60]), cube(10.0, [40, 40, 60, 50])], [1.0, 0.5]);
         assert_eq!([cube(0.5, [0, 0, 100, 100]), cube(10.0, [40, 40, 40, 40])], [0.0, 0.0]);

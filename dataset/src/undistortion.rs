@@ -178,8 +178,9 @@ impl Undistorter {
         target
     }
 
-    /// Resamples a mask (`width · height` bytes of the photo) to `area` bytes of the pinhole, by nearest neighbour.
-    pub fn mask(&self, photo: &[u8]) -> Vec<u8> {
+    /// Resamples a mask or labels (`width · height` values of the photo) to `area` values of the pinhole, by nearest
+    /// neighbour.
+    pub fn nearest<T: Copy>(&self, photo: &[T]) -> Vec<T> {
         let mut target = Vec::with_capacity(self.area());
         self.for_each_source(|x, y| {
             target.push(photo[y.round() as usize * self.width as usize + x.round() as usize]);

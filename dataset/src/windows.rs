@@ -306,7 +306,7 @@ impl Shared {
         }
         if let Some((zones, weight)) = &self.zones {
             let zones = zones.of(number as usize);
-            zone_weights::weigh(&mut pixels, zones, *weight, &view.camera.pinhole, &camera, rect);
+            zone_weights::weigh(&mut pixels, zones, *weight, &view.camera.pinhole, mip, rect);
         }
         self.tiles.insert_tiles((number, mip), missing.into_iter().map(|i| (ranges[i].start, tiles[i].clone())));
         Ok(Arc::new(pixels))

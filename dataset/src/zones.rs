@@ -1,57 +1,63 @@
-//! Zones of a capture's photos: found by a detector, or read from a file of boxes.
+//! Zones of a capture's photos: found by a detector, read from files, or labels that the capture itself has.
 
-mod boxes_file;
+mod classes;
+mod coco;
+mod detected;
+mod id_map;
+mod label_maps;
+mod own_labels;
+mod photos;
 mod smoothing;
 
-use std::sync::Arc;
-
-use perceive::{Detector, Picture, masked_share};
+use perceive::Detector;
 use scene::frame::{self, Kind};
-use scene::{ArtefactId, BadInput, Capture, Pixels, Rect, Zone, Zones};
+use scene::{ArtefactId, BadInput, Capture, Zones};
 use store::BlockingStore;
 
-pub use self::boxes_file::BoxesFile;
+pub use self::coco::CocoFile;
+use self::detected::detected;
+pub use self::label_maps::LabelMaps;
+pub use self::own_labels::OwnLabels;
+use self::photos::Photos;
 use crate::ingest::IngestError;
-use crate::windows::{WindowError, WindowReader};
 
 /// The zones of a capture.
-pub const ZONES: Kind = Kind(*b"zone", 1);
-/// What a detector found on a photo.
-const RECORD: Kind = Kind(*b"seen", 1);
-/// Part of the name of a record. Raise it with each change of what a detector is shown or of what is kept of its boxes.
-const FORMAT: u32 = 1;
-/// Largest share of a zone that may be masked: moving objects, which no model shows, are not its zones.
-const MAX_MASKED: f64 = 0.5;
+pub const ZONES: Kind = Kind(*b"zone", 2);
 
 /// Where zones come from.
 pub enum ZoneSource {
     /// A detector, and the hash of its network and card.
     Detector(Box<Detector>, ArtefactId),
-    /// A file of boxes.
-    Boxes(BoxesFile),
+    /// A file of boxes and masks.
+    Coco(CocoFile),
+    /// A folder of label maps.
+    LabelMaps(LabelMaps),
+    /// The labels that the capture has.
+    OwnLabels(OwnLabels),
 }
 
-/// The zones of an ingested capture's photos, and their artefact, a frame of kind [`ZONES`]. `progress` is called with (photos
-/// done, photos in total).
+/// The zones of an ingested capture's photos, and their artefact, a frame of kind [`ZONES`]. Boxes of a detector and of a file
+/// are averaged over three photos. What photos' masks hide is left out. `progress` is called with (photos done, photos in
+/// total).
 ///
 /// What a detector finds on a photo is recorded in the store, so a repeated call only reads records.
 ///
 /// # Errors
-/// A network that cannot be run, boxes that do not fit the photos, or a failing store.
+/// A network that cannot be run, objects that do not fit the photos, or a failing store.
 pub fn find(
     capture: &Capture,
     from: &ZoneSource,
     store: &BlockingStore,
     progress: &dyn Fn(usize, usize),
 ) -> Result<(Zones, ArtefactId), IngestError> {
-    let found = match from {
-        ZoneSource::Detector(detector, id) => detected(capture, detector, *id, store, progress)?,
-        ZoneSource::Boxes(file) => file.zones(capture)?,
+    let zones = match from {
+        ZoneSource::Detector(detector, id) => smoothed(capture, detected(capture, detector, *id, store, progress)?),
+        ZoneSource::Coco(file) => smoothed(capture, without_masked(capture, file.zones(capture)?, store)?),
+        ZoneSource::LabelMaps(maps) => without_masked(capture, maps.zones(capture, progress)?, store)?,
+        ZoneSource::OwnLabels(labels) => without_masked(capture, labels.zones(capture, progress)?, store)?,
     };
-    let of_views = smoothing::smoothed(&found.of_views, |view| follows(capture, view));
-    let zones = Zones { of_views, ..found };
     let checked = zones.check(&capture.views);
-    checked.map_err(|error| BadInput::new("the zones", error.to_string(), "correct the file that they come from"))?;
+    checked.map_err(|error| BadInput::new("the zones", error.to_string(), "correct what they come from"))?;
     let id = store.put(frame::encode(ZONES, &zones, &[]))?;
     Ok((zones, id))
 }
@@ -68,68 +74,21 @@ pub fn load(store: &BlockingStore, id: ArtefactId, capture: &Capture) -> Result<
         .map_err(|error| BadInput::new(format!("artefact {id}"), error.to_string(), "look for the objects again"))?)
 }
 
+fn smoothed(capture: &Capture, zones: Zones) -> Zones {
+    let of_views = smoothing::smoothed(&zones.of_views, |view| follows(capture, view));
+    Zones { of_views, ..zones }
+}
+
 /// Whether a view comes right after the one before it in a sequence: photos of one folder.
 fn follows(capture: &Capture, view: usize) -> bool {
     let folder = |view: usize| capture.views[view].name.rsplit_once('/').map_or("", |(folder, _)| folder);
     view > 0 && folder(view) == folder(view - 1)
 }
 
-fn detected(
-    capture: &Capture,
-    detector: &Detector,
-    id: ArtefactId,
-    store: &BlockingStore,
-    progress: &dyn Fn(usize, usize),
-) -> Result<Zones, IngestError> {
-    let classes = detector.card().classes.clone();
-    if classes.len() > usize::from(u16::MAX) {
-        let problem = format!("has {} classes, and {} are the most", classes.len(), u16::MAX);
-        return Err(BadInput::new(detector.file(), problem, "map them to fewer in its card").into());
-    }
-    let without_points = Capture { views: capture.views.clone(), ..Capture::default() };
-    let reader = WindowReader::new(Arc::new(without_points), store.clone(), 0);
-    let mut of_views = Vec::with_capacity(capture.views.len());
-    for (number, view) in (0u32..).zip(&capture.views) {
-        let key = frame::encode(RECORD, &(FORMAT, id, view.mips.first()), &[]);
-        let name = format!("zones/{}", ArtefactId::of(&key));
-        let recorded = store.get_record(&name)?;
-        let recorded = recorded.and_then(|bytes| frame::decode(RECORD, &bytes).ok().map(|(zones, _)| zones));
-        let zones: Vec<Zone> = match recorded {
-            Some(zones) => zones,
-            None => {
-                let k = view.camera.pinhole;
-                let photo = reader.window(number, 0, Rect { x: 0, y: 0, width: k.width, height: k.height });
-                let zones = found(detector, &*photo.map_err(|error| unreadable(&view.name, error))?)?;
-                store.put_record(&name, frame::encode(RECORD, &zones, &[]))?;
-                zones
-            }
-        };
-        of_views.push(zones);
-        progress(of_views.len(), capture.views.len());
-    }
-    Ok(Zones { classes, of_views })
-}
-
-fn unreadable(view: &str, error: WindowError) -> IngestError {
-    match error {
-        WindowError::Store { error, .. } => error.into(),
-        other => BadInput::new(view, other.to_string(), "ingest the capture again").into(),
-    }
-}
-
-/// What a detector finds on a photo outside its mask, surest first.
-fn found(detector: &Detector, photo: &Pixels) -> Result<Vec<Zone>, BadInput> {
-    let (width, height, area) = (photo.width as usize, photo.height as usize, photo.area());
-    let rgb: Vec<u8> = (0..area).flat_map(|i| [photo.rgb[i], photo.rgb[area + i], photo.rgb[2 * area + i]]).collect();
-    let found = detector.detect(&Picture { rgb: &rgb, width, height }, detector.card().score)?;
-    let zones = found.into_iter().filter_map(|of| {
-        let [left, top, right, bottom] = of.corners;
-        let (w, h) = (width as f32, height as f32);
-        let corners = [left.clamp(0.0, w), top.clamp(0.0, h), right.clamp(0.0, w), bottom.clamp(0.0, h)];
-        let is_empty = corners[0] >= corners[2] || corners[1] >= corners[3];
-        let is_masked = |mask: &Vec<u8>| masked_share(mask, width, corners) > MAX_MASKED;
-        let left_out = is_empty || photo.mask.as_ref().is_some_and(is_masked);
-        (!left_out).then_some(Zone { corners, class: of.class as u16, score: of.score.clamp(0.0, 1.0) })
-    });
-    Ok(zones.take(Zones::MAX).collect())
+/// The zones without those that their photos' masks hide.
+fn without_masked(capture: &Capture, zones: Zones, store: &BlockingStore) -> Result<Zones, IngestError> {
+    let photos = Photos::new(capture, store);
+    let of_views = zones.of_views.into_iter().enumerate();
+    let of_views = of_views.map(|(view, zones)| photos.without_masked(view, zones)).collect::<Result<_, _>>()?;
+    Ok(Zones { of_views, ..zones })
 }

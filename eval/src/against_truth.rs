@@ -81,6 +81,7 @@ mod tests {
             Shapes { inputs: vec![[1, 3, 64, 96].map(Some).to_vec()], outputs: vec![[1, 126, 85].map(Some).to_vec()] };
         let card = Card::of(&shapes, Some("[map]\ncar = 'vehicle'\ntruck = 'vehicle'")).unwrap();
         let object = |class: &str, left: f32, height: f32, visible: f32| SeenObject {
+            instance: 1,
             class: class.into(),
             corners: [left, 0.0, left + 30.0, height],
             visible,

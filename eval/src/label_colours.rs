@@ -25,7 +25,7 @@ pub fn coloured_by(splats: &Splats, attribute: &str) -> Option<Splats> {
 }
 
 /// sRGB in 0..1, saturated and bright.
-fn label_colour(value: u32) -> Vec3 {
+pub(crate) fn label_colour(value: u32) -> Vec3 {
     const GOLDEN_RATIO: f64 = 0.618_033_988_749_894_9;
     if value == 0 {
         return UNSET;

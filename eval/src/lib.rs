@@ -35,6 +35,7 @@ mod renderer;
 mod sheet;
 mod summary;
 mod surface;
+mod zone_pictures;
 mod zones;
 
 pub mod cuts;
@@ -63,5 +64,7 @@ pub use observer::{Observer, Seconds};
 pub use photos::{PhotoOptions, Photos};
 pub use pruning::Pruner;
 pub use renderer::{Renderer, Uploaded};
+pub use sheet::gallery;
 pub use summary::{ByKind, Group, Summary};
+pub use zone_pictures::{count_zones, draw_zones};
 pub use zones::ZoneFigures;

@@ -9,7 +9,7 @@ const COLUMN: u32 = 480;
 const GAP: u32 = 8;
 /// Size of one of a letter's 8×8 dots, pixels.
 const DOT: u32 = 2;
-const LINE: u32 = 8 * DOT + 8;
+pub(crate) const LINE: u32 = 8 * DOT + 8;
 const HEADER: u32 = 8 + LINE;
 pub(crate) const INK: Rgb<u8> = Rgb([232, 232, 232]);
 const DIM: Rgb<u8> = Rgb([150, 150, 150]);
@@ -85,14 +85,43 @@ pub(crate) fn error_map(photo: &RgbImage, render: &RgbImage) -> Option<RgbImage>
     Some(map)
 }
 
+/// Draws captioned pictures in three columns, scaled to one width. Those of a row share its height.
+pub fn gallery(pictures: &[(String, RgbImage)]) -> RgbImage {
+    let rows: Vec<(u32, &[(String, RgbImage)])> = pictures
+        .chunks(3)
+        .map(|row| (row.iter().map(|(_, picture)| scaled_height(picture)).max().unwrap_or_default(), row))
+        .collect();
+    let height = GAP + rows.iter().map(|(height, _)| height + LINE + GAP).sum::<u32>();
+    let mut sheet = RgbImage::from_pixel(3 * COLUMN + 4 * GAP, height, PAPER);
+    let mut y = GAP;
+    for (height, row) in rows {
+        for (i, (caption, picture)) in (0..).zip(row) {
+            let x = GAP + i * (COLUMN + GAP);
+            let letters = (COLUMN / (8 * DOT)) as usize;
+            draw_text(&mut sheet, x, y + 4, &caption.chars().take(letters).collect::<String>(), INK);
+            place(&mut sheet, picture, x, y + LINE, scaled_height(picture));
+        }
+        y += height + LINE + GAP;
+    }
+    sheet
+}
+
+/// Width of a text, pixels.
+pub(crate) fn text_width(text: &str) -> u32 {
+    text.chars().count() as u32 * 8 * DOT
+}
+
 /// Draws text in an 8×8 font at twice its size. Text beyond the image is cut off; characters outside ASCII become `?`.
 pub(crate) fn draw_text(image: &mut RgbImage, x: u32, y: u32, text: &str, colour: Rgb<u8>) {
     for (i, letter) in text.chars().enumerate() {
         let glyph = BASIC_LEGACY[if letter.is_ascii() { letter as usize } else { '?' as usize }];
-        let left = x + i as u32 * 8 * DOT;
+        let left = x.saturating_add(i as u32 * 8 * DOT);
+        if left >= image.width() {
+            break;
+        }
         for (dy, bits) in glyph.iter().enumerate() {
             for dx in (0..8u32).filter(|dx| bits >> dx & 1 == 1) {
-                fill(image, left + dx * DOT, y + dy as u32 * DOT, DOT, DOT, colour);
+                fill(image, left + dx * DOT, y.saturating_add(dy as u32 * DOT), DOT, DOT, colour);
             }
         }
     }
@@ -142,9 +171,10 @@ fn heat(share: f32) -> Rgb<u8> {
     Rgb(std::array::from_fn(|c| (HEAT[below][c] + t * (HEAT[below + 1][c] - HEAT[below][c]) + 0.5) as u8))
 }
 
-fn fill(image: &mut RgbImage, x: u32, y: u32, width: u32, height: u32, colour: Rgb<u8>) {
-    for y in y..(y + height).min(image.height()) {
-        for x in x..(x + width).min(image.width()) {
+/// Fills a rectangle, as far as it lies in the image.
+pub(crate) fn fill(image: &mut RgbImage, x: u32, y: u32, width: u32, height: u32, colour: Rgb<u8>) {
+    for y in y..y.saturating_add(height).min(image.height()) {
+        for x in x..x.saturating_add(width).min(image.width()) {
             image.put_pixel(x, y, colour);
         }
     }
@@ -179,6 +209,17 @@ mod tests {
         assert_eq!(*sheet.get_pixel(2 * GAP + COLUMN + 200, y), Rgb([0, 0, 200]));
         let has_ink = (HEADER..HEADER + LINE).any(|y| (0..400).any(|x| *sheet.get_pixel(x, y) == INK));
         assert!(has_ink, "the caption is missing");
+    }
+
+    #[test]
+    fn a_gallery_has_three_columns() {
+        let red = (String::from("a.png"), RgbImage::from_pixel(60, 40, Rgb([200, 0, 0])));
+        let sheet = gallery(&vec![red; 4]);
+        assert_eq!(sheet.dimensions(), (3 * COLUMN + 4 * GAP, GAP + 2 * (320 + LINE + GAP)));
+        let second = GAP + 320 + LINE + GAP + LINE;
+        assert_eq!(*sheet.get_pixel(GAP, second), Rgb([200, 0, 0]));
+        assert_eq!(*sheet.get_pixel(2 * GAP + COLUMN, second), PAPER);
+        assert_eq!(gallery(&[]).height(), GAP);
     }
 
     #[test]

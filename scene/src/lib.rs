@@ -46,4 +46,4 @@ pub use image::Pixels;
 pub use poses::Poses;
 pub use similarity::Similarity;
 pub use splats::{Attribute, BLOCK_ATTRIBUTE, SH_C0, Splat, Splats, column};
-pub use zones::{Zone, Zones};
+pub use zones::{MaskBuilder, Zone, ZoneMask, Zones};

@@ -9,21 +9,40 @@ use super::values::{aligned_weight, weight};
 
 /// The weight where `--zone-weight` is not given.
 const ZONE_WEIGHT: f64 = 4.0;
+/// The value of `--zones` for the labels that the capture itself has.
+pub(crate) const OWN_LABELS: &str = "@labels";
 
+/// Where objects are.
 #[derive(Debug, Clone, Default, PartialEq, Args, Serialize)]
 #[serde(rename_all = "kebab-case")]
 #[command(group = ArgGroup::new("zone_source").args(["zone_detector", "zones"]))]
-pub(crate) struct ZoneOptions {
-    /// Look for objects on the photos with this detector (ONNX), as `plat eval --detector` does, and let their pixels count more in
-    /// training and in pruning, by --zone-weight
+pub(crate) struct ZoneFinder {
+    /// Look for objects on the photos with this detector (ONNX), as `plat eval --detector` does; see --zones
     #[arg(long = "detector", value_name = "FILE")]
     #[serde(rename = "detector", skip_serializing_if = "Option::is_none")]
     pub(crate) zone_detector: Option<PathBuf>,
-    /// Boxes of objects instead, as JSON in COCO's layout: images, annotations, categories. They are in pixels of the photos without
-    /// their lens distortion
-    #[arg(long, value_name = "FILE")]
+    /// Objects whose pixels count more in training and in pruning, by --zone-weight: a JSON file in COCO's layout (boxes, polygons, run
+    /// lengths, in pixels of the photos without their lens distortion), a folder of label maps NAME.png of the photos as they were taken
+    /// (ids as Cityscapes' instanceIds, or those in its classes.json or classes.txt), or @labels for the labels that the capture itself
+    /// has (DGP, nuScenes, Waymo, plat synth)
+    #[arg(long, value_name = "FILE|DIR|@labels")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) zones: Option<PathBuf>,
+}
+
+impl ZoneFinder {
+    /// Whether anybody looks for objects.
+    pub(crate) fn is_given(&self) -> bool {
+        self.zone_detector.is_some() || self.zones.is_some()
+    }
+}
+
+#[derive(Debug, Clone, Default, PartialEq, Args, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub(crate) struct ZoneOptions {
+    #[command(flatten)]
+    #[serde(flatten)]
+    pub(crate) finder: ZoneFinder,
     /// Pixels of objects that cover a hundredth of the photo count 1 + W times, with --detector or --zones, those of smaller objects more
     /// and those of larger ones less; 4 if it is not given
     #[arg(long, value_name = "W", value_parser = weight, requires = "zone_source")]
@@ -34,12 +53,7 @@ pub(crate) struct ZoneOptions {
 impl ZoneOptions {
     /// The additional weight of objects' pixels; 0 if nobody looks for objects.
     pub(crate) fn weight(&self) -> f64 {
-        if self.is_given() { self.zone_weight.unwrap_or(ZONE_WEIGHT) } else { 0.0 }
-    }
-
-    /// Whether anybody looks for objects.
-    pub(crate) fn is_given(&self) -> bool {
-        self.zone_detector.is_some() || self.zones.is_some()
+        if self.finder.is_given() { self.zone_weight.unwrap_or(ZONE_WEIGHT) } else { 0.0 }
     }
 }
 

@@ -10,6 +10,7 @@ use store::file::save;
 use worker::estimate::Estimate;
 use worker::speed::relative_speed;
 
+use super::inspect_objects::{Objects, objects};
 use crate::args::InspectArgs;
 use crate::captures;
 use crate::failure::Failure;
@@ -41,6 +42,8 @@ struct Inspected {
     depth_maps: usize,
     /// Number of annotated boxes by class.
     boxes: BTreeMap<String, usize>,
+    /// What `--detector` or `--zones` finds; null without them.
+    objects: Option<Objects>,
     left_out: Vec<(String, String)>,
     /// Along the ground's axes and up, 1st to 99th percentile of the points.
     extent_metres: [f64; 3],
@@ -102,6 +105,7 @@ pub(crate) fn run(args: &InspectArgs, output: &Output) -> Result<(), Failure> {
         lidar_points: source.seeds.len(),
         depth_maps: source.depth_maps(),
         boxes: source.labels,
+        objects: objects(args, output)?,
         left_out: source.left_out,
         extent_metres: extent_metres(capture),
         geo_origin: capture.geo_origin,
@@ -139,6 +143,9 @@ fn text(found: &Inspected, plan: Option<&Plan>) -> String {
     if !found.boxes.is_empty() {
         let boxes: Vec<String> = found.boxes.iter().map(|(class, count)| format!("{count} {class}")).collect();
         text += &format!("boxes: {}\n", boxes.join(", "));
+    }
+    if let Some(objects) = &found.objects {
+        text += &objects.text(found.views);
     }
     text += &match found.geo_origin {
         Some(at) => format!(

@@ -9,6 +9,7 @@ pub(crate) mod eval;
 pub(crate) mod export;
 pub(crate) mod import;
 pub(crate) mod inspect;
+mod inspect_objects;
 pub(crate) mod jobs;
 pub(crate) mod kernels;
 pub(crate) mod pareto;

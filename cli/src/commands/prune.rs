@@ -41,7 +41,7 @@ pub(crate) fn run(args: &PruneArgs, output: &Output) -> Result<(), Failure> {
     let clock = Stopwatch::start();
     let tolerance_db = if args.keep.is_none() { Some(args.tolerance_db.unwrap_or(TOLERANCE_DB)) } else { None };
     let Some(capture) = &args.capture else {
-        if args.photos.zones.is_given() {
+        if args.photos.zones.finder.is_given() {
             let advice = "name the capture with --capture";
             return Err(BadInput::new("--detector and --zones", "need photos to look at", advice).into());
         }
@@ -83,7 +83,7 @@ pub(super) fn photos(
 ) -> Result<Photos, Failure> {
     let source = captures::open(capture, output)?;
     let PruneCapture { test_every, downscale, store, zones } = options;
-    let from = captures::zone_source(zones, &source.capture)?;
+    let from = captures::zone_source(&zones.finder, capture, &source)?;
     let options =
         PhotoOptions { store: store.as_deref(), downscale: *downscale, test_every: *test_every, test_stretches: None };
     let mut photos = captures::photos_of(model, &source, &options, output)?;

@@ -52,7 +52,7 @@ pub(crate) fn run(args: &SubmitArgs, output: &Output) -> Result<(), Failure> {
     let source = captures::open_to_plan(&args.capture, &args.plan, output)?;
     // Plan and coordinator are checked before any photo is read.
     let (planned_for, plan) = plan_of(&source, &args.plan)?;
-    let zones = zone_source(&args.zones, &planned_for)?;
+    let zones = zone_source(&args.zones.finder, &args.capture, &source)?;
     let mut remote = Remote::open(&args.connection)?;
     let about = remote.call(async |client: &mut Client| client.about(proto::AboutRequest {}).await)?;
     let backend = backend_of(args, &about, output)?;

@@ -190,7 +190,7 @@ fn prepare(args: &TrainArgs, clock: &Stopwatch, output: &Output) -> Result<Prepa
     let source = captures::open_to_plan(&args.capture, &args.plan, output)?;
     // The plan is checked before any photo is read.
     let (planned_for, plan) = plan_of(&source, &args.plan)?;
-    let zones = zone_source(&args.zones, &planned_for)?;
+    let zones = zone_source(&args.zones.finder, &args.capture, &source)?;
     let backend = backend::open(args.backend)?;
     let plan = Plan { backend: backend.name(), ..plan };
     let network = aligned_network(&args.zones, &args.aligned, &plan.backend)?;

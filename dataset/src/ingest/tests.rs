@@ -33,7 +33,7 @@ fn source(folder: &Path, count: u32) -> Source {
             model: model(),
             width: WIDTH,
             height: HEIGHT,
-            moving: Vec::new(),
+            boxes: Vec::new(),
         };
         let camera_from_world = Rigid { translation: [f64::from(i), 0.0, 0.0].into(), ..Rigid::IDENTITY };
         let camera = Camera { pinhole: ideal_pinhole(&model(), WIDTH, HEIGHT).unwrap(), camera_from_world };

@@ -6,10 +6,10 @@ use crate::open::Photo;
 use crate::undistortion::Undistorter;
 
 /// The undistorter of the last photo, by lens and size. Consecutive photos mostly share a lens.
-pub(super) type LastUndistorter = Option<((CameraModel, u32, u32), Undistorter)>;
+pub(crate) type LastUndistorter = Option<((CameraModel, u32, u32), Undistorter)>;
 
 /// The undistorter of a photo, whose pinhole has to be the camera of its view.
-pub(super) fn undistorter<'a>(
+pub(crate) fn undistorter<'a>(
     photo: &Photo,
     pinhole: Pinhole,
     last: &'a mut LastUndistorter,

@@ -48,7 +48,7 @@ pub(super) fn read(root: &CaptureRoot, folder: &str, options: &OpenOptions) -> R
             depth: None,
             intrinsics: Intrinsics::from_model(&camera.model, size),
             camera_from_world: image.camera_from_world,
-            moving: Vec::new(),
+            boxes: Vec::new(),
         })
     });
     let images = images.collect::<Result<Vec<_>, BadInput>>()?;

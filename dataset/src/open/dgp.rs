@@ -16,11 +16,11 @@ use std::path::{Path, PathBuf};
 
 use scene::dgp::{self, BoxAnnotation, Datum, Scene};
 use scene::transforms::Intrinsics;
-use scene::{BadInput, CameraModel, CodecError, Rigid};
+use scene::{BadInput, CameraModel, CodecError};
 
+use super::annotated_boxes::{corners, moving};
 use super::files::{self, CaptureRoot, Found};
-use super::moving_boxes::{corners, moving};
-use super::parsed::{OpenOptions, ParsedCapture, ParsedSweep, PosedImage, RawPoints};
+use super::parsed::{LabelledBox, OpenOptions, ParsedCapture, ParsedSweep, PosedImage, RawPoints};
 use crate::lidar::PointFormat;
 
 /// The scene's file.
@@ -60,7 +60,7 @@ pub(super) fn read(root: &CaptureRoot, path: &Path, options: &OpenOptions) -> Re
                 depth: None,
                 intrinsics: Intrinsics::from_model(model, Some(photo.size).filter(|size| size.0 > 0)),
                 camera_from_world: photo.world_from_sensor.inverse(),
-                moving: Vec::new(),
+                boxes: Vec::new(),
             });
         }
         for sweep in sample.sweeps.iter().filter(|_| options.lidar) {
@@ -75,21 +75,18 @@ pub(super) fn read(root: &CaptureRoot, path: &Path, options: &OpenOptions) -> Re
     }
     let places = boxes.iter().map(|(_, pose, found)| (found.instance, pose.apply(found.sensor_from_box.translation)));
     let moving = moving(places);
-    for (image, _, found) in boxes.iter().filter(|(.., found)| moving.contains(&found.instance)) {
-        images[*image as usize].moving.push(corners(&found.sensor_from_box, found.size));
+    let (names, mut labels) = (class_names(root)?, BTreeMap::new());
+    for (image, _, found) in &boxes {
+        let class = names.get(&found.class).cloned().unwrap_or_else(|| format!("class {}", found.class));
+        *labels.entry(class.clone()).or_default() += 1;
+        let (moves, corners) = (moving.contains(&found.instance), corners(&found.sensor_from_box, found.size));
+        images[*image as usize].boxes.push(LabelledBox { class, moves, corners });
     }
-    Ok(ParsedCapture {
-        labels: labels(root, &boxes)?,
-        sweeps,
-        ..ParsedCapture::new("dgp", images, RawPoints::default())
-    })
+    Ok(ParsedCapture { labels, sweeps, ..ParsedCapture::new("dgp", images, RawPoints::default()) })
 }
 
-/// A box with its photo and that photo's pose.
-type Labelled = (u32, Rigid, BoxAnnotation);
-
-/// Number of boxes by class.
-fn labels(root: &CaptureRoot, boxes: &[Labelled]) -> Result<BTreeMap<String, usize>, BadInput> {
+/// The names of the classes of boxes, by number.
+fn class_names(root: &CaptureRoot) -> Result<BTreeMap<i64, String>, BadInput> {
     let mut names = BTreeMap::new();
     let entries = root.path("ontology").read_dir().into_iter().flatten();
     let mut files: Vec<String> = entries.filter_map(|entry| entry.ok()?.file_name().into_string().ok()).collect();
@@ -99,12 +96,7 @@ fn labels(root: &CaptureRoot, boxes: &[Labelled]) -> Result<BTreeMap<String, usi
             names.extend(parse(&path, dgp::read_ontology)?);
         }
     }
-    let mut labels = BTreeMap::new();
-    for (.., found) in boxes {
-        let name = names.get(&found.class).cloned().unwrap_or_else(|| format!("class {}", found.class));
-        *labels.entry(name).or_default() += 1;
-    }
-    Ok(labels)
+    Ok(names)
 }
 
 /// The 3D boxes annotated in a photo, if there are any.

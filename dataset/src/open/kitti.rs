@@ -89,7 +89,7 @@ pub(super) fn read(root: &CaptureRoot, of: &Sequence, options: &OpenOptions) -> 
                 depth: None,
                 intrinsics: Intrinsics::from_model(model, None),
                 camera_from_world: from_first.compose(&world_from_first.inverse()),
-                moving: Vec::new(),
+                boxes: Vec::new(),
             });
         }
         let sweep = root.file(&format!("{folder}velodyne/{frame:06}.bin")).filter(|_| options.lidar);

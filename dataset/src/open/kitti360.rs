@@ -85,7 +85,7 @@ pub(super) fn read(root: &CaptureRoot, options: &OpenOptions) -> Result<ParsedCa
                     depth: None,
                     intrinsics: Intrinsics::from_model(&lens.model, Some((lens.width, lens.height))),
                     camera_from_world: world_from_camera.inverse(),
-                    moving: Vec::new(),
+                    boxes: Vec::new(),
                 });
             }
         }

@@ -150,7 +150,7 @@ fn image(
         mask: None,
         intrinsics: Intrinsics::from_model(model, size),
         camera_from_world,
-        moving: boxes.moving.seen(datum.microseconds, &camera_from_world, model, size),
+        boxes: boxes.tracks.seen(datum.microseconds, &camera_from_world, model, size),
     })
 }
 

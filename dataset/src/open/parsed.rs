@@ -73,8 +73,18 @@ pub(super) struct PosedImage {
     pub(super) depth: Option<String>,
     pub(super) intrinsics: Intrinsics,
     pub(super) camera_from_world: Rigid,
-    /// Boxes of moving objects, which are left out of the photo: corners in the camera's axes.
-    pub(super) moving: Vec<[DVec3; 8]>,
+    pub(super) boxes: Vec<LabelledBox>,
+}
+
+/// An annotated object that may be in a photo.
+#[derive(Debug, Clone, PartialEq)]
+pub struct LabelledBox {
+    /// As the capture names it.
+    pub class: String,
+    /// Whether it moves: then its pixels are left out of the photo.
+    pub moves: bool,
+    /// Corners of its box in the camera's axes, numbered by the bits of their signs along its three sides.
+    pub corners: [DVec3; 8],
 }
 
 /// Sparse points whose tracks hold ids of [`PosedImage`]s instead of indices of views.

@@ -186,7 +186,8 @@ fn damaged_files_are_named() {
     refused(&folder.path().join("images"), &["no camera poses", "sparse/0"]);
 }
 
-fn shared(name: &str) -> Option<PathBuf> {
+/// A real capture of `../shared/data`; without it a line says that the test is skipped.
+pub(crate) fn shared(name: &str) -> Option<PathBuf> {
     let root = std::env::var_os("PLAT_SHARED")
         .map_or_else(|| PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/../../shared")), PathBuf::from);
     let path = root.join("data").join(name);

@@ -48,7 +48,7 @@ pub(super) fn read(root: &CaptureRoot, paths: &[PathBuf]) -> Result<ParsedCaptur
                 depth: frame.depth_file_path,
                 intrinsics: frame.intrinsics,
                 camera_from_world: frame.camera_from_world,
-                moving: Vec::new(),
+                boxes: Vec::new(),
             });
         }
     }

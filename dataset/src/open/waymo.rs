@@ -19,8 +19,8 @@ use scene::transforms::Intrinsics;
 use scene::waymo::{self, PIXEL_POSES, RANGES, WaymoPhoto, WaymoTurn};
 use scene::{BadInput, CodecError, Rigid};
 
+use super::annotated_boxes::{Placed, Tracks, moving};
 use super::files::{CaptureRoot, listed};
-use super::moving_boxes::{Placed, Tracks, moving};
 use super::parsed::{OpenOptions, ParsedCapture, ParsedSweep, PosedImage, RawPoints};
 use crate::lidar::{PointFormat, RangeImage};
 use crate::tables::{self, TableFile};
@@ -153,13 +153,13 @@ impl Segment<'_> {
                 depth: None,
                 intrinsics: Intrinsics::from_model(&camera.lens, size),
                 camera_from_world,
-                moving: tracks.seen(photo.microseconds, &camera_from_world, &camera.lens, seen),
+                boxes: tracks.seen(photo.microseconds, &camera_from_world, &camera.lens, seen),
             })
         };
         (0..).zip(photos).map(image).collect()
     }
 
-    /// Number of boxes by class, and those that move.
+    /// Number of boxes by class, and their tracks.
     fn boxes(&self, vehicles: Option<&BTreeMap<i64, Rigid>>) -> Result<(BTreeMap<String, usize>, Tracks), BadInput> {
         let (mut labels, mut placed) = (BTreeMap::new(), Vec::new());
         if let (Some(_), Some(vehicles)) = (self.find("lidar_box"), vehicles) {
@@ -167,13 +167,15 @@ impl Segment<'_> {
                 let vehicle = self.vehicle("lidar_box", vehicles, found.frame)?;
                 let world_from_box = vehicle.after(&found.vehicle_from_box);
                 *labels.entry(found.class.to_owned()).or_default() += 1;
-                placed.push((found.object, Placed { microseconds: found.frame, world_from_box, size: found.size }));
+                let placed_box = Placed { microseconds: found.frame, world_from_box, size: found.size };
+                placed.push((found.object, found.class, placed_box));
             }
         }
-        placed.sort_by_key(|(_, found)| found.microseconds);
-        let moving = moving(placed.iter().map(|(object, found)| (object.as_str(), found.world_from_box.translation)));
-        let boxes = placed.iter().map(|(object, found)| (object.as_str(), *found));
-        Ok((labels, Tracks::new(boxes.filter(|(object, _)| moving.contains(object)))))
+        placed.sort_by_key(|(.., found)| found.microseconds);
+        let places = placed.iter().map(|(object, _, found)| (object.as_str(), found.world_from_box.translation));
+        let moving = moving(places);
+        let boxes = placed.iter().map(|(object, class, found)| (object.as_str(), &**class, *found));
+        Ok((labels, Tracks::new(boxes, |object| moving.contains(object))))
     }
 
     /// A sweep of each laser for each frame: it belongs to the photos of the frame.

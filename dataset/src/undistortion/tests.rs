@@ -72,7 +72,7 @@ fn photos_and_masks_are_resampled_at_the_distorted_positions() {
         let k = undistorter.pinhole();
         let photo: Vec<u8> = (0..HEIGHT).flat_map(|y| (0..WIDTH).flat_map(move |x| [x as u8, y as u8, 7])).collect();
         let mask: Vec<u8> = (0..HEIGHT).flat_map(|_| (0..WIDTH).map(|x| if x < 100 { 0 } else { 255 })).collect();
-        let (rgb, mask) = (undistorter.rgb(&photo), undistorter.mask(&mask));
+        let (rgb, mask) = (undistorter.rgb(&photo), undistorter.nearest(&mask));
         assert_eq!((rgb.len(), mask.len()), (3 * undistorter.area(), undistorter.area()));
         for (i, (pixel, usable)) in rgb.chunks_exact(3).zip(mask).enumerate() {
             let (x, y) = (i as u32 % k.width, i as u32 / k.width);

@@ -18,6 +18,7 @@ use scene::{CameraModel, Exposure, Exposures, Pixels, Splat, Splats};
 use scene::{npy, ply, rad, sog, splat_glb, spz, transforms};
 
 use crate::readers::*;
+use crate::zones;
 
 /// The checksum or compression of a file, which stops damage early. It is restored after most mutations.
 #[derive(Clone, Copy, PartialEq)]
@@ -38,13 +39,13 @@ pub(crate) struct Budget {
     pub(crate) base: usize,
 }
 
-const PLAIN: Budget = Budget { factor: 16, base: 16 << 20 };
+pub(crate) const PLAIN: Budget = Budget { factor: 16, base: 16 << 20 };
 /// SPZ is compressed: the reader's own limit applies.
 const COMPRESSED: Budget = Budget { factor: 20, base: 34 << 20 };
 /// SOG: its own limit, and a picture of so many pixels with what its decoder takes.
 const PICTURES: Budget = Budget { factor: 80, base: 128 << 20 };
 /// Several times a photo's pixels, which `photo::BASE_PIXELS` limits.
-const PHOTO: Budget = Budget { factor: 0, base: 256 << 20 };
+pub(crate) const PHOTO: Budget = Budget { factor: 0, base: 256 << 20 };
 
 /// Size of the photos written here, such that an uncompressed TIFF fits a fuzzer's seed.
 pub(crate) const PHOTO_SIZE: (u32, u32) = (80, 60);
@@ -59,7 +60,7 @@ pub(crate) struct Seed {
 
 /// All seeds, in the same order in every run.
 pub(crate) fn seeds() -> Vec<Seed> {
-    let mut corpus = Corpus(Vec::new());
+    let mut corpus = Corpus(zones::seeds());
     corpus.written();
     match shared() {
         Some(data) => corpus.real(&data),
@@ -70,7 +71,7 @@ pub(crate) fn seeds() -> Vec<Seed> {
 
 /// Decompression bombs: files that claim many times their length. All are refused.
 pub(crate) fn swelling() -> Vec<Seed> {
-    let mut corpus = Corpus(Vec::new());
+    let mut corpus = Corpus(zones::swelling());
     let ones = |n: usize| "1,".repeat(n) + "1";
     let json = format!(r#"{{"fl_x": 5, "x": [{}], "frames": []}}"#, ones(2_000_000));
     corpus.plain("unknown numbers in transforms.json", json, &transforms_codec());

@@ -8,6 +8,7 @@ mod corpus;
 mod memory;
 mod mutate;
 mod readers;
+mod zones;
 
 use std::io::{Read, Write};
 use std::panic::{AssertUnwindSafe, catch_unwind};

@@ -32,7 +32,7 @@ type Call = dyn Fn(&[u8]) -> Result<(), String>;
 pub(crate) type Read = Rc<Reader>;
 
 impl Reader {
-    fn new(target: &'static str, call: impl Fn(&[u8]) -> Result<(), String> + 'static) -> Read {
+    pub(crate) fn new(target: &'static str, call: impl Fn(&[u8]) -> Result<(), String> + 'static) -> Read {
         Rc::new(Self { target, call: Box::new(call) })
     }
 

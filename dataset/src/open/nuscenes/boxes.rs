@@ -1,11 +1,11 @@
-//! Boxes of a scene of nuScenes: their classes, and the tracks of those that move.
+//! Boxes of a scene of nuScenes: their classes, their tracks, and which of them move.
 
 use std::collections::{BTreeMap, BTreeSet};
 
 use scene::BadInput;
 use scene::nuscenes;
 
-use super::super::moving_boxes::{Placed, Tracks, moving};
+use super::super::annotated_boxes::{Placed, Tracks, moving};
 use super::tables::Tables;
 
 /// An object whose boxes have an attribute with this ending moves.
@@ -14,8 +14,8 @@ const MOVING: &str = ".moving";
 pub(super) struct Boxes {
     /// Number of boxes by class.
     pub(super) labels: BTreeMap<String, usize>,
-    /// Those of objects that move.
-    pub(super) moving: Tracks,
+    /// Those of each object.
+    pub(super) tracks: Tracks,
 }
 
 impl Boxes {
@@ -24,12 +24,14 @@ impl Boxes {
         let instances = tables.read("instance", nuscenes::read_instances)?;
         let categories = tables.read("category", nuscenes::read_names)?;
         let attributes = tables.read("attribute", nuscenes::read_names)?;
-        let mut labels = BTreeMap::new();
+        let (mut labels, mut placed) = (BTreeMap::new(), Vec::new());
         let mut said: BTreeSet<&str> = BTreeSet::new();
         for found in &boxes {
             let category = tables.row(&instances, "sample_annotation", "instance", &found.instance)?;
             let name = tables.row(&categories, "instance", "category", category)?;
             *labels.entry(name.clone()).or_default() += 1;
+            let &nuscenes::Annotation { microseconds, world_from_box, size, .. } = found;
+            placed.push((found.instance.as_str(), name.as_str(), Placed { microseconds, world_from_box, size }));
             for token in &found.attributes {
                 let name = tables.row(&attributes, "sample_annotation", "attribute", token)?;
                 if name.ends_with(MOVING) {
@@ -39,10 +41,6 @@ impl Boxes {
         }
         let places = boxes.iter().map(|found| (found.instance.as_str(), found.world_from_box.translation));
         let moving: BTreeSet<&str> = moving(places).into_iter().chain(said).collect();
-        let placed = boxes.iter().filter(|found| moving.contains(found.instance.as_str())).map(|found| {
-            let &nuscenes::Annotation { microseconds, world_from_box, size, .. } = found;
-            (found.instance.as_str(), Placed { microseconds, world_from_box, size })
-        });
-        Ok(Self { moving: Tracks::new(placed), labels })
+        Ok(Self { tracks: Tracks::new(placed.into_iter(), |object| moving.contains(object)), labels })
     }
 }

@@ -110,7 +110,7 @@ fn change(root: &Path, table: &str, change: impl Fn(&mut Value)) {
 }
 
 #[test]
-fn a_scene_has_its_photos_sweeps_and_moving_boxes() {
+fn a_scene_has_its_photos_sweeps_and_annotated_boxes() {
     let folder = data_set();
     let source = with_lidar(folder.path()).unwrap();
     let views = &source.capture.views;
@@ -128,7 +128,7 @@ fn a_scene_has_its_photos_sweeps_and_moving_boxes() {
     assert_eq!(places, [DVec3::new(14.0, 1.0, 2.0), DVec3::new(24.0, -1.0, 2.5)]);
     // Only the box that moves is masked, between the samples where it is then.
     for (photo, expected) in source.photos.iter().zip([29.0, 15.0, 22.0]) {
-        let [corners] = &photo.moving[..] else { panic!("{:?}", photo.moving) };
+        let [corners] = &photo.moving()[..] else { panic!("{:?}", photo.boxes) };
         let middle = corners.iter().sum::<DVec3>() / 8.0;
         assert!(middle.distance(DVec3::new(0.0, 0.5, expected)) < 1e-9, "{middle}");
         assert!((corners[1].z - corners[0].z).abs() - 4.0 < 1e-9 && (corners[0] - corners[4]).length() - 1.5 < 1e-9);
@@ -139,7 +139,7 @@ fn a_scene_has_its_photos_sweeps_and_moving_boxes() {
         rows[1]["translation"] = json!([-20.0, 0.0, 1.0]);
     });
     let source = with_lidar(folder.path()).unwrap();
-    assert_eq!(source.photos.iter().map(|photo| photo.moving.len()).collect::<Vec<_>>(), [2, 1, 2]);
+    assert_eq!(source.photos.iter().map(|photo| photo.moving().len()).collect::<Vec<_>>(), [2, 1, 2]);
 
     // Excerpts lack the data between key frames, or a key frame.
     fs::remove_dir_all(folder.path().join("sweeps")).unwrap();

@@ -150,7 +150,7 @@ fn with_lidar(path: &Path) -> Result<Source, String> {
 }
 
 #[test]
-fn a_segment_has_its_photos_sweeps_and_moving_boxes() {
+fn a_segment_has_its_photos_sweeps_and_annotated_boxes() {
     let folder = tempfile::tempdir().unwrap();
     Tables::new().write(&folder.path().join("training"));
     let source = with_lidar(folder.path()).unwrap();
@@ -179,7 +179,7 @@ fn a_segment_has_its_photos_sweeps_and_moving_boxes() {
     // One box moves; in the first photo, taken 50 ms after its frame, it is half way.
     assert_eq!(source.labels, BTreeMap::from([("vehicle".into(), 2), ("cyclist".into(), 2)]));
     for (photo, expected) in source.photos.iter().zip([Some(27.0), Some(21.0), None, None]) {
-        let middles: Vec<DVec3> = photo.moving.iter().map(|box_| box_.iter().sum::<DVec3>() / 8.0).collect();
+        let middles: Vec<DVec3> = photo.moving().iter().map(|box_| box_.iter().sum::<DVec3>() / 8.0).collect();
         match (&middles[..], expected) {
             ([middle], Some(depth)) => assert!(middle.distance(DVec3::new(0.0, 0.5, depth)) < 1e-4, "{middle}"),
             (found, expected) => assert!(found.is_empty() && expected.is_none(), "{found:?}"),

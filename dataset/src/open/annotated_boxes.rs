@@ -1,9 +1,11 @@
-//! Boxes of annotated objects: which of them move, and where those are at a photo's time.
+//! Boxes of annotated objects: which of them move, and where they are at a photo's time.
 
 use std::collections::{BTreeMap, BTreeSet};
 
 use glam::DVec3;
 use scene::{CameraModel, Rigid};
+
+use super::parsed::LabelledBox;
 
 /// An object moves if its places in the world differ by more, metres.
 const MOVED_METRES: f64 = 0.5;
@@ -40,30 +42,42 @@ pub(super) struct Placed {
     pub(super) size: DVec3,
 }
 
-/// For each moving object its boxes, by time.
-pub(super) struct Tracks(Vec<Vec<Placed>>);
+/// For each object its boxes, by time.
+pub(super) struct Tracks(Vec<Track>);
+
+struct Track {
+    class: String,
+    moves: bool,
+    boxes: Vec<Placed>,
+}
 
 impl Tracks {
-    /// Of boxes with their objects, each object's in the order of time.
-    pub(super) fn new<K: Ord>(boxes: impl Iterator<Item = (K, Placed)>) -> Self {
-        let mut by_object: BTreeMap<K, Vec<Placed>> = BTreeMap::new();
-        boxes.for_each(|(object, found)| by_object.entry(object).or_default().push(found));
-        Self(by_object.into_values().collect())
+    /// Of boxes with their objects and classes, each object's in the order of time; `moves` says which objects move.
+    pub(super) fn new<'a, K: Ord>(
+        boxes: impl Iterator<Item = (K, &'a str, Placed)>,
+        moves: impl Fn(&K) -> bool,
+    ) -> Self {
+        let mut by_object: BTreeMap<K, (&str, Vec<Placed>)> = BTreeMap::new();
+        boxes.for_each(|(object, class, found)| by_object.entry(object).or_insert((class, Vec::new())).1.push(found));
+        let track = |(object, (class, boxes))| Track { class: String::from(class), moves: moves(&object), boxes };
+        Self(by_object.into_iter().map(track).collect())
     }
 
-    /// Corners in the camera's axes of the moving objects that may be in a photo.
+    /// The objects that may be in a photo.
     pub(super) fn seen(
         &self,
         microseconds: i64,
         camera_from_world: &Rigid,
         lens: &CameraModel,
         size: Option<(u32, u32)>,
-    ) -> Vec<[DVec3; 8]> {
-        let at = |boxes: &Vec<Placed>| {
-            let (world_from_box, size) = at(boxes, microseconds)?;
-            Some(corners(&camera_from_world.compose(&world_from_box), size))
+    ) -> Vec<LabelledBox> {
+        let seen = |track: &Track| {
+            let (world_from_box, side) = at(&track.boxes, microseconds)?;
+            let corners = corners(&camera_from_world.compose(&world_from_box), side);
+            let labelled = || LabelledBox { class: track.class.clone(), moves: track.moves, corners };
+            is_in_view(&corners, lens, size).then(labelled)
         };
-        self.0.iter().filter_map(at).filter(|corners| is_in_view(corners, lens, size)).collect()
+        self.0.iter().filter_map(seen).collect()
     }
 }
 
