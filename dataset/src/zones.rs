@@ -1,8 +1,10 @@
 //! Zones of a capture's photos: found by a detector, or read from a file of boxes.
 
 mod boxes_file;
+mod parts;
 mod smoothing;
 
+use std::ops::Range;
 use std::sync::Arc;
 
 use perceive::{Detector, Picture, masked_share};
@@ -11,6 +13,7 @@ use scene::{ArtefactId, BadInput, Capture, Pixels, Rect, Zone, Zones};
 use store::BlockingStore;
 
 pub use self::boxes_file::BoxesFile;
+pub use self::parts::{gathered, objects_from_frame, objects_to_frame};
 use crate::ingest::IngestError;
 use crate::windows::{WindowError, WindowReader};
 
@@ -25,7 +28,7 @@ const MAX_MASKED: f64 = 0.5;
 
 /// Where zones come from.
 pub enum ZoneSource {
-    /// A detector, and the hash of its network and card.
+    /// A detector, and the artefact of its network and card.
     Detector(Box<Detector>, ArtefactId),
     /// A file of boxes.
     Boxes(BoxesFile),
@@ -45,7 +48,17 @@ pub fn find(
     progress: &dyn Fn(usize, usize),
 ) -> Result<(Zones, ArtefactId), IngestError> {
     let found = match from {
-        ZoneSource::Detector(detector, id) => detected(capture, detector, *id, store, progress)?,
+        ZoneSource::Detector(detector, id) => {
+            check_detector(detector)?;
+            let all = capture.views.len();
+            let without_points = Capture { views: capture.views.clone(), ..Capture::default() };
+            let reader = WindowReader::new(Arc::new(without_points), store.clone(), 0);
+            let goes_on = &mut |done| {
+                progress(done, all);
+                true
+            };
+            detect(&reader, 0..all, (detector, *id), store, goes_on)?
+        }
         ZoneSource::Boxes(file) => file.zones(capture)?,
     };
     let of_views = smoothing::smoothed(&found.of_views, |view| follows(capture, view));
@@ -74,22 +87,40 @@ fn follows(capture: &Capture, view: usize) -> bool {
     view > 0 && folder(view) == folder(view - 1)
 }
 
-fn detected(
-    capture: &Capture,
-    detector: &Detector,
-    id: ArtefactId,
-    store: &BlockingStore,
-    progress: &dyn Fn(usize, usize),
-) -> Result<Zones, IngestError> {
-    let classes = detector.card().classes.clone();
-    if classes.len() > usize::from(u16::MAX) {
-        let problem = format!("has {} classes, and {} are the most", classes.len(), u16::MAX);
-        return Err(BadInput::new(detector.file(), problem, "map them to fewer in its card").into());
+/// Refuses a detector that cannot look for objects: it has too many classes, or it cannot be run.
+///
+/// # Errors
+/// Such a detector.
+pub fn check_detector(detector: &Detector) -> Result<(), BadInput> {
+    let classes = detector.card().classes.len();
+    if classes > usize::from(u16::MAX) {
+        let problem = format!("has {classes} classes, and {} are the most", u16::MAX);
+        return Err(BadInput::new(detector.file(), problem, "map them to fewer in its card"));
     }
-    let without_points = Capture { views: capture.views.clone(), ..Capture::default() };
-    let reader = WindowReader::new(Arc::new(without_points), store.clone(), 0);
-    let mut of_views = Vec::with_capacity(capture.views.len());
-    for (number, view) in (0u32..).zip(&capture.views) {
+    // Every picture is scaled to the same input.
+    detector.detect(&Picture { rgb: &[0; 3], width: 1, height: 1 }, 1.0).map(drop)
+}
+
+/// What a [checked](check_detector) detector finds on some views, as it is: not smoothed, and [`Zones::of_views`] are those of the range only. `goes_on`
+/// is called with the number of views done; if it says no, the rest is left out.
+///
+/// What is found on a photo is recorded in the store, by the artefacts of the photo and of the detector, so a repeated call only
+/// reads records.
+///
+/// # Errors
+/// A network that cannot be run, or a failing store.
+pub fn detect(
+    reader: &WindowReader,
+    views: Range<usize>,
+    (detector, id): (&Detector, ArtefactId),
+    store: &BlockingStore,
+    goes_on: &mut dyn FnMut(usize) -> bool,
+) -> Result<Zones, IngestError> {
+    let of_range = reader.capture().views.get(views.clone());
+    let of_range =
+        of_range.ok_or_else(|| BadInput::new("the views", format!("{views:?} do not exist"), "plan again"))?;
+    let mut of_views = Vec::with_capacity(of_range.len());
+    for (number, view) in views.zip(of_range) {
         let key = frame::encode(RECORD, &(FORMAT, id, view.mips.first()), &[]);
         let name = format!("zones/{}", ArtefactId::of(&key));
         let recorded = store.get_record(&name)?;
@@ -98,16 +129,18 @@ fn detected(
             Some(zones) => zones,
             None => {
                 let k = view.camera.pinhole;
-                let photo = reader.window(number, 0, Rect { x: 0, y: 0, width: k.width, height: k.height });
+                let photo = reader.window(number as u32, 0, Rect { x: 0, y: 0, width: k.width, height: k.height });
                 let zones = found(detector, &*photo.map_err(|error| unreadable(&view.name, error))?)?;
                 store.put_record(&name, frame::encode(RECORD, &zones, &[]))?;
                 zones
             }
         };
         of_views.push(zones);
-        progress(of_views.len(), capture.views.len());
+        if !goes_on(of_views.len()) {
+            break;
+        }
     }
-    Ok(Zones { classes, of_views })
+    Ok(Zones { classes: detector.card().classes.clone(), of_views })
 }
 
 fn unreadable(view: &str, error: WindowError) -> IngestError {
