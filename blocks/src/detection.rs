@@ -17,7 +17,7 @@ const SHORT_MICROS: u64 = 2_000_000;
 /// The maximum number of detection tasks: the root depends on all of them.
 pub(crate) const MAX_DETECT_TASKS: usize = 4096;
 /// CPU microseconds of reading a pixel of a photo and scaling it to the network's input.
-const MICROS_PER_PIXEL: f64 = 0.03;
+const MICROS_PER_PIXEL: f64 = 0.02;
 /// Bytes per pixel of the largest photo: compressed tiles, planes, mask, and rows of colours.
 const BYTES_PER_PIXEL: u64 = 12;
 

@@ -60,9 +60,9 @@ fn worker(at: &Path, url: &str, name: &str) -> Running {
 
 /// Submits a plan that is in the store.
 fn submit(at: &Path, url: &str, plan: &Plan) {
-    let id = store(at, "shared").put(plan.to_frame()).unwrap();
-    let store_url = format!("file://{}", at.join("shared").display());
-    let request = proto::SubmitRequest { plan: id.0.to_vec(), store_url };
+    let shared = store(at, "shared");
+    let id = shared.put(plan.to_frame()).unwrap();
+    let request = proto::SubmitRequest { plan: id.0.to_vec(), store_url: shared.store().url().into() };
     runtime().block_on(async { proto::connect(url, &Access::default()).unwrap().submit(request).await }).unwrap();
 }
 
@@ -112,7 +112,9 @@ fn workers_and_coordinators_that_die_while_they_look_for_objects_change_nothing(
     assert!(plan.zones.is_none() && plan.detector.is_some() && plan.detect_tasks.len() == 1);
     // The cluster has the photos, and no memory of what was found on them.
     assert!(Command::new("cp").args(["-r", "calm/store", "shared"]).current_dir(at).status().unwrap().success());
-    ["zones", "results"].map(|names| fs::remove_dir_all(at.join("shared/names").join(names)).unwrap());
+    for names in ["zones", "results"] {
+        fs::remove_dir_all(at.join("shared/names").join(names)).unwrap();
+    }
     let divided = divided(&plan, 23);
     assert_eq!(divided.detect_tasks.len(), 7);
 

@@ -31,7 +31,7 @@ pub struct Detector {
 /// What running a detector on one picture takes, estimated from its size.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Cost {
-    /// CPU seconds on a core with AVX2.
+    /// CPU seconds on a core with AVX2; one with AVX-512 takes half.
     pub cpu_seconds: f64,
     /// Memory, bytes, with that of the network.
     pub memory_bytes: u64,
@@ -40,10 +40,11 @@ pub struct Cost {
 /// Pixels of the input that share an evaluation of a weight, on average: a network has most weights where its maps are small.
 /// It is 290 to 300 for YOLOX nano and x and for YOLOv8n, by the multiply-adds that their authors state.
 const PIXELS_PER_USE: f64 = 300.0;
-/// CPU seconds of a multiply-add.
-const SECONDS_PER_MULTIPLY: f64 = 0.05e-9;
+/// CPU seconds of a multiply-add, and of all else that a picture takes (docs/decisions/0080).
+const SECONDS_PER_MULTIPLY: f64 = 0.04e-9;
+const SECONDS_PER_PICTURE: f64 = 0.03;
 /// Bytes of intermediate maps per pixel of the input.
-const BYTES_PER_PIXEL: u64 = 400;
+const BYTES_PER_PIXEL: u64 = 200;
 
 impl Detector {
     /// Loads a detector from the bytes of its ONNX file; `card` is the text of the TOML file beside it, if there is
@@ -70,7 +71,7 @@ impl Detector {
         let [width, height] = self.card.input;
         let (pixels, weights) = ((width * height) as f64, self.bytes as f64 / 4.0);
         Cost {
-            cpu_seconds: weights * pixels / PIXELS_PER_USE * SECONDS_PER_MULTIPLY,
+            cpu_seconds: SECONDS_PER_PICTURE + weights * pixels / PIXELS_PER_USE * SECONDS_PER_MULTIPLY,
             memory_bytes: 3 * self.bytes as u64 + (width * height) as u64 * BYTES_PER_PIXEL,
         }
     }
@@ -247,6 +248,15 @@ mod tests {
                 assert_eq!(load().on_threads(threads).detect(&picture, 0.05).unwrap(), shared, "{name}, {threads}");
             }
         }
+    }
+
+    #[test]
+    fn a_larger_network_costs_more() {
+        let cost = |name: &str| network(name).map(|(bytes, card)| Detector::load(name, bytes, card).unwrap().cost());
+        let tiny = cost("yolov8_tiny.onnx").unwrap();
+        assert!((0.03..0.031).contains(&tiny.cpu_seconds) && tiny.memory_bytes < 4 << 20, "{tiny:?}");
+        let Some(yolox) = cost(YOLOX) else { return };
+        assert!((0.05..0.06).contains(&yolox.cpu_seconds) && (40 << 20..60 << 20).contains(&yolox.memory_bytes));
     }
 
     #[test]
