@@ -1,12 +1,10 @@
 //! Plans the tasks that look for objects on the photos.
 
-use std::collections::BTreeSet;
-use std::ops::Range;
-
 use scene::{Capture, View};
-use serde::{Deserialize, Serialize};
 
 use crate::budgets::BASE_BYTES;
+use crate::plan::MAX_DETECT_TASKS;
+use crate::task::DetectTask;
 
 /// CPU microseconds of a task at most, about: longer ones leave workers idle while the last ones run.
 const TASK_MICROS: u64 = 15_000_000;
@@ -14,32 +12,10 @@ const TASK_MICROS: u64 = 15_000_000;
 const FEW_TASKS: u64 = 8;
 /// but not shorter ones: each loads the network.
 const SHORT_MICROS: u64 = 2_000_000;
-/// The maximum number of detection tasks: the root depends on all of them.
-pub(crate) const MAX_DETECT_TASKS: usize = 4096;
 /// CPU microseconds of reading a pixel of a photo and scaling it to the network's input.
 const MICROS_PER_PIXEL: f64 = 0.02;
 /// Bytes per pixel of the largest photo: compressed tiles, planes, mask, and rows of colours.
 const BYTES_PER_PIXEL: u64 = 12;
-
-/// The task of running the plan's detector on views that follow each other.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub struct DetectTask {
-    /// Index of its first view.
-    pub first: u32,
-    /// Number of its views, at least 1.
-    pub count: u32,
-    /// Estimated CPU time, milliseconds, on the machine of [`StepCost::CPU_SECONDS`](crate::StepCost::CPU_SECONDS).
-    pub work_millis: u64,
-    /// Estimated peak memory, bytes.
-    pub memory_bytes: u64,
-}
-
-impl DetectTask {
-    /// Indices of its views.
-    pub fn views(&self) -> Range<u32> {
-        self.first..self.first.saturating_add(self.count)
-    }
-}
 
 /// What running a detector on one picture takes, estimated from the network.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -79,14 +55,6 @@ pub fn detect_tasks(capture: &Capture, cost: DetectorCost) -> Vec<DetectTask> {
     tasks
 }
 
-/// The tasks, by their place among these, of some views and of the views before and after each.
-pub(crate) fn tasks_of_views(tasks: &[DetectTask], views: impl Iterator<Item = u32>) -> BTreeSet<usize> {
-    let near = views.flat_map(|view| view.saturating_sub(1)..=view.saturating_add(1));
-    near.map(|view| tasks.partition_point(|task| task.views().end <= view))
-        .filter(|&place| place < tasks.len())
-        .collect()
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -112,17 +80,5 @@ mod tests {
             assert!(!detect_tasks(&capture, DetectorCost { cpu_seconds, ..COST }).is_empty());
         }
         assert!(detect_tasks(&Capture::default(), COST).is_empty());
-    }
-
-    #[test]
-    fn a_view_needs_its_neighbours() {
-        let task = |first, count| DetectTask { first, count, work_millis: 1, memory_bytes: 1 };
-        let tasks = [task(0, 3), task(3, 2), task(5, 1), task(6, 4)];
-        let of = |views: &[u32]| tasks_of_views(&tasks, views.iter().copied()).collect::<Vec<_>>();
-        assert_eq!([of(&[0]), of(&[1]), of(&[9]), of(&[])], [vec![0], vec![0], vec![3], vec![]]);
-        assert_eq!([of(&[2]), of(&[3]), of(&[5]), of(&[0, 8])], [vec![0, 1], vec![0, 1], vec![1, 2, 3], vec![0, 3]]);
-        // What a damaged plan may name.
-        assert_eq!(of(&[10, u32::MAX]), [3]);
-        assert!(tasks_of_views(&[], [0].into_iter()).is_empty());
     }
 }

@@ -236,8 +236,8 @@ mod tests {
     use scene::ArtefactId;
 
     use super::*;
-    use crate::detection::DetectTask;
     use crate::plan::PlanSettings;
+    use crate::task::DetectTask;
     use crate::testing::aerial;
 
     /// Each damage is found at the damaged block.

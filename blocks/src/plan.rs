@@ -9,10 +9,9 @@ use scene::frame::{self, Kind};
 use scene::{ArtefactId, BlockId, CodecError, Rect};
 use serde::{Deserialize, Serialize};
 
-use crate::detection::{DetectTask, MAX_DETECT_TASKS, tasks_of_views};
 use crate::ground::Ground;
 use crate::lod::{Cut, training_order};
-use crate::task::{EvalTask, Task, ViewUse};
+use crate::task::{DetectTask, EvalTask, Task, ViewUse, tasks_of_views};
 
 /// The format version of [`Plan`] that this program reads and writes.
 pub const VERSION: u32 = 11;
@@ -26,6 +25,8 @@ pub const MAX_VIEWS_PER_STEP: u32 = 16;
 
 /// The maximum number of evaluation tasks. Each depends on all blocks.
 pub(crate) const MAX_EVAL_TASKS: usize = 256;
+/// The maximum number of detection tasks: the root depends on all of them.
+pub(crate) const MAX_DETECT_TASKS: usize = 4096;
 /// The maximum number of blocks of a plan with evaluation tasks: a grant names all results, 40 bytes each, in a message of
 /// at most 4 MiB.
 pub(crate) const MAX_EVALUATED_BLOCKS: usize = 1 << 16;

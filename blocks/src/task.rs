@@ -1,6 +1,7 @@
-//! The tasks that train a block or measure the model, as a plan lists them.
+//! The tasks of a plan: they train a block, measure the model, or look for objects.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
+use std::ops::Range;
 
 use glam::DVec3;
 use scene::{BlockId, Rect};
@@ -103,4 +104,49 @@ pub struct EvalTask {
     pub pixels: u64,
     /// Estimated peak memory, bytes.
     pub memory_bytes: u64,
+}
+
+/// The task of running the plan's detector on views that follow each other.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct DetectTask {
+    /// Index of its first view.
+    pub first: u32,
+    /// Number of its views, at least 1.
+    pub count: u32,
+    /// Estimated CPU time, milliseconds, on the machine of [`StepCost::CPU_SECONDS`](crate::StepCost::CPU_SECONDS).
+    pub work_millis: u64,
+    /// Estimated peak memory, bytes.
+    pub memory_bytes: u64,
+}
+
+impl DetectTask {
+    /// Indices of its views.
+    pub fn views(&self) -> Range<u32> {
+        self.first..self.first.saturating_add(self.count)
+    }
+}
+
+/// The tasks, by their place among these, of some views and of the views before and after each.
+pub(crate) fn tasks_of_views(tasks: &[DetectTask], views: impl Iterator<Item = u32>) -> BTreeSet<usize> {
+    let near = views.flat_map(|view| view.saturating_sub(1)..=view.saturating_add(1));
+    near.map(|view| tasks.partition_point(|task| task.views().end <= view))
+        .filter(|&place| place < tasks.len())
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_view_needs_its_neighbours() {
+        let task = |first, count| DetectTask { first, count, work_millis: 1, memory_bytes: 1 };
+        let tasks = [task(0, 3), task(3, 2), task(5, 1), task(6, 4)];
+        let of = |views: &[u32]| tasks_of_views(&tasks, views.iter().copied()).into_iter().collect::<Vec<_>>();
+        assert_eq!([of(&[0]), of(&[1]), of(&[9]), of(&[])], [vec![0], vec![0], vec![3], vec![]]);
+        assert_eq!([of(&[2]), of(&[3]), of(&[5]), of(&[0, 8])], [vec![0, 1], vec![0, 1], vec![1, 2, 3], vec![0, 3]]);
+        // What a damaged plan may name.
+        assert_eq!(of(&[10, u32::MAX]), [3]);
+        assert!(tasks_of_views(&[], [0].into_iter()).is_empty());
+    }
 }

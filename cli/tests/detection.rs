@@ -109,7 +109,7 @@ fn workers_and_coordinators_that_die_while_they_look_for_objects_change_nothing(
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
     let (plan, _) = calm(at, 160);
-    assert!(plan.zones.is_none() && plan.detector.is_some() && plan.detect_tasks.len() == 1);
+    assert!(plan.zones.is_none() && plan.detector.is_some());
     // The cluster has the photos, and no memory of what was found on them.
     assert!(Command::new("cp").args(["-r", "calm/store", "shared"]).current_dir(at).status().unwrap().success());
     for names in ["zones", "results"] {
@@ -143,7 +143,7 @@ fn workers_and_coordinators_that_die_while_they_look_for_objects_change_nothing(
         assert_eq!(block["artefact"], results[&index].to_string(), "block {}", task.block);
     }
     let found = zones(&divided, &store(at, "shared"), |task| results[&task]);
-    // In one process each result is recorded by the plan, the task and, here, no inputs.
+    // In one process each result is recorded by the plan and the task, which has no inputs.
     let recorded = |task: u32| {
         let key = proto::result_key(plan.id(), task, &BTreeMap::new());
         let record = whole.get_record(&format!("results/{key}")).unwrap().unwrap();
