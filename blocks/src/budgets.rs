@@ -11,7 +11,8 @@ use scene::{BlockId, Camera, Capture};
 use crate::cost::{HALO_AREA, epoch_cost};
 use crate::coverage::PixelCoverage;
 use crate::ground::Ground;
-use crate::plan::{Plan, PlanSettings, Task};
+use crate::plan::{Plan, PlanSettings};
+use crate::task::Task;
 use crate::visibility::Observations;
 
 /// Splats of an inner block per splat of its children.

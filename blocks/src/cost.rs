@@ -5,7 +5,7 @@
 //! estimate of a plan's CPU time has constants of its own.
 
 use crate::ground::HALO_SCALE;
-use crate::plan::Task;
+use crate::task::Task;
 
 /// Cost of a splat that the window shows, in pixels: it is projected, sorted, blended over its pixels and updated.
 const PER_VISIBLE: f64 = 1.0;

@@ -7,7 +7,7 @@ use std::collections::BTreeMap;
 
 use scene::Capture;
 
-use crate::plan::ViewUse;
+use crate::task::ViewUse;
 
 /// The coverage of each view, by view index. All windows of a view have the same mip.
 #[derive(Debug, Clone, Default)]

@@ -8,8 +8,9 @@ use scene::{BlockId, Capture};
 use crate::page::{
     Map, SOFT, Svg, camera_glyph, draw_cameras, draw_points, facts_of, grouped, page, panel_corner, points_glyph, short,
 };
-use crate::plan::{Mode, Plan, Task};
+use crate::plan::{Mode, Plan};
 use crate::split::Split;
+use crate::task::Task;
 
 const TRAIN: &str = "#1467a8";
 const TEST: &str = "#d9480f";

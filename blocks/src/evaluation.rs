@@ -4,8 +4,9 @@ use scene::Capture;
 
 use crate::budgets::{BASE_BYTES, BYTES_PER_FROZEN_COLUMN, BYTES_PER_FROZEN_PROJECTED, COLUMNS};
 use crate::cost::HALO_AREA;
-use crate::plan::{EvalTask, MAX_EVAL_TASKS, PlanSettings, Task};
+use crate::plan::{MAX_EVAL_TASKS, PlanSettings};
 use crate::split::Split;
+use crate::task::{EvalTask, Task};
 
 /// Least pixels of the views of one task, about. Larger tasks would leave workers without work.
 const TASK_PIXELS: u64 = 8 << 20;

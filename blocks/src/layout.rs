@@ -7,8 +7,10 @@ use scene::{BlockId, Capture};
 use crate::budgets::BLOCK_SPLATS;
 use crate::ground::{Ground, quantile};
 use crate::lod::{context_of, finished_neighbours, training_order};
-use crate::plan::{MAX_LEVELS, Mode, PlanError, Task};
+use crate::plan::{MAX_LEVELS, Mode};
+use crate::plan_error::PlanError;
 use crate::split::Split;
+use crate::task::Task;
 use crate::view_selection::{ViewSelection, full_views, select_level};
 use crate::visibility::Observations;
 

@@ -7,8 +7,9 @@ use scene::{BlockId, Capture};
 
 use crate::layout::MIN_VIEWS;
 use crate::lod::training_order;
-use crate::plan::{EvalTask, Mode, Plan, Task, ViewUse};
+use crate::plan::{Mode, Plan};
 use crate::split::Split;
+use crate::task::{EvalTask, Task, ViewUse};
 use crate::visibility::max_mip;
 
 /// Finest blocks that draw each of their windows less often than this gain little on their parents: a street had 26.56 dB with
@@ -74,14 +75,15 @@ pub fn lint(plan: &Plan, capture: &Capture) -> Vec<Finding> {
         earlier.insert(task.block);
     }
     plan.eval_tasks.iter().for_each(|task| check_evaluation(task, capture, &split, &mut findings));
-    let (limit, largest) =
-        (plan.settings.memory_limit_bytes, plan.eval_tasks.iter().map(|task| task.memory_bytes).max());
-    if let Some(bytes) = largest.filter(|bytes| *bytes > limit) {
-        let [bytes, limit] = [bytes, limit].map(|bytes| bytes.div_ceil(1 << 20));
-        let advice = "lower --budget, or leave --evaluate and use plat eval";
-        findings
-            .error(None, format!("evaluating the merged model needs {bytes} MiB, the limit is {limit} MiB; {advice}"));
+    if let Some(end) = plan.detect_tasks.last().map(|task| task.views().end as usize)
+        && end != capture.views.len()
+    {
+        findings.error(None, format!("looks for objects on {end} views, the capture has {}", capture.views.len()));
     }
+    let evaluating = ("evaluating the merged model", "lower --budget, or leave --evaluate and use plat eval");
+    check_memory(plan, plan.eval_tasks.iter().map(|task| task.memory_bytes), evaluating, &mut findings);
+    let detecting = ("looking for objects", "give a smaller --detector");
+    check_memory(plan, plan.detect_tasks.iter().map(|task| task.memory_bytes), detecting, &mut findings);
     let finest: u64 = plan.leaves().blocks().iter().filter_map(|&b| plan.task(b)).map(|t| u64::from(t.budget)).sum();
     let deepest: u64 = plan.tasks.iter().filter(|t| t.block.level == plan.levels).map(|t| u64::from(t.budget)).sum();
     let (budget, parts) = (u64::from(plan.settings.budget), plan.tasks.len() as u64);
@@ -209,6 +211,15 @@ fn check_budgets(plan: &Plan, task: &Task, findings: &mut Findings) {
     }
 }
 
+/// Checks that the largest of some tasks that train no block fits the memory limit.
+fn check_memory(plan: &Plan, bytes: impl Iterator<Item = u64>, (what, advice): (&str, &str), findings: &mut Findings) {
+    let limit = plan.settings.memory_limit_bytes;
+    if let Some(bytes) = bytes.max().filter(|bytes| *bytes > limit) {
+        let [bytes, limit] = [bytes, limit].map(|bytes| bytes.div_ceil(1 << 20));
+        findings.error(None, format!("{what} needs {bytes} MiB, the limit is {limit} MiB; {advice}"));
+    }
+}
+
 /// Checks that the views of an evaluation exist and are held out.
 fn check_evaluation(task: &EvalTask, capture: &Capture, split: &Split, findings: &mut Findings) {
     for &view in &task.views {
@@ -226,6 +237,7 @@ mod tests {
 
     use super::*;
     use crate::plan::PlanSettings;
+    use crate::task::DetectTask;
     use crate::testing::aerial;
 
     /// Each damage is found at the damaged block.
@@ -284,6 +296,27 @@ mod tests {
             let found = findings.iter().any(|f| f.severity == Severity::Error && f.message.contains(expected));
             assert!(found, "{expected}: {findings:?}");
         }
+        let detects = |ranges: &[(u32, u32)], memory_bytes: u64| {
+            let task = |&(first, count): &(u32, u32)| DetectTask { first, count, work_millis: 1, memory_bytes };
+            let detector = Some(ArtefactId::of(b"network"));
+            lint(&Plan { detector, detect_tasks: ranges.iter().map(task).collect(), ..good.clone() }, &capture)
+        };
+        assert!(detects(&[(0, 36)], 1).is_empty() && detects(&[(0, 1), (1, 35)], 1).is_empty());
+        for (ranges, bytes, expected) in [
+            (&[(0, 35)][..], 1, "on 35 views, the capture has 36"),
+            (&[(1, 35)], 1, "do not follow each other"),
+            (&[(0, 2), (1, 34)], 1, "do not follow each other"),
+            (&[(0, 0), (0, 36)], 1, "do not follow each other"),
+            (&[(0, u32::MAX), (u32::MAX, 1)], 1, "do not follow each other"),
+            (&[(0, 36)], u64::MAX, "give a smaller --detector"),
+        ] {
+            let findings = detects(ranges, bytes);
+            let found = findings.iter().any(|f| f.severity == Severity::Error && f.message.contains(expected));
+            assert!(found, "{expected}: {findings:?}");
+        }
+        let task = DetectTask { first: 0, count: 36, work_millis: 1, memory_bytes: 1 };
+        let blind = Plan { detect_tasks: vec![task], ..good.clone() };
+        assert!(lint(&blind, &capture)[0].message.contains("no detector"));
         let mut fewer = capture.clone();
         fewer.views.truncate(20);
         assert!(lint(&good, &fewer).iter().any(|f| f.message.contains("the capture has 20")));

@@ -3,18 +3,18 @@
 //! A plan is stored as positional bincode in a frame, and as JSON. The order of fields and the serde names are part of
 //! both formats.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 
-use glam::DVec3;
 use scene::frame::{self, Kind};
 use scene::{ArtefactId, BlockId, CodecError, Rect};
 use serde::{Deserialize, Serialize};
 
-use crate::ground::{Ground, HALO_SCALE};
+use crate::ground::Ground;
 use crate::lod::{Cut, training_order};
+use crate::task::{DetectTask, EvalTask, Task, ViewUse, tasks_of_views};
 
 /// The format version of [`Plan`] that this program reads and writes.
-pub const VERSION: u32 = 10;
+pub const VERSION: u32 = 11;
 /// The frame kind of a plan.
 pub const PLAN: Kind = Kind(*b"plan", VERSION);
 /// The maximum depth of a plan: 65,536 blocks a side.
@@ -25,6 +25,8 @@ pub const MAX_VIEWS_PER_STEP: u32 = 16;
 
 /// The maximum number of evaluation tasks. Each depends on all blocks.
 pub(crate) const MAX_EVAL_TASKS: usize = 256;
+/// The maximum number of detection tasks: the root depends on all of them.
+pub(crate) const MAX_DETECT_TASKS: usize = 4096;
 /// The maximum number of blocks of a plan with evaluation tasks: a grant names all results, 40 bytes each, in a message of
 /// at most 4 MiB.
 pub(crate) const MAX_EVALUATED_BLOCKS: usize = 1 << 16;
@@ -122,102 +124,6 @@ impl Default for PlanSettings {
     }
 }
 
-/// A window of a view at one mip.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
-pub struct ViewUse {
-    /// Index into the capture's views.
-    pub view: u32,
-    /// Mip of the image; 0 is full resolution.
-    pub mip: u8,
-    /// The window, pixels of that mip.
-    pub window: Rect,
-}
-
-/// The task of training one block.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Task {
-    /// The block. It identifies the task within the plan.
-    pub block: BlockId,
-    /// The block whose result initialises this one. `None`: initialised from sparse points.
-    pub parent: Option<BlockId>,
-    /// Context: blocks that are rendered frozen with this one. Coarser blocks outside the halo, and finished neighbours
-    /// of the same level, which also count inside the halo. Together with the parent they cover the plane; see
-    /// [`Task::context_cut`].
-    pub context: Vec<BlockId>,
-    /// Training windows, sorted by view.
-    pub views: Vec<ViewUse>,
-    /// Held-out windows for evaluation, sorted by view.
-    pub test_views: Vec<ViewUse>,
-    /// Number of sparse points in the halo.
-    pub points: u32,
-    /// Target number of splats in the core at the end of training.
-    pub budget: u32,
-    /// Estimated number of own splats (core and halo) that a window shows at the end, mean over the windows.
-    #[serde(rename = "drawn")]
-    pub visible_splats: u32,
-    /// Estimated number of frozen context splats that a window shows, mean over the windows.
-    #[serde(rename = "context_drawn")]
-    pub visible_context_splats: u32,
-    /// Training steps, one window each.
-    pub steps: u32,
-    /// Target resolution, metres per pixel.
-    pub rho_metres: f64,
-    /// Estimated peak memory, bytes.
-    pub memory_bytes: u64,
-}
-
-impl Task {
-    /// The total number of pixels of all training windows.
-    pub fn window_pixels(&self) -> u64 {
-        self.views.iter().map(|v| v.window.area()).sum()
-    }
-
-    /// The share of the pixels of the training windows that are finer than the parent's of the same view, 0 to 1: what
-    /// the parent has not been trained on.
-    pub fn finer_share(&self, parent: &Task) -> f64 {
-        let mips: BTreeMap<u32, u8> = parent.views.iter().map(|used| (used.view, used.mip)).collect();
-        let is_finer = |used: &&ViewUse| mips.get(&used.view).is_none_or(|mip| used.mip < *mip);
-        let finer: u64 = self.views.iter().filter(is_finer).map(|used| used.window.area()).sum();
-        finer as f64 / self.window_pixels().max(1) as f64
-    }
-
-    /// The donor of a place (world metres): the finished neighbour whose splats initialise that part of this block's
-    /// core. `None`: the parent's splats are used.
-    ///
-    /// The donor is the nearest finished neighbour whose halo contains the place in its inner half. The neighbour
-    /// trained its splats there together with the splats that stay frozen on its side of the face. In the outer half of
-    /// its halo it has too few observations.
-    pub fn donor(&self, ground: &Ground, place: DVec3) -> Option<BlockId> {
-        const INNER: f64 = 0.25 * (HALO_SCALE - 1.0);
-        if !ground.owns(self.block, place) || ground.is_background(place) {
-            return None;
-        }
-        let reach = INNER * ground.core_edge_metres(self.block.level);
-        (self.context.iter())
-            .filter(|neighbour| neighbour.level == self.block.level)
-            .map(|&neighbour| (ground.metres_from_core(neighbour, place), neighbour))
-            .filter(|&(metres, _)| metres <= reach)
-            .min_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)))
-            .map(|(_, neighbour)| neighbour)
-    }
-
-    /// The cut that the block is trained against: its context and its parent.
-    pub fn context_cut(&self) -> Cut {
-        self.context.iter().copied().chain(self.parent).collect()
-    }
-}
-
-/// The task of measuring the merged model on some held-out views. It reads the results of all blocks.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub struct EvalTask {
-    /// Indices of the views, ascending. They are compared at full resolution.
-    pub views: Vec<u32>,
-    /// Pixels of all these views.
-    pub pixels: u64,
-    /// Estimated peak memory, bytes.
-    pub memory_bytes: u64,
-}
-
 /// A task of any kind, as [`Plan::planned`] finds it. A new kind of task is a list in [`Plan`] and a variant here.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum PlannedTask<'a> {
@@ -225,6 +131,8 @@ pub enum PlannedTask<'a> {
     Train(&'a Task),
     /// Measures the merged model.
     Evaluate(&'a EvalTask),
+    /// Looks for objects on photos.
+    Detect(&'a DetectTask),
 }
 
 impl PlannedTask<'_> {
@@ -233,6 +141,7 @@ impl PlannedTask<'_> {
         match self {
             Self::Train(task) => task.steps.into(),
             Self::Evaluate(task) => task.views.len() as u64,
+            Self::Detect(task) => task.count.into(),
         }
     }
 
@@ -241,20 +150,21 @@ impl PlannedTask<'_> {
         match self {
             Self::Train(task) => task.memory_bytes,
             Self::Evaluate(task) => task.memory_bytes,
+            Self::Detect(task) => task.memory_bytes,
         }
     }
 }
 
-/// An immutable list of tasks in topological order: each task follows its dependencies.
+/// An immutable list of tasks. Those that train are in topological order: each follows the blocks that it reads.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Plan {
     /// [`VERSION`].
     pub version: u32,
     /// The capture that the plan is for.
     pub capture: ArtefactId,
-    /// The objects on its photos, if anyone looked for them.
+    /// The objects on its photos, if they are known before the job. Else [`Plan::detect_tasks`] look for them, if anyone does.
     pub zones: Option<ArtefactId>,
-    /// The detector whose loss is in training, if [`PlanSettings::aligned_weight`] is not 0.
+    /// The detector that looks for objects, and whose loss is in training if [`PlanSettings::aligned_weight`] is not 0.
     pub detector: Option<ArtefactId>,
     /// The user's settings.
     pub settings: PlanSettings,
@@ -271,6 +181,9 @@ pub struct Plan {
     /// Tasks after training: each view that they measure is held out and named once. Empty without
     /// [`PlanSettings::evaluate`].
     pub eval_tasks: Vec<EvalTask>,
+    /// Tasks before training: together they run the detector on each view of the capture once, in order. Empty unless a
+    /// detector is to find the zones.
+    pub detect_tasks: Vec<DetectTask>,
 }
 
 impl Plan {
@@ -315,6 +228,17 @@ impl Plan {
         if aligned_weight > 0.0 && self.detector.is_none() {
             return bad("has a weight for the loss of a detector and no detector".into());
         }
+        if !self.detect_tasks.is_empty() && (self.detector.is_none() || self.zones.is_some()) {
+            return bad("has detection tasks and no detector, or zones that are known".into());
+        }
+        let mut detected = Some(0u32);
+        for task in &self.detect_tasks {
+            detected = detected.filter(|end| task.first == *end && task.count > 0);
+            detected = detected.and_then(|end| end.checked_add(task.count));
+        }
+        if detected.is_none() || self.detect_tasks.len() > MAX_DETECT_TASKS {
+            return bad(format!("has detection tasks that do not follow each other, or more than {MAX_DETECT_TASKS}"));
+        }
         let sane = |rho: &f64| rho.is_finite() && *rho > 0.0;
         if self.rho_metres.len() != usize::from(self.levels) + 1 || !self.rho_metres.iter().all(sane) {
             return bad("has resolutions that do not match its levels".into());
@@ -357,7 +281,7 @@ impl Plan {
 
     /// The number of tasks of all kinds.
     pub fn len(&self) -> usize {
-        self.tasks.len() + self.eval_tasks.len()
+        self.tasks.len() + self.eval_tasks.len() + self.detect_tasks.len()
     }
 
     /// Whether there is no task of any kind; false for a plan that passed [`Plan::check`].
@@ -365,20 +289,29 @@ impl Plan {
         self.len() == 0
     }
 
-    /// The task of an index: first the training tasks, then those that evaluate. The index identifies the task towards
-    /// the coordinator and its workers.
+    /// The task of an index: first the training tasks, then those that evaluate, then those that detect. The index identifies
+    /// the task towards the coordinator and its workers.
     pub fn planned(&self, index: u32) -> Option<PlannedTask<'_>> {
         let index = index as usize;
-        match index.checked_sub(self.tasks.len()) {
-            None => self.tasks.get(index).map(PlannedTask::Train),
-            Some(index) => self.eval_tasks.get(index).map(PlannedTask::Evaluate),
+        let Some(index) = index.checked_sub(self.tasks.len()) else {
+            return self.tasks.get(index).map(PlannedTask::Train);
+        };
+        match index.checked_sub(self.eval_tasks.len()) {
+            None => self.eval_tasks.get(index).map(PlannedTask::Evaluate),
+            Some(index) => self.detect_tasks.get(index).map(PlannedTask::Detect),
         }
     }
 
     /// All tasks, by index.
     pub fn all_tasks(&self) -> impl Iterator<Item = PlannedTask<'_>> {
         let evaluate = self.eval_tasks.iter().map(PlannedTask::Evaluate);
-        self.tasks.iter().map(PlannedTask::Train).chain(evaluate)
+        let detect = self.detect_tasks.iter().map(PlannedTask::Detect);
+        self.tasks.iter().map(PlannedTask::Train).chain(evaluate).chain(detect)
+    }
+
+    /// The index of the first detection task; that of no task if there are none.
+    pub fn first_detection(&self) -> usize {
+        self.tasks.len() + self.eval_tasks.len()
     }
 
     /// The blocks whose results a task reads.
@@ -386,7 +319,35 @@ impl Plan {
         match task {
             PlannedTask::Train(task) => task.context_cut().blocks(),
             PlannedTask::Evaluate(_) => self.tasks.iter().map(|task| task.block).collect(),
+            PlannedTask::Detect(_) => BTreeSet::new(),
         }
+    }
+
+    /// The detection tasks whose results a task reads, by index, ascending: those of its training views and, as zones are
+    /// smoothed over three photos, of the views before and after each.
+    pub fn detections(&self, task: PlannedTask) -> Vec<u32> {
+        match task {
+            PlannedTask::Train(task) if self.settings.zone_weight > 0.0 => {
+                let views = task.views.iter().map(|used| used.view);
+                let first = self.first_detection();
+                let places = tasks_of_views(&self.detect_tasks, views);
+                places.into_iter().map(|place| (first + place) as u32).collect()
+            }
+            PlannedTask::Train(_) | PlannedTask::Evaluate(_) | PlannedTask::Detect(_) => Vec::new(),
+        }
+    }
+
+    /// The tasks whose results a task reads, by index.
+    ///
+    /// # Errors
+    /// A block that has no task.
+    pub fn dependencies(&self, task: PlannedTask) -> Result<Vec<u32>, CodecError> {
+        let index = |block| {
+            let missing = || CodecError::new(format!("a task needs block {block}, which has no task"));
+            self.index(block).ok_or_else(missing)
+        };
+        let detections = self.detections(task).into_iter().map(Ok);
+        self.inputs(task).into_iter().map(index).chain(detections).collect()
     }
 
     /// The index of a block's training task.
@@ -420,52 +381,4 @@ impl Plan {
             Mode::Tree | Mode::Whole => blocks.collect(),
         }
     }
-}
-
-/// Why a capture cannot be planned.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum PlanError {
-    /// A setting is out of range.
-    #[error("{setting}: {problem}; {advice}")]
-    Setting {
-        /// The command-line flag or name of the setting.
-        setting: &'static str,
-        /// The problem.
-        problem: String,
-        /// What to do about it.
-        advice: &'static str,
-    },
-    /// No training view remains.
-    #[error(
-        "no training view: of {views} views, {usable} have a usable camera and {test} are held out; add views or hold out fewer (--test-every)"
-    )]
-    NoTrainViews {
-        /// Number of views of the capture.
-        views: usize,
-        /// Number of views with a usable camera.
-        usable: usize,
-        /// Number of held-out views.
-        test: usize,
-    },
-    /// The capture has no sparse points.
-    #[error(
-        "the capture has no finite sparse points, which plat needs to divide and initialise the scene; run structure from motion or provide a point cloud"
-    )]
-    NoPoints,
-    /// No training view observes a sparse point.
-    #[error(
-        "no training view observes any of the {points} sparse points; check that poses and points are in the same frame and that cameras look along +z"
-    )]
-    NoObservations {
-        /// Number of finite sparse points.
-        points: usize,
-    },
-    /// The blocks are too small for the capture.
-    #[error("no block of level {levels} has {needed} views and enough sparse points; use fewer levels (--levels)")]
-    NoBlocks {
-        /// The level that was tried.
-        levels: u8,
-        /// Minimum number of views of a block.
-        needed: usize,
-    },
 }

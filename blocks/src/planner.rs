@@ -6,7 +6,8 @@ use crate::budgets::{self, BLOCK_SPLATS, DetailShares};
 use crate::evaluation::eval_tasks;
 use crate::ground::{Ground, quantile};
 use crate::layout::{Layout, level_rho_metres};
-use crate::plan::{MAX_EVALUATED_BLOCKS, MAX_LEVELS, MAX_VIEWS_PER_STEP, Mode, Plan, PlanError, PlanSettings, VERSION};
+use crate::plan::{MAX_EVALUATED_BLOCKS, MAX_LEVELS, MAX_VIEWS_PER_STEP, Mode, Plan, PlanSettings, VERSION};
+use crate::plan_error::PlanError;
 use crate::split::{Part, Split};
 use crate::visibility::{Observations, is_usable};
 
@@ -40,8 +41,8 @@ pub fn plan_at_most(
     Ok(best)
 }
 
-/// Plans the training of a capture on a backend. Held-out views ([`Split`]) are never trained on. Equal
-/// inputs give equal plans.
+/// Plans the training of a capture on a backend. Held-out views ([`Split`]) are never trained on. Zones, detector and
+/// detection tasks are for the caller to add. Equal inputs give equal plans.
 ///
 /// # Errors
 /// [`PlanError`]: a setting out of range, or a capture that cannot be trained on.
@@ -112,6 +113,7 @@ pub fn plan(
         rho_metres: (0..=levels).map(|level| level_rho_metres(finest_metres, base, level)).collect(),
         tasks,
         eval_tasks,
+        detect_tasks: Vec::new(),
     })
 }
 

@@ -12,8 +12,8 @@ use scene::{BlockId, Capture, Rect};
 
 use crate::block_box::BlockBox;
 use crate::ground::{Ground, quantile};
-use crate::plan::ViewUse;
 use crate::split::Split;
+use crate::task::ViewUse;
 use crate::visibility::{Observation, Observations, footprint_metres, is_usable, mip_for};
 
 /// A view needs at least this many observations of a block; fewer give no reliable depth and bounds.

@@ -8,13 +8,12 @@ use dataset::ingest::{IngestOptions, Ingested, downscaled, ingest};
 use dataset::mips::MIN_MIP_SIDE;
 use dataset::open::{OpenOptions, Source};
 use dataset::zones::{CocoFile, LabelMaps, OwnLabels, ZoneSource};
-use eval::{DetectorFile, PhotoOptions, Photos, load_identified_detector};
+use eval::{PhotoOptions, Photos, load_identified_detector};
 use model::Model;
-use perceive::aligned::{Aligned, Weights};
 use scene::{ArtefactId, BadInput, Camera, Capture, Pinhole, Zones};
 use store::BlockingStore;
 
-use crate::args::{AlignedOptions, DepthKind, OWN_LABELS, PlanOptions, ZoneFinder, ZoneOptions};
+use crate::args::{DepthKind, OWN_LABELS, PlanOptions, ZoneFinder};
 use crate::failure::Failure;
 use crate::observer::OutputObserver;
 use crate::output::Output;
@@ -116,25 +115,6 @@ pub(crate) fn zone_source(
         }
         (None, None) => Ok(None),
     }
-}
-
-/// The artefact of the detector whose loss is in training on this backend, if the options give it a weight.
-///
-/// # Errors
-/// A file that is no detector, a network without a gradient, or a GPU.
-pub(crate) fn aligned_network(
-    zones: &ZoneOptions,
-    aligned: &AlignedOptions,
-    backend: &str,
-) -> Result<Option<Vec<u8>>, BadInput> {
-    let Some(path) = zones.finder.zone_detector.as_ref().filter(|_| aligned.weight() > 0.0) else { return Ok(None) };
-    if !backend.starts_with("cpu-") {
-        let problem = format!("is computed on the CPU, and the job is for {backend}");
-        return Err(BadInput::new("--aligned-weight", problem, "give --backend cpu, or leave the loss out"));
-    }
-    let DetectorFile { name, onnx, card } = DetectorFile::read(path)?;
-    Aligned::new(&name, &onnx, card.as_deref(), Weights::default())?;
-    Ok(Some(dataset::networks::to_frame(&onnx, card.as_deref())))
 }
 
 /// Ingests a capture's photos into a store, with progress.

@@ -8,6 +8,7 @@
 
 use std::collections::BTreeMap;
 
+use blocks::Plan;
 use coordinator::Results;
 use proto::watch_event::Event;
 use proto::{TaskChanged, TaskState};
@@ -23,10 +24,37 @@ const MAX_TASKS_SHOWN: usize = 8;
 /// Least seconds between two redraws.
 const REDRAW_PERIOD: f64 = 0.25;
 
+/// What a job's tasks are called.
+#[derive(Debug, Default)]
+pub(crate) struct TaskNames {
+    /// Of the tasks that train, which are the first. Empty if they are not known.
+    pub(crate) blocks: Vec<BlockId>,
+    /// The first task that looks for objects; 0 if there is none.
+    pub(crate) first_detection: u32,
+}
+
+impl TaskNames {
+    /// Those of a plan.
+    pub(crate) fn of(plan: &Plan) -> Self {
+        let first_detection = if plan.detect_tasks.is_empty() { 0 } else { plan.first_detection() as u32 };
+        Self { blocks: plan.tasks.iter().map(|task| task.block).collect(), first_detection }
+    }
+
+    /// A task's block; what it does and its number if it trains none, or its number if the blocks are not known.
+    pub(crate) fn name(&self, task: u32) -> String {
+        match self.blocks.get(task as usize) {
+            Some(block) => format!("block {block}"),
+            None if self.blocks.is_empty() => format!("task {task}"),
+            None if self.first_detection > 0 && task >= self.first_detection => format!("detection task {task}"),
+            None => format!("evaluation task {task}"),
+        }
+    }
+}
+
 /// The display of one job.
 pub(crate) struct LiveStatus<'a> {
     job: u64,
-    blocks: Vec<BlockId>,
+    names: &'a TaskNames,
     /// Of running tasks, in thousandths.
     progress: BTreeMap<u32, u64>,
     states: Vec<TaskState>,
@@ -37,10 +65,10 @@ pub(crate) struct LiveStatus<'a> {
 }
 
 impl<'a> LiveStatus<'a> {
-    /// A job with these blocks. Without blocks there is no map.
-    pub(crate) fn new(job: u64, blocks: Vec<BlockId>, output: &'a Output) -> Self {
+    /// A job with these tasks. Without blocks there is no map.
+    pub(crate) fn new(job: u64, names: &'a TaskNames, output: &'a Output) -> Self {
         let (progress, screen, clock) = (BTreeMap::new(), output.screen(), Stopwatch::start());
-        Self { job, blocks, progress, states: Vec::new(), output, screen, clock, drawn: f64::NEG_INFINITY }
+        Self { job, names, progress, states: Vec::new(), output, screen, clock, drawn: f64::NEG_INFINITY }
     }
 
     /// Shows an update that `results` already contains.
@@ -64,7 +92,7 @@ impl<'a> LiveStatus<'a> {
         }
         if self.screen.is_some() && self.clock.wall_seconds() - self.drawn >= REDRAW_PERIOD {
             self.drawn = self.clock.wall_seconds();
-            let mut lines = map(&self.blocks, results.tasks(), true);
+            let mut lines = map(&self.names.blocks, results.tasks(), true);
             lines.extend(self.summary(results));
             self.screen.iter_mut().for_each(|screen| screen.draw(&lines));
         }
@@ -77,7 +105,7 @@ impl<'a> LiveStatus<'a> {
         if std::mem::replace(before, changed.state()) == changed.state() {
             return;
         }
-        let name = name_of(&self.blocks, changed.task);
+        let name = self.names.name(changed.task);
         let (done, all) = (count(results, TaskState::Done), results.tasks().len());
         match changed.state() {
             TaskState::Done => self.output.note(format!("{name} done, {done} of {all}")),
@@ -101,18 +129,9 @@ impl<'a> LiveStatus<'a> {
         let running = results.tasks().iter().filter(|task| task.state() == TaskState::Leased);
         lines.extend(running.take(MAX_TASKS_SHOWN).map(|task| {
             let percent = self.progress.get(&task.task).copied().unwrap_or(0) / 10;
-            format!("  {:<14} {percent:>3} %  {}", name_of(&self.blocks, task.task), task.worker)
+            format!("  {:<14} {percent:>3} %  {}", self.names.name(task.task), task.worker)
         }));
         lines
-    }
-}
-
-/// A task's block; its number if it evaluates, or if the blocks are not known.
-pub(crate) fn name_of(blocks: &[BlockId], task: u32) -> String {
-    match blocks.get(task as usize) {
-        Some(block) => format!("block {block}"),
-        None if blocks.is_empty() => format!("task {task}"),
-        None => format!("evaluation task {task}"),
     }
 }
 
@@ -186,6 +205,16 @@ fn painted(cell: u8, colours: bool) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn tasks_are_named_by_their_kind() {
+        let blocks = vec![BlockId::ROOT];
+        let names = TaskNames { blocks: blocks.clone(), first_detection: 3 };
+        let all: Vec<String> = (0..4).map(|task| names.name(task)).collect();
+        assert_eq!(all, ["block 0/0/0", "evaluation task 1", "evaluation task 2", "detection task 3"]);
+        assert_eq!(TaskNames { blocks, first_detection: 0 }.name(1), "evaluation task 1");
+        assert_eq!(TaskNames::default().name(3), "task 3");
+    }
 
     #[test]
     fn the_map_shows_the_deepest_block_whose_training_has_begun() {

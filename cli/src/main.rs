@@ -16,6 +16,7 @@ mod eval_results;
 mod failure;
 mod live_status;
 mod metrics_log;
+mod objects;
 mod observer;
 mod output;
 mod planning;

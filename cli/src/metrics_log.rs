@@ -1,6 +1,5 @@
 //! Writes the updates of a job to `metrics.jsonl`, shows progress, and adds up times.
 
-use std::collections::BTreeMap;
 use std::fs::File;
 use std::path::{Path, PathBuf};
 
@@ -19,7 +18,7 @@ use crate::output::Stages;
 #[derive(Debug, Clone, Default)]
 struct Spent {
     attempt: u32,
-    /// Scaled to the planned steps; a time limit may leave fewer.
+    /// Optimiser steps, scaled to the planned ones, as a time limit may leave fewer; views of other tasks.
     step: u64,
     cpu_seconds: f64,
     wall_seconds: f64,
@@ -41,8 +40,9 @@ pub(crate) struct Totals {
 pub(crate) struct MetricsLog {
     path: PathBuf,
     file: File,
-    /// Block and planned steps of each task.
+    /// Block and planned steps of each task that trains one: the first tasks.
     planned: Vec<(BlockId, u32)>,
+    /// Of all tasks.
     tasks: Vec<Spent>,
     workers: u32,
     /// Since the start of the command.
@@ -52,8 +52,10 @@ pub(crate) struct MetricsLog {
     progress: Stages,
     totals: Totals,
     done: usize,
-    /// Number of held-out views that evaluation tasks measure, and how many each task has measured.
-    views: (usize, BTreeMap<usize, u64>),
+    /// Number of held-out views that evaluation tasks measure.
+    measured_views: u64,
+    /// The first detection task, and the number of views that those tasks look at.
+    detection: (usize, u64),
     /// CPU and wall seconds when the first evaluation task began. Evaluation does not count.
     trained_at: Option<(f64, f64)>,
     failed: Option<Failure>,
@@ -72,14 +74,15 @@ impl MetricsLog {
             path: path.to_path_buf(),
             file: File::create(path).map_err(cannot("written", path))?,
             planned: plan.tasks.iter().map(|task| (task.block, task.steps)).collect(),
-            tasks: vec![Spent::default(); plan.tasks.len()],
+            tasks: vec![Spent::default(); plan.len()],
             workers,
             before: (clock.cpu_seconds(), clock.wall_seconds()),
             clock,
             progress,
             totals: Totals::default(),
             done: 0,
-            views: (plan.eval_tasks.iter().map(|task| task.views.len()).sum(), BTreeMap::new()),
+            measured_views: plan.eval_tasks.iter().map(|task| task.views.len() as u64).sum(),
+            detection: (plan.first_detection(), plan.detect_tasks.iter().map(|task| u64::from(task.count)).sum()),
             trained_at: None,
             failed: None,
         })
@@ -89,6 +92,9 @@ impl MetricsLog {
     pub(crate) fn update(&mut self, update: &Event) {
         match update {
             Event::Changed(changed) => {
+                if changed.task as usize >= self.detection.0 {
+                    return self.detection_changed(changed);
+                }
                 let Some((block, _)) = self.planned.get(changed.task as usize) else {
                     return self.evaluation_changed(changed);
                 };
@@ -125,24 +131,42 @@ impl MetricsLog {
         }
     }
 
-    /// Shows how many views are measured. Evaluation is not logged: its figures are those of the finished model.
-    fn evaluation_reported(&mut self, task: usize, report: &proto::Report) {
-        let (all, measured) = &mut self.views;
-        measured.insert(task, report.step);
-        let done: u64 = measured.values().sum();
-        self.progress.at("evaluating", done, *all as u64, "");
+    /// Detection tasks come before the blocks of their views.
+    fn detection_changed(&mut self, changed: &TaskChanged) {
+        if let TaskState::Failed | TaskState::Quarantined = changed.state() {
+            self.progress.note(format!("looking for objects failed: {}", proto::one_line(&changed.message)));
+        }
+    }
+
+    /// Takes over progress and times of a task; false if there is no such task.
+    fn spend(&mut self, task: usize, spent: Spent) -> bool {
+        let Some(before) = self.tasks.get_mut(task) else { return false };
+        if before.attempt != spent.attempt {
+            self.before.0 += before.cpu_seconds;
+            self.before.1 += before.wall_seconds;
+        }
+        *before = spent;
+        true
     }
 
     fn report(&mut self, task: usize, attempt: u32, report: &proto::Report) {
-        let Some(spent) = self.tasks.get_mut(task) else { return self.evaluation_reported(task, report) };
-        if spent.attempt != attempt {
-            self.before.0 += spent.cpu_seconds;
-            self.before.1 += spent.wall_seconds;
-        }
-        let (block, planned) = self.planned[task];
+        let &proto::Report { step, cpu_seconds, wall_seconds, .. } = report;
+        let (first_detection, looked_at) = self.detection;
+        let Some(&(block, planned)) = self.planned.get(task) else {
+            let done = |tasks: &[Spent]| tasks.iter().map(|spent| spent.step).sum();
+            if task < first_detection {
+                // Evaluation is not logged: its figures are those of the finished model.
+                self.spend(task, Spent { attempt, step, ..Spent::default() });
+                let measured = done(&self.tasks[self.planned.len()..first_detection]);
+                self.progress.at("evaluating", measured, self.measured_views, "");
+            } else if self.spend(task, Spent { attempt, step, cpu_seconds, wall_seconds }) && !self.is_training() {
+                self.progress.at("objects", done(&self.tasks[first_detection..]), looked_at, "");
+            }
+            return;
+        };
         let share = report.step as f64 / report.steps.max(1) as f64;
         let step = (share * f64::from(planned)) as u64;
-        *spent = Spent { attempt, step, cpu_seconds: report.cpu_seconds, wall_seconds: report.wall_seconds };
+        self.spend(task, Spent { attempt, step, cpu_seconds, wall_seconds });
         let (cpu_seconds, wall_seconds) = self.clocks();
         let line = ReportLine {
             task: block.to_string(),
@@ -169,9 +193,14 @@ impl MetricsLog {
         }
         let psnr = self.totals.last_psnr.map_or(String::new(), |psnr| format!(", {psnr:.2} dB"));
         let message = format!("block {}, {} splats{psnr}", line.task, report.splats);
-        let done = self.tasks.iter().map(|spent| spent.step).sum();
+        let done = self.tasks[..self.planned.len()].iter().map(|spent| spent.step).sum();
         let all = self.planned.iter().map(|(_, steps)| u64::from(*steps)).sum();
         self.progress.at("training", done, all, &message);
+    }
+
+    /// Whether a block has reported.
+    fn is_training(&self) -> bool {
+        self.tasks[..self.planned.len()].iter().any(|spent| spent.attempt > 0)
     }
 
     /// CPU and wall seconds since the start of the command.

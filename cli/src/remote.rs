@@ -15,6 +15,7 @@ use tonic::{Code, Response, Status};
 
 use crate::args::Connection;
 use crate::failure::Failure;
+use crate::live_status::TaskNames;
 use crate::output::Output;
 
 /// Largest certificate or token file, bytes.
@@ -59,12 +60,14 @@ impl Remote {
         self.runtime.block_on(shared_store(&about.store_url))
     }
 
-    /// The blocks of a job's training tasks, in the plan's order.
-    pub(crate) fn blocks(&mut self, job: u64) -> Result<Vec<BlockId>, Failure> {
+    /// What a job's tasks are called.
+    pub(crate) fn names(&mut self, job: u64) -> Result<TaskNames, Failure> {
         let reply = self.call(async |client: &mut Client| client.blocks(proto::BlocksRequest { job }).await)?;
         let columns = reply.level.into_iter().zip(reply.x).zip(reply.y);
         let blocks = columns.map(|((level, x), y)| format!("{level}/{x}/{y}").parse::<BlockId>());
-        blocks.collect::<Result<_, _>>().map_err(|error| Failure::Work(format!("the coordinator's answer: {error}")))
+        let blocks = blocks.collect::<Result<_, _>>();
+        let blocks = blocks.map_err(|error| Failure::Work(format!("the coordinator's answer: {error}")))?;
+        Ok(TaskNames { blocks, first_detection: reply.first_detection })
     }
 
     /// Follows a job of this many tasks to its end and passes on each update. If the coordinator is lost, it reconnects and receives the

@@ -71,7 +71,8 @@ fn pixels_of_zones_change_training_and_pruning_reproducibly() {
     let detector = ["--detector", "tiny.onnx", "--zone-weight", "2"];
     let (_, zones, found) = train("detected", &detector);
     let recorded = fs::read_dir(at.join("detected/store/names/zones")).map_or(0, Iterator::count);
-    assert!(!zones.is_null() && recorded == names(at).len(), "{recorded} records");
+    // Tasks of the job look for them, so the plan does not know them.
+    assert!(zones.is_null() && found != plain && recorded == names(at).len(), "{recorded} records");
     assert_eq!(
         train("detected-again", &[&detector[..], &["--store", "detected/store"]].concat()),
         (capture, zones, found)

@@ -15,20 +15,13 @@ const SECONDS_PER_EVALUATED_PIXEL: f64 = 2e-6;
 /// CPU seconds of reading a splat of the merged model on that machine.
 const SECONDS_PER_READ_SPLAT: f64 = 1e-6;
 
-/// The task graph: a task depends on the training tasks of the blocks whose results it reads.
+/// The task graph: a task depends on those whose results it reads.
 fn dag_of(plan: &Plan) -> Result<Vec<TaskNode>, CodecError> {
-    let node = |(number, task): (usize, PlannedTask)| {
-        let found = plan.inputs(task).into_iter().map(|block| {
-            let missing = || CodecError::new(format!("task {number} needs block {block}, which has no task"));
-            plan.index(block).map(TaskIndex).ok_or_else(missing)
-        });
-        Ok(TaskNode {
-            dependencies: found.collect::<Result<_, CodecError>>()?,
-            work: work_of(plan, task),
-            memory_bytes: task.memory_bytes(),
-        })
+    let node = |task: PlannedTask| {
+        let dependencies = plan.dependencies(task)?.into_iter().map(TaskIndex).collect();
+        Ok(TaskNode { dependencies, work: work_of(plan, task), memory_bytes: task.memory_bytes() })
     };
-    plan.all_tasks().enumerate().map(node).collect()
+    plan.all_tasks().map(node).collect()
 }
 
 /// The estimated CPU milliseconds of a task. Only ratios between tasks matter, as the scheduler measures the workers' speeds in the same
@@ -40,6 +33,7 @@ fn work_of(plan: &Plan, task: PlannedTask) -> u64 {
             let splats = f64::from(plan.settings.budget);
             task.pixels as f64 * SECONDS_PER_EVALUATED_PIXEL + splats * SECONDS_PER_READ_SPLAT
         }
+        PlannedTask::Detect(task) => return task.work_millis,
     };
     // `as` saturates: a plan may have any number of steps.
     (seconds * 1e3) as u64

@@ -293,6 +293,7 @@ impl Coordinator for Service {
                 level: column(|block| block.level.into()),
                 x: column(|block| block.x),
                 y: column(|block| block.y),
+                first_detection: if plan.detect_tasks.is_empty() { 0 } else { plan.first_detection() as u32 },
             })
         };
         Ok(Response::new(self.read_plan(plan, columns).await?))

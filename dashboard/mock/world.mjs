@@ -206,8 +206,8 @@ export class Sim {
     return {
       id: this.id, name: this.shape.name, plan: `${(this.shape.seed * 2654435761 >>> 0).toString(16).padStart(8, '0')}c0ffee`, state,
       phase: state === 'done' ? 'done' : share < 1 ? 'train' : 'evaluate', backend: 'auto', priority: this.priority, weight: 1,
-      blocks: n, evaluations: this.plan.evaluations, levels: this.plan.levels, counts,
-      started_unix_ms: this.started, ended_unix_ms: this.ended, steps_done: done, steps_all: all,
+      blocks: n, evaluations: this.plan.evaluations, detections: this.plan.detections, levels: this.plan.levels, counts,
+      started_unix_ms: this.started, ended_unix_ms: this.ended, steps_done: done, steps_all: all, photos_done: 0, photos_all: 0,
       splats: this.splats(), cpu_seconds: Math.round(this.cpu),
       eta_seconds: known ? [Math.round(left * 0.85), Math.round(left * 1.25)] : null,
       eta_note: known ? 'from the speed of the last 10 minutes' : state === 'running' ? 'unknown until 5 % of the steps are done' : '',
@@ -270,7 +270,7 @@ function makePlan(shape, rnd) {
   }
   return {
     plan: 'abad1dea', name: shape.name, levels: shape.levels, root: { x: -EDGE / 2, y: -EDGE / 2, edge: EDGE }, north_up: true,
-    geo: { latitude: 55.7047, longitude: 13.191 }, blocks, evaluations: shape.evaluations ?? 4, cameras, points,
+    geo: { latitude: 55.7047, longitude: 13.191 }, blocks, evaluations: shape.evaluations ?? 4, detections: 0, cameras, points,
   };
 }
 

@@ -13,18 +13,22 @@ export interface Job {
   name: string;
   plan: string;
   state: 'running' | 'paused' | 'done' | 'incomplete' | 'cancelled';
-  phase: 'train' | 'evaluate' | 'merge' | 'done';
+  phase: 'detect' | 'train' | 'evaluate' | 'merge' | 'done';
   backend: string;
   priority: number;
   weight: number;
   blocks: number;
   evaluations: number;
+  detections: number;
   levels: number;
   counts: { waiting: number; ready: number; leased: number; done: number; failed: number; quarantined: number };
   started_unix_ms: number | null;
   ended_unix_ms: number | null;
   steps_done: number;
   steps_all: number;
+  /** On how many photos objects were looked for, of how many; 0 of 0 if nobody looks for any. */
+  photos_done: number;
+  photos_all: number;
   splats: number;
   cpu_seconds: number;
   eta_seconds: null | [low: number, high: number];
@@ -113,6 +117,7 @@ export interface Plan {
   geo: null | { latitude: number; longitude: number };
   blocks: { level: number[]; x: number[]; y: number[]; steps: number[]; budget: number[]; rho_metres: number[]; views: number[] };
   evaluations: number;
+  detections: number;
   cameras: { x: number[]; y: number[]; test: number[] };
   points: { x: number[]; y: number[] };
 }
@@ -143,7 +148,7 @@ export type Band = [p10: number, p50: number, p90: number];
 export interface Task {
   task: number;
   block: string | null;
-  kind: 'train' | 'evaluate';
+  kind: 'train' | 'evaluate' | 'detect';
   state: string;
   steps: number;
   budget: number;

@@ -83,7 +83,7 @@ function Header() {
         </label>
       )}
       {now && <Phases />}
-      {now && <span><b class="num">{percent(now.steps_done, now.steps_all)}</b> <span class="muted">{eta()}</span></span>}
+      {now && <span><b class="num">{now.phase === 'detect' ? percent(now.photos_done, now.photos_all) : percent(now.steps_done, now.steps_all)}</b> <span class="muted">{eta()}</span></span>}
       <span class="push muted">
         {known > 0 && <a href={href('cluster')}><span class="num">{live} of {known}</span> workers</a>}
       </span>
@@ -103,7 +103,7 @@ function eta(): string {
 
 function Phases() {
   const now = job.value!;
-  const names = ['train', 'evaluate', 'merge', 'done'] as const;
+  const names = [...(now.detections ? ['detect'] : []), 'train', 'evaluate', 'merge', 'done'];
   const at = names.indexOf(now.phase);
   return (
     <ol class="phases" aria-label="Phases">

@@ -54,7 +54,9 @@ export class TaskTable {
 
   name(task: number): string {
     const b = this.plan.blocks;
-    return task < this.blocks ? `${b.level[task]}/${b.x[task]}/${b.y[task]}` : `evaluation ${task - this.blocks + 1}`;
+    if (task < this.blocks) return `${b.level[task]}/${b.x[task]}/${b.y[task]}`;
+    const other = task - this.blocks;
+    return other < this.plan.evaluations ? `evaluation ${other + 1}` : `detection ${other - this.plan.evaluations + 1}`;
   }
 
   /** Edge of a block of this level, in metres. */

@@ -6,6 +6,7 @@ mod detected;
 mod id_map;
 mod label_maps;
 mod own_labels;
+mod parts;
 mod photos;
 mod smoothing;
 
@@ -15,9 +16,10 @@ use scene::{ArtefactId, BadInput, Capture, Zones};
 use store::BlockingStore;
 
 pub use self::coco::CocoFile;
-use self::detected::detected;
+pub use self::detected::{check_detector, detect};
 pub use self::label_maps::LabelMaps;
 pub use self::own_labels::OwnLabels;
+pub use self::parts::{gathered, objects_from_frame, objects_to_frame};
 use self::photos::Photos;
 use crate::ingest::IngestError;
 
@@ -26,7 +28,7 @@ pub const ZONES: Kind = Kind(*b"zone", 2);
 
 /// Where zones come from.
 pub enum ZoneSource {
-    /// A detector, and the hash of its network and card.
+    /// A detector, and the artefact of its network and card.
     Detector(Box<Detector>, ArtefactId),
     /// A file of boxes and masks.
     Coco(CocoFile),
@@ -51,7 +53,15 @@ pub fn find(
     progress: &dyn Fn(usize, usize),
 ) -> Result<(Zones, ArtefactId), IngestError> {
     let zones = match from {
-        ZoneSource::Detector(detector, id) => smoothed(capture, detected(capture, detector, *id, store, progress)?),
+        ZoneSource::Detector(detector, id) => {
+            check_detector(detector)?;
+            let all = capture.views.len();
+            let goes_on = &mut |done| {
+                progress(done, all);
+                true
+            };
+            smoothed(capture, detect(&photos::reader(capture, store), 0..all, (detector, *id), store, goes_on)?)
+        }
         ZoneSource::Coco(file) => smoothed(capture, without_masked(capture, file.zones(capture)?, store)?),
         ZoneSource::LabelMaps(maps) => without_masked(capture, maps.zones(capture, progress)?, store)?,
         ZoneSource::OwnLabels(labels) => without_masked(capture, labels.zones(capture, progress)?, store)?,

@@ -48,10 +48,9 @@ impl DetectorFile {
         Ok(Self { name: path.display().to_string(), onnx, card })
     }
 
-    /// The hash of the network and its card.
-    pub fn id(&self) -> ArtefactId {
-        let card = self.card.as_deref().unwrap_or_default().as_bytes();
-        ArtefactId::of(&[&self.onnx[..], card].map(|bytes| ArtefactId::of(bytes).0).concat())
+    /// The artefact of the network and its card, as a plan names it.
+    pub fn artefact(&self) -> Vec<u8> {
+        dataset::networks::to_frame(&self.onnx, self.card.as_deref())
     }
 }
 
@@ -63,13 +62,13 @@ pub fn load_detector(path: &Path) -> Result<Detector, BadInput> {
     load_identified_detector(path).map(|(detector, _)| detector)
 }
 
-/// As [`load_detector`], with the hash of the network and its card.
+/// As [`load_detector`], with the id of its [artefact](DetectorFile::artefact).
 ///
 /// # Errors
 /// As [`load_detector`].
 pub fn load_identified_detector(path: &Path) -> Result<(Detector, ArtefactId), BadInput> {
     let file = DetectorFile::read(path)?;
-    let id = file.id();
+    let id = ArtefactId::of(&file.artefact());
     let DetectorFile { name, onnx, card } = file;
     Ok((Detector::load(&name, onnx, card.as_deref())?, id))
 }

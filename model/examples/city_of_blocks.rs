@@ -83,6 +83,7 @@ fn plan(levels: u8, sh_degree: u8, seed: u64, splats: u64) -> Plan {
         rho_metres,
         tasks,
         eval_tasks: Vec::new(),
+        detect_tasks: Vec::new(),
     }
 }
 

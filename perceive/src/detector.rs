@@ -3,7 +3,9 @@
 #[cfg(test)]
 mod expected;
 
-use rten::{Model, Value};
+use std::sync::Arc;
+
+use rten::{Model, RunOptions, ThreadPool, Value};
 use scene::BadInput;
 
 use crate::Picture;
@@ -20,7 +22,29 @@ pub struct Detector {
     file: String,
     model: Model,
     card: Card,
+    /// Bytes of the ONNX file: nearly all are weights.
+    bytes: usize,
+    /// `None`: those that all networks of the process share.
+    threads: Option<Arc<ThreadPool>>,
 }
+
+/// What running a detector on one picture takes, estimated from its size.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Cost {
+    /// CPU seconds on a core with AVX2; one with AVX-512 takes half.
+    pub cpu_seconds: f64,
+    /// Memory, bytes, with that of the network.
+    pub memory_bytes: u64,
+}
+
+/// Pixels of the input that share an evaluation of a weight, on average: a network has most weights where its maps are small.
+/// It is 290 to 300 for YOLOX nano and x and for YOLOv8n, by the multiply-adds that their authors state.
+const PIXELS_PER_USE: f64 = 300.0;
+/// CPU seconds of a multiply-add, and of all else that a picture takes (docs/decisions/0079).
+const SECONDS_PER_MULTIPLY: f64 = 0.04e-9;
+const SECONDS_PER_PICTURE: f64 = 0.03;
+/// Bytes of intermediate maps per pixel of the input.
+const BYTES_PER_PIXEL: u64 = 200;
 
 impl Detector {
     /// Loads a detector from the bytes of its ONNX file; `card` is the text of the TOML file beside it, if there is
@@ -30,9 +54,26 @@ impl Detector {
     /// Bytes that are no ONNX graph, or one that does not fit its card.
     pub fn load(file: &str, bytes: Vec<u8>, card: Option<&str>) -> Result<Self, BadInput> {
         let bad = |problem: String| BadInput::new(file, problem, ADVICE);
+        let size = bytes.len();
         let model = load(bytes).map_err(bad)?;
         let card = Card::of(&Shapes::of(&model), card).map_err(bad)?;
-        Ok(Self { file: file.to_owned(), model, card })
+        Ok(Self { file: file.to_owned(), model, card, bytes: size, threads: None })
+    }
+
+    /// The detector with this many threads of its own. Its results are the same.
+    #[must_use]
+    pub fn on_threads(self, threads: usize) -> Self {
+        Self { threads: Some(Arc::new(ThreadPool::with_num_threads(threads))), ..self }
+    }
+
+    /// What a picture takes.
+    pub fn cost(&self) -> Cost {
+        let [width, height] = self.card.input;
+        let (pixels, weights) = ((width * height) as f64, self.bytes as f64 / 4.0);
+        Cost {
+            cpu_seconds: SECONDS_PER_PICTURE + weights * pixels / PIXELS_PER_USE * SECONDS_PER_MULTIPLY,
+            memory_bytes: 3 * self.bytes as u64 + (width * height) as u64 * BYTES_PER_PIXEL,
+        }
     }
 
     /// The file that it was loaded from.
@@ -69,7 +110,8 @@ impl Detector {
         let [width, height] = self.card.input;
         let run = || {
             let input = Value::from_shape(&[1, 3, height, width], input).map_err(|error| error.to_string())?;
-            let output = self.model.run_one(input.into(), None).map_err(|error| error.to_string())?;
+            let options = RunOptions::default().with_thread_pool(self.threads.clone());
+            let output = self.model.run_one(input.into(), Some(options)).map_err(|error| error.to_string())?;
             let output = output.into_tensor::<f32>().ok_or("its output is not made of floats")?.into_data();
             let anchors: usize = self.card.grids().map(|(_, [columns, rows])| columns * rows).sum();
             let count = anchors * self.card.head.numbers(self.card.outputs.len(), self.card.bins);
@@ -192,6 +234,36 @@ mod tests {
         detector.card.strides.pop();
         let error = detector.detect(&Picture { rgb: &[9; 3], width: 1, height: 1 }, 0.3).unwrap_err().to_string();
         assert!(error.starts_with("net.onnx") && error.contains("its output has 882 numbers, not the 840"), "{error}");
+    }
+
+    #[test]
+    fn threads_change_nothing() {
+        let (rgb, height) = picture(None, 0..120).unwrap();
+        let picture = Picture { rgb: &rgb, width: 120, height };
+        for name in ["yolov8_tiny.onnx", "nanodet_tiny.onnx", YOLOX] {
+            let Some((bytes, card)) = network(name) else { continue };
+            let load = || Detector::load(name, bytes.clone(), card).unwrap();
+            let shared = load().detect(&picture, 0.05).unwrap();
+            for threads in [1, 2, 5] {
+                assert_eq!(load().on_threads(threads).detect(&picture, 0.05).unwrap(), shared, "{name}, {threads}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_larger_network_costs_more() {
+        let cost = |name: &str| network(name).map(|(bytes, card)| Detector::load(name, bytes, card).unwrap().cost());
+        let tiny = cost("yolov8_tiny.onnx").unwrap();
+        assert!((0.03..0.031).contains(&tiny.cpu_seconds) && tiny.memory_bytes < 4 << 20, "{tiny:?}");
+        let Some(yolox) = cost(YOLOX) else { return };
+        assert!((0.05..0.06).contains(&yolox.cpu_seconds) && (40 << 20..60 << 20).contains(&yolox.memory_bytes));
+    }
+
+    #[test]
+    fn a_panic_of_the_runtime_is_an_error_on_every_thread() {
+        let panics = || crate::network::without_panic(|| -> Result<(), String> { panic!("broken graph") });
+        let all: Vec<_> = (0..4).map(|_| std::thread::spawn(panics)).collect();
+        assert!(all.into_iter().all(|thread| thread.join().unwrap().unwrap_err().contains("panicked")));
     }
 
     #[test]

@@ -24,7 +24,7 @@ mod testing;
 pub use agreement::{Agreement, Counts, agreement};
 pub use boxes::{Detection, iou};
 pub use card::Card;
-pub use detector::Detector;
+pub use detector::{Cost, Detector};
 pub use masked::{box_pixels, masked_share};
 pub use precision::{Boxes, Precision, TrueBox, precision};
 

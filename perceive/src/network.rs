@@ -1,18 +1,37 @@
 //! ONNX graphs run in process by rten, whose panics on unusual graphs become errors.
 
+use std::cell::Cell;
 use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::Once;
 
 use rten::{Dimension, Model};
 
-/// Runs the inference runtime; its panics become errors.
+thread_local! {
+    /// Whether this thread runs the inference runtime.
+    static RUNS: Cell<bool> = const { Cell::new(false) };
+}
+/// Names of the runtime's own threads begin so.
+const THREADS: &str = "rten-";
+
+/// Runs the inference runtime; its panics become errors, and print nothing.
 ///
 /// # Errors
 /// Those of the work, or its panic.
 pub fn without_panic<T>(work: impl FnOnce() -> Result<T, String>) -> Result<T, String> {
-    let hook = std::panic::take_hook();
-    std::panic::set_hook(Box::new(|_| {}));
+    // Set once: workers of one process run networks at the same time, and could not put back each other's hooks.
+    static HOOK: Once = Once::new();
+    HOOK.call_once(|| {
+        let others = std::panic::take_hook();
+        std::panic::set_hook(Box::new(move |panic| {
+            let is_own = std::thread::current().name().is_some_and(|name| name.starts_with(THREADS));
+            if !is_own && !RUNS.get() {
+                others(panic);
+            }
+        }));
+    });
+    let before = RUNS.replace(true);
     let done = catch_unwind(AssertUnwindSafe(work));
-    std::panic::set_hook(hook);
+    RUNS.set(before);
     done.unwrap_or_else(|_| Err("the runtime panicked".to_owned()))
 }
 

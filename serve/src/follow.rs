@@ -7,7 +7,7 @@ use std::pin::Pin;
 use std::sync::Arc;
 use std::time::Duration;
 
-use blocks::Plan;
+use blocks::{Plan, PlannedTask};
 use dataset::ingest::load_capture;
 use proto::watch_event::Event as Update;
 use proto::{Client, LogsRequest, TaskState, WatchRequest};
@@ -193,7 +193,8 @@ async fn watch(feed: Arc<Feed>, mut client: Client, job: u64) -> u64 {
 /// Reads the figures of an evaluation task that is done.
 async fn add_figures(feed: &Arc<Feed>, job: u64, task: u32, artefact: &[u8]) {
     let project = feed.board().jobs.get(&job).map(|job| job.project.clone());
-    let Some(project) = project.filter(|project| task as usize >= project.blocks()) else { return };
+    let evaluates = |project: &Arc<Project>| matches!(project.plan.planned(task), Some(PlannedTask::Evaluate(_)));
+    let Some(project) = project.filter(evaluates) else { return };
     let Ok(artefact) = proto::artefact_id(artefact) else { return };
     let reader = project.clone();
     match tokio::task::spawn_blocking(move || reader.figures_of(artefact).map(|figures| reader.add_figures(figures)))

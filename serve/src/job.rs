@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use blocks::PlannedTask;
 use proto::{LogKind, LogLine, Outcome, Report, StatusReply, TaskChanged, TaskState};
 
 use scene::ArtefactId;
@@ -333,9 +334,16 @@ impl JobRecord {
             None if self.paused => JobState::Paused,
             None => JobState::Running,
         };
+        let detections = &self.tasks[plan.first_detection()..];
+        let photos = plan.detect_tasks.iter().map(|task| u64::from(task.count));
+        let photos_done = photos.clone().zip(detections).map(|(count, task)| count * u64::from(task.permille) / 1000);
+        let is_waiting = |task: &TaskRecord| matches!(task.state, TaskState::Waiting | TaskState::Ready);
+        let is_detecting =
+            detections.iter().any(|task| task.state != TaskState::Done) && self.tasks[..blocks].iter().all(is_waiting);
         let phase = match self.outcome {
             _ if self.merging => Phase::Merge,
             Some(_) => Phase::Done,
+            None if is_detecting => Phase::Detect,
             None if is_trained => Phase::Evaluate,
             None => Phase::Train,
         };
@@ -353,12 +361,15 @@ impl JobRecord {
             weight: self.weight,
             blocks,
             evaluations: plan.eval_tasks.len(),
+            detections: plan.detect_tasks.len(),
             levels: plan.levels + 1,
             counts,
             started_unix_ms: self.started_unix_ms,
             ended_unix_ms: self.ended_unix_ms,
             steps_done: steps_done.sum(),
             steps_all: steps.sum(),
+            photos_done: photos_done.sum(),
+            photos_all: photos.sum(),
             splats: self.splats(),
             cpu_seconds: self.cpu_seconds.unwrap_or_else(|| self.tasks.iter().map(TaskRecord::cpu_seconds).sum()),
             eta_seconds,
@@ -415,7 +426,11 @@ impl JobRecord {
         Some(views::Task {
             task,
             block: about.block.map(|block| block.to_string()),
-            kind: if about.block.is_some() { "train" } else { "evaluate" },
+            kind: match self.project.plan.planned(task) {
+                Some(PlannedTask::Evaluate(_)) => "evaluate",
+                Some(PlannedTask::Detect(_)) => "detect",
+                Some(PlannedTask::Train(_)) | None => "train",
+            },
             state: record.letter(),
             steps: about.steps,
             budget: about.budget,

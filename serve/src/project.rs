@@ -116,7 +116,7 @@ impl Project {
         }
     }
 
-    /// Number of tasks that train a block; those after them evaluate.
+    /// Number of tasks that train a block, which are the first.
     pub(crate) fn blocks(&self) -> usize {
         self.plan.tasks.len()
     }
@@ -145,8 +145,8 @@ impl Project {
                 rho_metres: task.rho_metres,
                 memory_bytes: task.memory_bytes,
             },
-            Some(PlannedTask::Evaluate(task)) => {
-                About { steps: task.views.len() as u32, memory_bytes: task.memory_bytes, ..none }
+            Some(other @ (PlannedTask::Evaluate(_) | PlannedTask::Detect(_))) => {
+                About { steps: other.steps() as u32, memory_bytes: other.memory_bytes(), ..none }
             }
             None => none,
         }
@@ -197,6 +197,7 @@ impl Project {
                 "views": column(&|task| task.views.len().into()),
             },
             "evaluations": plan.eval_tasks.len(),
+            "detections": plan.detect_tasks.len(),
             "cameras": {"x": camera_x, "y": camera_y, "test": is_test},
             "points": {"x": point_x, "y": point_y},
         })

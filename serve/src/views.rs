@@ -80,6 +80,7 @@ pub(crate) enum JobState {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub(crate) enum Phase {
+    Detect,
     Train,
     Evaluate,
     Merge,
@@ -109,12 +110,16 @@ pub(crate) struct Job {
     pub(crate) weight: u32,
     pub(crate) blocks: usize,
     pub(crate) evaluations: usize,
+    pub(crate) detections: usize,
     pub(crate) levels: u8,
     pub(crate) counts: Counts,
     pub(crate) started_unix_ms: Option<u64>,
     pub(crate) ended_unix_ms: Option<u64>,
     pub(crate) steps_done: u64,
     pub(crate) steps_all: u64,
+    /// Photos on which objects were looked for, and all of them.
+    pub(crate) photos_done: u64,
+    pub(crate) photos_all: u64,
     pub(crate) splats: u64,
     pub(crate) cpu_seconds: f64,
     pub(crate) eta_seconds: Option<[f64; 2]>,

@@ -7,10 +7,11 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
+use blocks::{DetectTask, Plan, ViewUse};
 use proto::{Access, Client, KeyPair, Token};
 use rcgen::{CertificateParams, KeyPair as Key};
 use scene::frame::encode_splats;
-use scene::{Splat, Splats};
+use scene::{ArtefactId, Rect, Splat, Splats};
 use serde_json::Value;
 use serve::{Kind, Options, Serving, Source};
 use store::Store;
@@ -40,6 +41,11 @@ fn options(files: &tempfile::TempDir) -> Options {
 }
 
 async fn setup() -> Setup {
+    let blocks = ["0/0/0", "1/0/0", "1/1/1", "1/1/0", "1/0/1"];
+    setup_of(plan_of(1, blocks.map(|block| task(block, &[])).to_vec())).await
+}
+
+async fn setup_of(plan: Plan) -> Setup {
     let folder = tempfile::tempdir().unwrap();
     let store = Store::open(&folder.path().join("store").display().to_string()).unwrap();
     std::fs::write(folder.path().join("notes.txt"), "0123456789").unwrap();
@@ -49,7 +55,6 @@ async fn setup() -> Setup {
     let hosting = coordinator::Options::new(store.clone());
     tokio::spawn(coordinator::serve(listener, hosting, stop.clone().cancelled_owned()));
     let mut client = proto::connect(&url, &Access::default()).unwrap();
-    let plan = plan_of(1, ["0/0/0", "1/0/0", "1/1/1", "1/1/0", "1/0/1"].map(|block| task(block, &[])).to_vec());
     let plan = store.put(plan.to_frame().into()).await.unwrap();
     let request = proto::SubmitRequest { plan: plan.0.to_vec(), store_url: store.url().into() };
     client.submit(request).await.unwrap();
@@ -200,6 +205,34 @@ async fn a_job_is_shown_as_it_runs_and_can_be_controlled() {
     while TcpStream::connect(at).await.is_ok() {
         tokio::time::sleep(Duration::from_millis(20)).await;
     }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_job_looks_for_objects_before_it_trains() {
+    let detect = |first| DetectTask { first, count: 2, work_millis: 1, memory_bytes: 1 };
+    let used = |view| ViewUse { view, mip: 0, window: Rect { x: 0, y: 0, width: 1, height: 1 } };
+    let mut plan = plan_of(0, vec![task("0/0/0", &[])]);
+    plan.tasks[0].views = vec![used(0), used(3)];
+    plan.settings.zone_weight = 1.0;
+    (plan.detector, plan.detect_tasks) = (Some(ArtefactId([2; 32])), vec![detect(0), detect(2)]);
+    let mut setup = setup_of(plan).await;
+    let at = setup.address;
+    let job = until(at, "/api/snapshot", |all| all["jobs"][0]["id"] == 1).await["jobs"][0].clone();
+    assert_eq!((&job["phase"], &job["blocks"], &job["detections"]), (&"detect".into(), &1.into(), &2.into()));
+    assert_eq!((&job["photos_done"], &job["photos_all"], &job["counts"]["ready"]), (&0.into(), &4.into(), &2.into()));
+    assert_eq!(json(at, "/api/jobs/1/plan").await["detections"], 2);
+    let task = json(at, "/api/jobs/1/tasks/1").await;
+    assert_eq!((&task["kind"], &task["block"], &task["steps"]), (&"detect".into(), &Value::Null, &2.into()));
+    finish_one(&mut setup).await;
+    let job = until(at, "/api/snapshot", |all| all["jobs"][0]["counts"]["done"] == 1).await["jobs"][0].clone();
+    assert_eq!((&job["phase"], &job["photos_done"], &job["model"]), (&"detect".into(), &2.into(), &false.into()));
+    finish_one(&mut setup).await;
+    until(at, "/api/jobs/1/tasks", |tasks| tasks["state"] == "rdd").await;
+    lease(&mut setup.client, "w").await;
+    let job = until(at, "/api/snapshot", |all| all["jobs"][0]["counts"]["leased"] == 1).await["jobs"][0].clone();
+    assert_eq!((&job["phase"], &job["photos_done"]), (&"train".into(), &4.into()));
+    let (status, _, page) = get(at, "/status", "").await;
+    assert!(status == 200 && String::from_utf8(page).unwrap().contains("2 of 3 done"));
 }
 
 #[tokio::test(flavor = "multi_thread")]

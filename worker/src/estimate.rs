@@ -32,6 +32,8 @@ const INHERITED_SHARE: f64 = 0.4;
 /// Splats of a child's core and halo at the end, relative to [`blocks::trained_splats`]: neighbours own parts of the halo, and growth
 /// may end early.
 const CHILD_SPLATS: f64 = 0.2;
+/// CPU seconds of a detection task on the machine of these constants, relative to that of the scheduler's unit.
+const DETECTION_COST: f64 = 0.5;
 /// Outcome over estimate on the bench's captures: smallest and largest of 16 runs (docs/decisions/0054).
 const OUTCOME_RANGE: [f64; 2] = [0.7, 1.45];
 /// Floats of a splat of SH degree 0 to 3 in a merged PLY: position, normal, colour, opacity, scale and rotation.
@@ -40,7 +42,7 @@ const PLY_FLOATS: [u64; 4] = [17, 26, 41, 62];
 /// Estimated time, memory and size of a plan.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Estimate {
-    /// CPU seconds of all training tasks on the CPU backend.
+    /// CPU seconds of all tasks that train a block or look for objects, on the CPU backend.
     pub cpu_seconds: f64,
     /// Within which the outcomes of the bench's captures lay: a plan does not know how much splats overlap, nor how detailed the
     /// photos are.
@@ -59,7 +61,9 @@ impl Estimate {
         let parents: BTreeSet<BlockId> = plan.tasks.iter().filter_map(|task| task.parent).collect();
         let leaf = |task: &&Task| !parents.contains(&task.block);
         let splats: u64 = plan.tasks.iter().filter(leaf).map(|task| u64::from(task.budget)).sum();
-        let cpu_seconds: f64 = plan.tasks.iter().map(|task| cpu_seconds(plan, task)).sum();
+        let training: f64 = plan.tasks.iter().map(|task| cpu_seconds(plan, task)).sum();
+        let detecting = plan.detect_tasks.iter().map(|task| task.work_millis).sum::<u64>() as f64 * 1e-3;
+        let cpu_seconds = training + DETECTION_COST * detecting;
         let cpu_seconds = cpu_seconds / relative_speed;
         Self {
             cpu_seconds,

@@ -1,7 +1,9 @@
-//! Carries out a task of a plan: trains a block, or measures the merged model.
+//! Carries out a task of a plan: looks for objects on photos, trains a block, or measures the merged model.
 //!
 //! ```text
-//! train:    plan, capture, results of parent and context ──from the store──▶ initial splats and frozen context
+//! detect:   plan, capture, detector ──from the store──▶ network
+//!             ──run on some photos──▶ objects on each ──to the store──▶ artefact
+//! train:    plan, capture, results of parent and context, objects ──from the store──▶ initial splats and frozen context
 //!             ──train──▶ splats of the block, halo included ──to the store──▶ artefact
 //! evaluate: plan, capture, results of all blocks ──from the store──▶ merged model
 //!             ──render held-out views──▶ figures of each view ──to the store──▶ artefact
@@ -9,27 +11,29 @@
 //! The result is a function of the plan and its inputs, so an attempt on any worker gives the same bytes.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 use std::sync::atomic::Ordering;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use blocks::{CONCURRENT_FETCHES, EvalTask, Plan, PlannedTask, Task};
-use bytes::Bytes;
-use dataset::byte_lru::ByteLru;
+use blocks::{DetectTask, EvalTask, Plan, PlannedTask, Task};
+use dataset::ingest::IngestError;
 use dataset::windows::{SharedTileCache, WindowReader};
+use perceive::Detector;
 use scene::frame::{self, TrainingInfo};
-use scene::{ArtefactId, BlockId, Capture, Exposures, Poses, Splats, Zones};
+use scene::{ArtefactId, BlockId, Capture, Exposures, Poses, Splats};
 use store::BlockingStore;
 use train::Backend;
 
 use crate::aligned::AlignedLoss;
 use crate::block::Block;
 use crate::clock::Stopwatch;
+use crate::detect::{Detection, detect, of_network};
 use crate::evaluate::{Evaluation, evaluate};
+use crate::inputs::{Inputs, KeptResults};
+use crate::latest::Latest;
 use crate::memory_budget::memory_budget;
 use crate::merged_eval::{MergedEvaluator, evaluates_after};
-use crate::recompute::recompute;
 use crate::result_cache::ResultCache;
-use crate::task::{Execute, ExecuteError, Flow, Report, TaskOrder};
+use crate::task::{Execute, ExecuteError, Flow, Report, Reporter, TaskOrder};
 use crate::train_block::TrainedBlock;
 use crate::trainer_context::{Shared, TrainerContext, TrainerOptions};
 
@@ -40,18 +44,15 @@ const REMOTE_CACHE_FRACTION: usize = 4;
 pub struct PlanExecutor {
     pub(crate) context: TrainerContext,
     pool: rayon::ThreadPool,
-    /// The plan of the last task. A city's plan has megabytes, and most consecutive tasks are of the same job.
-    plan: Mutex<Option<(ArtefactId, Arc<Plan>)>>,
-    /// The capture of the last task.
-    capture: Mutex<Option<CachedCapture>>,
-    /// Encoded results, with a remote store only: consecutive blocks share most neighbours, and all share the root.
-    results: Mutex<ByteLru<ArtefactId, Bytes>>,
+    plan: Latest<Arc<Plan>>,
+    /// The capture, and the tiles that its readers share.
+    capture: Latest<(Arc<Capture>, Arc<SharedTileCache>)>,
+    detector: Latest<Arc<Detector>>,
+    /// Keeps results with a remote store only: consecutive blocks share most neighbours, and all share the root.
+    results: KeptResults,
     /// Capacity for results, and as much again for tiles: bytes.
     remote_bytes: usize,
 }
-
-/// A capture and the tiles that its readers share.
-type CachedCapture = (ArtefactId, Arc<Capture>, Arc<SharedTileCache>);
 
 impl PlanExecutor {
     /// An executor over this store.
@@ -70,10 +71,10 @@ impl PlanExecutor {
             .map_err(|error| format!("cannot start {} threads: {error}", options.threads))?;
         let is_local = !store.store().is_remote();
         let remote_bytes = if is_local { 0 } else { options.cache_bytes / REMOTE_CACHE_FRACTION };
-        let results = Mutex::new(ByteLru::new(remote_bytes));
-        let (plan, capture) = (Mutex::default(), Mutex::default());
+        let results = KeptResults::new(remote_bytes);
+        let (plan, capture, detector) = (Latest::default(), Latest::default(), Latest::default());
         let context = TrainerContext { store, options, shared, backend };
-        Ok(Self { context, pool, plan, capture, results, remote_bytes })
+        Ok(Self { context, pool, plan, capture, detector, results, remote_bytes })
     }
 
     /// Runs `work` on the executor's threads.
@@ -106,6 +107,7 @@ impl Execute for PlanExecutor {
         match task {
             PlannedTask::Train(task) => self.train(&job, task, &mut stopwatch, report),
             PlannedTask::Evaluate(task) => self.evaluate(&job, task, &stopwatch, report),
+            PlannedTask::Detect(task) => self.detect(&job, task, &stopwatch, report),
         }
     }
 }
@@ -129,12 +131,6 @@ impl Assignment<'_> {
     }
 }
 
-/// The objects on the photos, if they count more than their surroundings.
-fn zones(plan: &Plan, capture: &Capture, store: &BlockingStore) -> Result<Option<Arc<Zones>>, ExecuteError> {
-    let id = plan.zones.filter(|_| plan.settings.zone_weight > 0.0);
-    Ok(id.map(|id| dataset::zones::load(store, id, capture).map(Arc::new)).transpose()?)
-}
-
 impl PlanExecutor {
     /// Trains a block; the artefact is its splats.
     fn train(
@@ -142,19 +138,19 @@ impl PlanExecutor {
         job: &Assignment,
         task: &Task,
         stopwatch: &mut Stopwatch,
-        report: &mut (dyn FnMut(Report) -> Flow + Send),
+        report: &mut Reporter,
     ) -> Result<ArtefactId, ExecuteError> {
         let &Assignment { order, plan, capture, cache, .. } = job;
         let TrainerContext { store, shared, options, .. } = &self.context;
         let fetching = job.fetch_span.enter();
         let reader = job.reader(store, options.cache_bytes - 2 * self.remote_bytes);
-        let reader = match zones(plan, capture, store)? {
+        let reader = match self.inputs(job).zones(task, capture, report)? {
             Some(zones) => reader.with_zones(zones, plan.settings.zone_weight as f32),
             None => reader,
         };
         let reader = if plan.settings.depth_weight > 0.0 { reader.with_depth() } else { reader };
         let (mut results, mut given) = (BTreeMap::new(), TrainingInfo::default());
-        self.for_each_input(plan, PlannedTask::Train(task), order, report, |block, splats, training| {
+        self.inputs(job).blocks(PlannedTask::Train(task), report, |block, splats, training| {
             results.insert(block, splats);
             given = if Some(block) == task.parent { training } else { given };
         })?;
@@ -205,42 +201,85 @@ impl PlanExecutor {
         Ok(artefact)
     }
 
+    /// Looks for objects on some photos; the artefact is what was found.
+    fn detect(
+        &self,
+        job: &Assignment,
+        task: &DetectTask,
+        stopwatch: &Stopwatch,
+        report: &mut Reporter,
+    ) -> Result<ArtefactId, ExecuteError> {
+        let TrainerContext { store, shared, options, .. } = &self.context;
+        let is_sound = |bytes: &[u8]| dataset::zones::objects_from_frame(bytes).is_ok();
+        self.kept_or(job, is_sound, || {
+            let id = job.plan.detector.ok_or_else(|| ExecuteError::work("the plan names no detector"))?;
+            let detector = job.fetch_span.in_scope(|| self.detector(id))?;
+            // Each photo is read once.
+            let reader = job.reader(store, 0);
+            let detection = Detection { task, detector: &detector, id, reader: &reader, store };
+            let span = tracing::info_span!("detect", views = task.count);
+            let found = span.in_scope(|| detect(&detection, memory_budget(options.memory_bytes), stopwatch, report));
+            shared.metrics.count_reads(reader.stats());
+            Ok(dataset::zones::objects_to_frame(&found?))
+        })
+    }
+
     /// Measures the merged model on some held-out views; the artefact is their figures.
     fn evaluate(
         &self,
         job: &Assignment,
         task: &EvalTask,
         stopwatch: &Stopwatch,
-        report: &mut (dyn FnMut(Report) -> Flow + Send),
+        report: &mut Reporter,
     ) -> Result<ArtefactId, ExecuteError> {
-        let &Assignment { order, plan, cache, .. } = job;
+        let plan = job.plan;
         let TrainerContext { store, shared, backend, options } = &self.context;
-        // Each photo is read once.
-        let reader = job.reader(store, 0);
-        let decode = |bytes: &[u8]| eval::figures_from_frame(bytes).ok();
-        if let Some((artefact, _)) = cache.and_then(|cache| cache.result(store, decode)) {
+        let is_sound = |bytes: &[u8]| eval::figures_from_frame(bytes).is_ok();
+        self.kept_or(job, is_sound, || {
+            // Each photo is read once.
+            let reader = job.reader(store, 0);
+            let (mut parts, leaves) = (Vec::new(), plan.leaves());
+            job.fetch_span.in_scope(|| {
+                self.inputs(job).blocks(PlannedTask::Evaluate(task), report, |block, splats, _| {
+                    parts.push((block, leaves.keep(&splats, &plan.ground, block)));
+                })
+            })?;
+            let span = tracing::info_span!("evaluate", views = task.views.len());
+            let figures = self.pool.install(|| {
+                span.in_scope(|| {
+                    let model = blocks::merge(parts);
+                    let evaluation = Evaluation { plan, task, model: &model, reader: &reader, backend };
+                    evaluate(&evaluation, memory_budget(options.memory_bytes), stopwatch, report)
+                })
+            });
+            shared.metrics.count_reads(reader.stats());
+            Ok(eval::figures_to_frame(&figures?))
+        })
+    }
+
+    /// The results of other tasks.
+    fn inputs<'a>(&'a self, job: &Assignment<'a>) -> Inputs<'a> {
+        let &Assignment { order, plan, .. } = job;
+        Inputs { executor: self, store: &self.context.store, kept: &self.results, plan, order }
+    }
+
+    /// The result that an earlier attempt left, if it is sound; else the computed one, which is kept.
+    fn kept_or(
+        &self,
+        job: &Assignment,
+        is_sound: impl FnOnce(&[u8]) -> bool,
+        compute: impl FnOnce() -> Result<Vec<u8>, ExecuteError>,
+    ) -> Result<ArtefactId, ExecuteError> {
+        let TrainerContext { store, shared, .. } = &self.context;
+        let decode = |bytes: &[u8]| is_sound(bytes).then_some(());
+        if let Some((artefact, ())) = job.cache.and_then(|cache| cache.result(store, decode)) {
             shared.resumed.fetch_add(1, Ordering::Relaxed);
             return Ok(artefact);
         }
-        let (mut parts, leaves) = (Vec::new(), plan.leaves());
-        job.fetch_span.in_scope(|| {
-            self.for_each_input(plan, PlannedTask::Evaluate(task), order, report, |block, splats, _| {
-                parts.push((block, leaves.keep(&splats, &plan.ground, block)));
-            })
-        })?;
-        let span = tracing::info_span!("evaluate", views = task.views.len());
-        let figures = self.pool.install(|| {
-            span.in_scope(|| {
-                let model = blocks::merge(parts);
-                let evaluation = Evaluation { plan, task, model: &model, reader: &reader, backend };
-                evaluate(&evaluation, memory_budget(options.memory_bytes), stopwatch, report)
-            })
-        });
-        shared.metrics.count_reads(reader.stats());
-        let figures = figures?;
+        let result = compute()?;
         let _keep_span = tracing::info_span!("keep").entered();
-        let artefact = store.put(eval::figures_to_frame(&figures))?;
-        if let Some(cache) = cache {
+        let artefact = store.put(result)?;
+        if let Some(cache) = job.cache {
             cache.put_result(store, artefact);
         }
         Ok(artefact)
@@ -297,80 +336,25 @@ impl PlanExecutor {
     }
 
     fn plan(&self, id: ArtefactId) -> Result<Arc<Plan>, ExecuteError> {
-        let mut cached = self.plan.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some((of, plan)) = &*cached
-            && *of == id
-        {
-            return Ok(plan.clone());
-        }
-        // Dropped first, so that two plans are never in memory together.
-        *cached = None;
-        let plan = Arc::new(Plan::from_frame(&self.context.store.get(id)?).map_err(ExecuteError::work)?);
-        *cached = Some((id, plan.clone()));
-        Ok(plan)
+        let load = || Plan::from_frame(&self.context.store.get(id)?).map_err(ExecuteError::work);
+        self.plan.get(id, || load().map(Arc::new))
     }
 
     fn capture(&self, id: ArtefactId) -> Result<(Arc<Capture>, Arc<SharedTileCache>), ExecuteError> {
-        let mut cached = self.capture.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some((of, capture, tiles)) = &*cached
-            && *of == id
-        {
-            return Ok((capture.clone(), tiles.clone()));
-        }
-        // Dropped first, so that two captures are never in memory together.
-        *cached = None;
-        let capture = dataset::ingest::load_capture(&self.context.store, id)?;
-        let (capture, tiles) = (Arc::new(capture), Arc::new(SharedTileCache::new(self.remote_bytes)));
-        *cached = Some((id, capture.clone(), tiles.clone()));
-        Ok((capture, tiles))
+        self.capture.get(id, || {
+            let capture = dataset::ingest::load_capture(&self.context.store, id)?;
+            Ok((Arc::new(capture), Arc::new(SharedTileCache::new(self.remote_bytes))))
+        })
     }
 
-    fn cached_results(&self) -> MutexGuard<'_, ByteLru<ArtefactId, Bytes>> {
-        self.results.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
-    /// Fetches the results that a task reads, in the order of their blocks, and hands them to `take` one by one.
-    fn for_each_input(
-        &self,
-        plan: &Plan,
-        task: PlannedTask,
-        order: &TaskOrder,
-        report: &mut (dyn FnMut(Report) -> Flow + Send),
-        mut take: impl FnMut(BlockId, Splats, TrainingInfo),
-    ) -> Result<(), ExecuteError> {
-        let wanted = plan.inputs(task).into_iter().map(|block| {
-            let known = plan.index(block).and_then(|index| order.inputs.get_key_value(&index));
-            known
-                .map(|(&index, &id)| (block, index, id))
-                .ok_or_else(|| ExecuteError::work(format!("the grant does not name the result of block {block}")))
-        });
-        let wanted: Vec<_> = wanted.collect::<Result<_, _>>()?;
-        for some in wanted.chunks(CONCURRENT_FETCHES) {
-            let mut found: Vec<Option<Bytes>> =
-                some.iter().map(|(.., id)| self.cached_results().get(id).cloned()).collect();
-            let missing: Vec<usize> = (0..some.len()).filter(|&i| found[i].is_none()).collect();
-            let ids: Vec<ArtefactId> = missing.iter().map(|&i| some[i].2).collect();
-            for (i, bytes) in missing.into_iter().zip(self.context.store.get_all_or_discard(&ids)?) {
-                bytes
-                    .iter()
-                    .for_each(|bytes| self.cached_results().insert_if_absent(some[i].2, bytes.clone(), bytes.len()));
-                found[i] = bytes;
-            }
-            for (&(block, index, id), found) in some.iter().zip(found) {
-                let bytes = match found {
-                    Some(bytes) => bytes,
-                    None => recompute(self, &self.context.store, plan, order, (index, id), report)?,
-                };
-                let (splats, training) = frame::decode_result(&bytes).map_err(ExecuteError::work)?;
-                take(block, splats, training);
-            }
-            // A training task reads a few blocks, an evaluation all of them.
-            if let PlannedTask::Evaluate(_) = task
-                && report(Report { steps: task.steps(), loss: f64::NAN, ..Report::default() }) == Flow::Stop
-            {
-                return Err(ExecuteError::work("stopped while reading the model, as requested"));
-            }
-        }
-        Ok(())
+    fn detector(&self, id: ArtefactId) -> Result<Arc<Detector>, ExecuteError> {
+        self.detector.get(id, || {
+            let loaded = dataset::networks::load_detector(&self.context.store, id);
+            let detector = loaded.map_err(|error| match error {
+                IngestError::BadInput(error) => of_network(error),
+                error @ IngestError::Store(_) => error.into(),
+            })?;
+            Ok(Arc::new(detector.on_threads(self.context.options.threads.max(1))))
+        })
     }
 }

@@ -48,7 +48,8 @@ fn result_of(
 ) -> Result<ArtefactId, ExecuteError> {
     let known = |task: &u32| order.inputs.get(task).copied();
     let mut inputs = BTreeMap::new();
-    for dependency in dependencies(plan, task) {
+    let needed = plan.planned(task).map(|task| plan.dependencies(task)).transpose().map_err(ExecuteError::work)?;
+    for dependency in needed.unwrap_or_default() {
         let id = match known(&dependency) {
             Some(id) => id,
             None => result_of(executor, plan, order, dependency, report)?,
@@ -63,10 +64,4 @@ fn result_of(
         }
         recomputed => recomputed,
     }
-}
-
-/// The tasks whose results a task takes as inputs.
-fn dependencies(plan: &Plan, task: u32) -> Vec<u32> {
-    let Some(task) = plan.planned(task) else { return Vec::new() };
-    plan.inputs(task).into_iter().filter_map(|block| plan.index(block)).collect()
 }

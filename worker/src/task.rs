@@ -30,7 +30,7 @@ pub struct TaskOrder {
 /// Progress of a task: one line of metrics.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Report {
-    /// Optimiser steps done; of an evaluation, views.
+    /// Optimiser steps done; views of an evaluation or a detection.
     pub step: u64,
     /// Optimiser steps or views in all.
     pub steps: u64,
@@ -67,6 +67,9 @@ pub enum Flow {
     /// The attempt is void or the worker shuts down: return soon, with any error unless the task is finished anyway.
     Stop,
 }
+
+/// How a task reports.
+pub(crate) type Reporter<'a> = dyn FnMut(Report) -> Flow + Send + 'a;
 
 /// Why a task has no result.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]

@@ -42,5 +42,6 @@ pub(crate) fn plan_of(mode: Mode, tasks: Vec<Task>) -> Plan {
         rho_metres: vec![2.0, 1.0],
         tasks,
         eval_tasks: Vec::new(),
+        detect_tasks: Vec::new(),
     }
 }

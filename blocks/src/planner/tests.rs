@@ -8,8 +8,10 @@ use scene::{BlockId, Camera};
 use super::*;
 use crate::budgets::COSTED_SPLATS;
 use crate::cost::epoch_cost;
+use crate::detection::{DetectorCost, detect_tasks};
 use crate::lint::{Severity, lint};
-use crate::plan::{PlannedTask, Task};
+use crate::plan::PlannedTask;
+use crate::task::Task;
 use crate::testing::{aerial, capture, look_at, noise, street};
 
 fn settings(mode: Mode, levels: Option<u8>) -> PlanSettings {
@@ -44,11 +46,48 @@ fn evaluation_tasks_come_after_training_and_read_all_blocks() {
             PlannedTask::Evaluate(_) => {
                 assert_eq!(inputs.into_iter().collect::<BTreeSet<u32>>(), (0..training).collect());
             }
+            PlannedTask::Detect(_) => unreachable!("no one looks for objects"),
         }
     }
     let none = PlanSettings { test_every: 0, ..settings };
     let error = plan(&capture, ArtefactId::of(b"capture"), &none, "cpu").unwrap_err();
     assert!(error.to_string().contains("--evaluate"), "{error}");
+}
+
+#[test]
+fn blocks_depend_on_the_detection_of_their_views() {
+    let capture = aerial(8, 300.0, 8000);
+    let settings = PlanSettings { evaluate: true, zone_weight: 4.0, ..settings(Mode::Tree, Some(1)) };
+    let planned = plan(&capture, ArtefactId::of(b"capture"), &settings, "cpu").unwrap();
+    let cost = DetectorCost { cpu_seconds: 1.0, memory_bytes: 1 };
+    let detect_tasks = detect_tasks(&capture, cost);
+    let plan = Plan { detector: Some(ArtefactId::of(b"network")), detect_tasks, ..planned };
+    assert!(plan.detect_tasks.len() > 3 && lint(&plan, &capture).is_empty());
+    assert_eq!(Plan::from_frame(&plan.to_frame()).unwrap(), plan);
+    let (training, first, all) = (plan.tasks.len() as u32, plan.first_detection() as u32, plan.len() as u32);
+    assert!(plan.all_tasks().eq((0..all).filter_map(|index| plan.planned(index))) && plan.planned(all).is_none());
+    for (index, task) in (0..).zip(plan.all_tasks()) {
+        let (needed, detections) = (plan.dependencies(task).unwrap(), plan.detections(task));
+        match task {
+            PlannedTask::Train(task) => {
+                assert!(needed.iter().all(|&other| other < index || other >= first));
+                let seen = |view: u32| {
+                    detections.iter().any(|&of| match plan.planned(of) {
+                        Some(PlannedTask::Detect(of)) => of.views().contains(&view),
+                        _ => false,
+                    })
+                };
+                let last = capture.views.len() as u32 - 1;
+                let near = |view: u32| [view.saturating_sub(1), view, (view + 1).min(last)];
+                assert!(task.views.iter().flat_map(|used| near(used.view)).all(seen));
+            }
+            PlannedTask::Evaluate(_) => assert!(needed == (0..training).collect::<Vec<_>>() && detections.is_empty()),
+            PlannedTask::Detect(_) => assert!(needed.is_empty()),
+        }
+    }
+    // Where zones have no weight, nobody waits for them.
+    let plain = Plan { settings: PlanSettings { zone_weight: 0.0, ..plan.settings.clone() }, ..plan.clone() };
+    assert!(plain.all_tasks().all(|task| plain.detections(task).is_empty()));
 }
 
 #[test]

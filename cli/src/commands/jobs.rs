@@ -6,7 +6,7 @@ use serde::Serialize;
 
 use crate::args::{Connection, JobArgs, JobsArgs, LogsArgs, RetryArgs, StatusArgs, TaskName};
 use crate::failure::Failure;
-use crate::live_status::{LiveStatus, map, name_of};
+use crate::live_status::{LiveStatus, TaskNames, map};
 use crate::output::{Output, print};
 use crate::remote::{Remote, result_of};
 
@@ -105,23 +105,23 @@ pub(crate) fn status(args: &StatusArgs, output: &Output) -> Result<(), Failure> 
     let mut remote = Remote::open(&args.connection)?;
     let mut reply = status_of(&mut remote, args.job)?;
     // If the plan cannot be read from the store, only the map is missing.
-    let blocks = remote.blocks(args.job).unwrap_or_default();
+    let names = remote.names(args.job).unwrap_or_default();
     let mut ended = Ok(());
     let mut drawing = String::new();
     if args.watch {
-        let mut live = LiveStatus::new(args.job, blocks.clone(), output);
+        let mut live = LiveStatus::new(args.job, &names, output);
         let tasks = Job::of(&reply).tasks;
         let followed = remote.follow(args.job, tasks, output, |results, update| live.update(results, update))?;
         if let Some((outcome, results)) = followed {
             ended = result_of(args.job, outcome, &results);
-            drawing = map(&blocks, results.tasks(), false).join("\n") + "\n";
+            drawing = map(&names.blocks, results.tasks(), false).join("\n") + "\n";
         }
         reply = status_of(&mut remote, args.job)?;
     }
     let tasks = |tasks: &[proto::TaskChanged]| -> Vec<Task> {
         let task = |of: &proto::TaskChanged| Task {
             task: of.task,
-            block: blocks.get(of.task as usize).map(ToString::to_string),
+            block: names.blocks.get(of.task as usize).map(ToString::to_string),
             attempt: of.attempt,
             worker: of.worker.clone(),
             message: of.message.clone(),
@@ -136,10 +136,10 @@ pub(crate) fn status(args: &StatusArgs, output: &Output) -> Result<(), Failure> 
     };
     let mut text = format!("{drawing}{}\n", status.job.line());
     for of in &reply.running {
-        text += &format!("  {} with {}, attempt {}\n", name_of(&blocks, of.task), of.worker, of.attempt);
+        text += &format!("  {} with {}, attempt {}\n", names.name(of.task), of.worker, of.attempt);
     }
     for of in &reply.failures {
-        text += &format!("  {} failed: {}\n", name_of(&blocks, of.task), proto::one_line(&of.message));
+        text += &format!("  {} failed: {}\n", names.name(of.task), proto::one_line(&of.message));
     }
     output.result(&status, &text)?;
     ended
@@ -182,8 +182,8 @@ pub(crate) fn retry(args: &RetryArgs, output: &Output) -> Result<(), Failure> {
     let task = match args.task {
         TaskName::Number(task) => task,
         TaskName::Block(block) => {
-            let blocks = Remote::open(&args.connection)?.blocks(args.job)?;
-            let found = blocks.iter().position(|of| *of == block);
+            let names = Remote::open(&args.connection)?.names(args.job)?;
+            let found = names.blocks.iter().position(|of| *of == block);
             let missing =
                 || Failure::Input(format!("{}: is not in job {}; plat status lists its tasks", args.task, args.job));
             u32::try_from(found.ok_or_else(missing)?).unwrap_or(u32::MAX)
@@ -240,7 +240,7 @@ pub(crate) fn logs(args: &LogsArgs, output: &Output) -> Result<(), Failure> {
     }
     let mut remote = Remote::open(&args.connection)?;
     let job = args.job;
-    let blocks = remote.blocks(job).unwrap_or_default();
+    let names = remote.names(job).unwrap_or_default();
     let (mut lines, mut after) = (Vec::new(), 0);
     loop {
         // Queried before the page, so that the log of a job that has ended is read to its end.
@@ -255,7 +255,7 @@ pub(crate) fn logs(args: &LogsArgs, output: &Output) -> Result<(), Failure> {
         };
         after = last.number;
         for line in page {
-            let block = line.task.and_then(|task| blocks.get(task as usize)).map(ToString::to_string);
+            let block = line.task.and_then(|task| names.blocks.get(task as usize)).map(ToString::to_string);
             let line = LogLine {
                 seconds_ago: line.millis_ago as f64 * 1e-3,
                 task: line.task,
@@ -267,7 +267,7 @@ pub(crate) fn logs(args: &LogsArgs, output: &Output) -> Result<(), Failure> {
             if output.is_json() {
                 lines.push(line);
             } else {
-                print(&describe(&line, &blocks))?;
+                print(&describe(&line, &names))?;
             }
         }
     }
@@ -275,11 +275,11 @@ pub(crate) fn logs(args: &LogsArgs, output: &Output) -> Result<(), Failure> {
 }
 
 /// A log line as text: age, message, worker.
-fn describe(line: &LogLine, blocks: &[scene::BlockId]) -> String {
+fn describe(line: &LogLine, names: &TaskNames) -> String {
     let seconds = line.seconds_ago as u64;
     let mut text = format!("-{:02}:{:02}:{:02}  ", seconds / 3600, seconds / 60 % 60, seconds % 60);
     if let Some(task) = line.task {
-        text += &name_of(blocks, task);
+        text += &names.name(task);
         line.attempt.iter().for_each(|attempt| text += &format!(", attempt {attempt}"));
         text += ": ";
     }

@@ -5,7 +5,7 @@
 
 use std::path::Path;
 
-use blocks::{Plan, PlanSettings};
+use blocks::Plan;
 use coordinator::Results;
 use dataset::ingest::Ingested;
 use model::save_json;
@@ -17,11 +17,12 @@ use telemetry::traced;
 use tracing::field::Empty;
 
 use crate::args::{Backend, SubmitArgs};
-use crate::captures::{self, aligned_network, find_zones, ingest_photos, zone_source};
+use crate::captures::{self, ingest_photos};
 use crate::clock::Stopwatch;
 use crate::eval_results;
 use crate::failure::{Failure, make_folder};
-use crate::live_status::LiveStatus;
+use crate::live_status::{LiveStatus, TaskNames};
+use crate::objects::{Objects, note_found};
 use crate::output::Output;
 use crate::planning::{check_plan, plan_of};
 use crate::remote::{Remote, result_of};
@@ -52,23 +53,18 @@ pub(crate) fn run(args: &SubmitArgs, output: &Output) -> Result<(), Failure> {
     let source = captures::open_to_plan(&args.capture, &args.plan, output)?;
     // Plan and coordinator are checked before any photo is read.
     let (planned_for, plan) = plan_of(&source, &args.plan)?;
-    let zones = zone_source(&args.zones.finder, &args.capture, &source)?;
     let mut remote = Remote::open(&args.connection)?;
     let about = remote.call(async |client: &mut Client| client.about(proto::AboutRequest {}).await)?;
     let backend = backend_of(args, &about, output)?;
-    let plan = Plan { backend: backend.clone(), ..plan };
-    let network = aligned_network(&args.zones, &args.aligned, &plan.backend)?;
+    let objects = Objects::of((&args.zones, &args.aligned), (&args.capture, &source), &backend)?;
+    let plan = objects.add_to(Plan { backend: backend.clone(), ..plan }, &planned_for);
     check_plan(&plan, &planned_for, output)?;
     if let Some(out) = &args.out {
         make_folder(out)?;
     }
     let store = remote.store(&about)?;
     let Ingested { capture, id, .. } = ingest_photos(&source, &store.blocking(), args.plan.downscale, output)?;
-    let zones = zones.map(|from| find_zones(&capture, &from, &store.blocking(), output)).transpose()?;
-    let detector = network.map(|network| store.blocking().put(network)).transpose()?;
-    let (zone_weight, aligned_weight) = (args.zones.weight(), args.aligned.weight());
-    let settings = PlanSettings { zone_weight, aligned_weight, ..plan.settings };
-    let plan = Plan { capture: id, zones: zones.map(|(_, id)| id), detector, settings, ..plan };
+    let plan = objects.put(Plan { capture: id, ..plan }, &capture, &store.blocking(), output)?;
     let plan_id = store.blocking().put(plan.to_frame())?;
     let request = proto::SubmitRequest { plan: plan_id.0.to_vec(), store_url: store.url().into() };
     let job = remote.call(async |client: &mut Client| client.submit(traced(request)).await)?;
@@ -90,8 +86,8 @@ pub(crate) fn run(args: &SubmitArgs, output: &Output) -> Result<(), Failure> {
     let mut text = format!("job {} of {} tasks; plat status {} shows its progress", job.job, job.tasks, job.job);
     if args.wait {
         output.note(format!("job {} of {} tasks", job.job, job.tasks));
-        let blocks = plan.tasks.iter().map(|task| task.block).collect();
-        let mut live = LiveStatus::new(job.job, blocks, output);
+        let names = TaskNames::of(&plan);
+        let mut live = LiveStatus::new(job.job, &names, output);
         let followed = remote.follow(job.job, job.tasks, output, |results, update| live.update(results, update))?;
         let Some((outcome, results)) = followed else {
             let advice = format!("plat status {0} --watch follows it, plat cancel {0} ends it", job.job);
@@ -102,7 +98,7 @@ pub(crate) fn run(args: &SubmitArgs, output: &Output) -> Result<(), Failure> {
         match &args.out {
             None => result_of(job.job, outcome, &results)?,
             Some(out) => {
-                let finished = Finished { args, plan: &plan, store: &store.blocking(), capture: &capture };
+                let finished = Finished { args, plan: &plan, store: &store.blocking(), capture: &capture, output };
                 text = finished.write(out, (outcome, &results), &mut submitted)?;
             }
         }
@@ -120,6 +116,7 @@ struct Finished<'a> {
     plan: &'a Plan,
     store: &'a BlockingStore,
     capture: &'a Capture,
+    output: &'a Output,
 }
 
 impl Finished<'_> {
@@ -131,7 +128,7 @@ impl Finished<'_> {
         (outcome, results): (Outcome, &Results),
         submitted: &mut Submitted,
     ) -> Result<String, Failure> {
-        let Self { args, plan, store, capture } = *self;
+        let Self { args, plan, store, capture, output } = *self;
         let trained = results.first(plan.tasks.len()).filter(|_| outcome == Outcome::Incomplete);
         let (results, failed) = match (result_of(submitted.job, outcome, results), trained) {
             (Ok(()), _) => (results.all()?, None),
@@ -139,6 +136,9 @@ impl Finished<'_> {
             (Err(failure), None) => return Err(failure),
         };
         save_json(&out.join("plan.json"), plan)?;
+        if failed.is_none() {
+            note_found(plan, capture, &results, store, output)?;
+        }
         let downscale = args.plan.downscale;
         let written = model::write(out, plan, &results, store, capture, downscale)?;
         if let Some(failure) = failed {

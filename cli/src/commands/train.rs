@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
 use bench::CurvePoint;
-use blocks::{Plan, PlanSettings};
+use blocks::Plan;
 use coordinator::{LocalError, Results, run_local};
 use dataset::ingest::Ingested;
 use eval::{ByKind, Group};
@@ -25,12 +25,13 @@ use worker::time_limit::TimeLimit;
 use worker::{PlanExecutor, Shared, TrainerOptions};
 
 use crate::args::TrainArgs;
-use crate::captures::{aligned_network, find_zones, ingest_photos, zone_source};
+use crate::captures::ingest_photos;
 use crate::clock::Stopwatch;
 use crate::dashboard::Dashboard;
 use crate::eval_results;
 use crate::failure::{Failure, make_folder};
 use crate::metrics_log::{MetricsLog, Totals};
+use crate::objects::{Objects, note_found};
 use crate::output::Output;
 use crate::planning::{check_plan, plan_of};
 use crate::run_record::Record;
@@ -130,6 +131,9 @@ pub(crate) fn train(args: &TrainArgs, output: &Output) -> Result<Trained, Failur
     let clock = Stopwatch::start();
     let Prepared { capture, capture_id, plan, plan_id, config_hash, store, ingest_cpu_seconds, .. } = prepared;
     let (store, downscale) = (store.blocking(), args.plan.downscale);
+    if finished.evaluation_failed.is_none() {
+        note_found(&plan, &capture, &finished.results, &store, output)?;
+    }
     let written = model::write(&args.out, &plan, &finished.results, &store, &capture, downscale)?;
     let totals = finished.totals;
     let mut record = Record {
@@ -190,10 +194,9 @@ fn prepare(args: &TrainArgs, clock: &Stopwatch, output: &Output) -> Result<Prepa
     let source = captures::open_to_plan(&args.capture, &args.plan, output)?;
     // The plan is checked before any photo is read.
     let (planned_for, plan) = plan_of(&source, &args.plan)?;
-    let zones = zone_source(&args.zones.finder, &args.capture, &source)?;
     let backend = backend::open(args.backend)?;
-    let plan = Plan { backend: backend.name(), ..plan };
-    let network = aligned_network(&args.zones, &args.aligned, &plan.backend)?;
+    let objects = Objects::of((&args.zones, &args.aligned), (&args.capture, &source), &backend.name())?;
+    let plan = objects.add_to(Plan { backend: backend.name(), ..plan }, &planned_for);
     check_plan(&plan, &planned_for, output)?;
     make_folder(&args.out)?;
     let store = Store::open(&store_url(args))?;
@@ -201,11 +204,7 @@ fn prepare(args: &TrainArgs, clock: &Stopwatch, output: &Output) -> Result<Prepa
     let ingest_cpu_seconds = clock.cpu_seconds();
 
     let Ingested { capture, id: capture_id, .. } = ingested;
-    let zones = zones.map(|from| find_zones(&capture, &from, &store.blocking(), output)).transpose()?;
-    let detector = network.map(|network| store.blocking().put(network)).transpose()?;
-    let (zone_weight, aligned_weight) = (args.zones.weight(), args.aligned.weight());
-    let settings = PlanSettings { zone_weight, aligned_weight, ..plan.settings };
-    let plan = Plan { capture: capture_id, zones: zones.map(|(_, id)| id), detector, settings, ..plan };
+    let plan = objects.put(Plan { capture: capture_id, ..plan }, &capture, &store.blocking(), output)?;
     let (config_text, config_hash) = resolved(args, &plan);
     save(&args.out.join("config.toml"), config_text.as_bytes())?;
     save_json(&args.out.join("plan.json"), &plan)?;

@@ -41,10 +41,17 @@ pub(crate) struct JobGroundTruth {
 impl JobGroundTruth {
     pub(crate) fn new(id: JobId, backend: &str, random: &mut Random) -> Self {
         let count = random.between(1, 14);
-        let tasks = (0..count).map(|task| node(task, random)).collect();
+        let mut tasks: Vec<TaskNode> = (0..count).map(|task| node(task, random)).collect();
+        add_detections(&mut tasks, random);
         let (priority, weight) = (random.between(0, 2) as u8, random.between(0, 5) as u32);
         let spec = JobSpec { backend: backend.into(), priority, weight, tasks };
         Self { id, spec, seed: random.number() }
+    }
+
+    /// Whether a task depends on one that follows it in the plan.
+    pub(crate) fn has_detections(&self) -> bool {
+        let later = |(task, node): (u32, &TaskNode)| node.dependencies.iter().any(|other| other.0 > task);
+        (0..).zip(&self.spec.tasks).any(later)
     }
 
     /// The ground truth about a task; the same for every call. Follow-up tasks succeed and have no follow-up tasks.
@@ -84,6 +91,21 @@ impl JobGroundTruth {
 /// accepted.
 pub(crate) fn result_of(attempt: AttemptId) -> ArtefactId {
     ArtefactId::of(attempt.to_string().as_bytes())
+}
+
+/// Adds tasks that depend on nothing, to half of the jobs: the first task waits for all of them and others for some, as blocks
+/// wait for the detection tasks of their views, which a plan lists last.
+fn add_detections(tasks: &mut Vec<TaskNode>, random: &mut Random) {
+    let first = tasks.len() as u64;
+    let end = first + if random.chance(500) { random.between(1, 5) } else { 0 };
+    for detection in (first..end).map(|detection| TaskIndex(detection as u32)) {
+        for (task, node) in (0..first).zip(&mut tasks[..]) {
+            if task == 0 || random.chance(400) {
+                node.dependencies.push(detection);
+            }
+        }
+        tasks.push(node(0, random));
+    }
 }
 
 /// A task that depends on up to three of the first `task` tasks.

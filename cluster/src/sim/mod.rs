@@ -41,7 +41,7 @@ mod tests {
     use super::*;
 
     /// Events that the seeds below must cover for the test to be meaningful.
-    const COVERED: [&str; 30] = [
+    const COVERED: [&str; 31] = [
         "message dropped",
         "message copied",
         "message late",
@@ -69,6 +69,7 @@ mod tests {
         "quarantined",
         "retried",
         "followers",
+        "detections",
         "cancelled",
         "paused",
         "committed",

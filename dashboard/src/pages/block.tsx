@@ -155,7 +155,7 @@ function Attempts({ task }: { task: Task }) {
 function Neighbours({ task }: { task: Task }) {
   void version.value;
   const t = table.value;
-  if (task.kind !== 'train') return <div class="empty">An evaluation has no neighbours.</div>;
+  if (task.kind !== 'train') return <div class="empty">Only blocks have neighbours.</div>;
   return (
     <div class="scroll"><table class="plain">
       <thead><tr><th>Block</th><th>Relation</th><th>State</th></tr></thead>

@@ -20,35 +20,40 @@ pub(super) struct Photos<'a> {
 
 impl<'a> Photos<'a> {
     pub(super) fn new(capture: &'a Capture, store: &BlockingStore) -> Self {
-        let without_points = Capture { views: capture.views.clone(), ..Capture::default() };
-        Self { capture, reader: WindowReader::new(Arc::new(without_points), store.clone(), 0) }
-    }
-
-    /// The photo of a view at mip 0.
-    ///
-    /// # Errors
-    /// A failing store, or damaged pixels.
-    pub(super) fn whole(&self, view: usize) -> Result<Arc<Pixels>, IngestError> {
-        let found = &self.capture.views[view];
-        let k = found.camera.pinhole;
-        let rect = Rect { x: 0, y: 0, width: k.width, height: k.height };
-        self.reader.window(view as u32, 0, rect).map_err(|error| match error {
-            WindowError::Store { error, .. } => error.into(),
-            other => BadInput::new(&found.name, other.to_string(), "ingest the capture again").into(),
-        })
+        Self { capture, reader: reader(capture, store) }
     }
 
     /// The zones of a view without those that its photo's mask hides.
     ///
     /// # Errors
-    /// As [`whole`](Self::whole).
+    /// As [`whole`].
     pub(super) fn without_masked(&self, view: usize, mut zones: Vec<Zone>) -> Result<Vec<Zone>, IngestError> {
         if self.capture.views[view].masked && !zones.is_empty() {
-            let photo = self.whole(view)?;
+            let photo = whole(&self.reader, view)?;
             zones.retain(|zone| !is_masked(&photo, zone));
         }
         Ok(zones)
     }
+}
+
+/// A reader of photos that are read once.
+pub(super) fn reader(capture: &Capture, store: &BlockingStore) -> WindowReader {
+    let without_points = Capture { views: capture.views.clone(), ..Capture::default() };
+    WindowReader::new(Arc::new(without_points), store.clone(), 0)
+}
+
+/// The photo of a view at mip 0.
+///
+/// # Errors
+/// A failing store, or damaged pixels.
+pub(super) fn whole(reader: &WindowReader, view: usize) -> Result<Arc<Pixels>, IngestError> {
+    let of = &reader.capture().views[view];
+    let k = of.camera.pinhole;
+    let rect = Rect { x: 0, y: 0, width: k.width, height: k.height };
+    reader.window(view as u32, 0, rect).map_err(|error| match error {
+        WindowError::Store { error, .. } => error.into(),
+        other => BadInput::new(&of.name, other.to_string(), "ingest the capture again").into(),
+    })
 }
 
 /// Whether the photo's mask hides more than half of a zone.

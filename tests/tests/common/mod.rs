@@ -55,6 +55,7 @@ pub(crate) fn plan_of(levels: u8, tasks: Vec<Task>) -> Plan {
         rho_metres: (0..=levels).rev().map(|level| f64::from(1u32 << level)).collect(),
         tasks,
         eval_tasks: Vec::new(),
+        detect_tasks: Vec::new(),
     }
 }
 

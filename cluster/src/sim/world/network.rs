@@ -95,6 +95,9 @@ impl World {
                         if !follow_ups.is_empty() {
                             self.count("followers");
                         }
+                        if attempt.task.0 == 0 && self.jobs[&attempt.job].has_detections() {
+                            self.count("detections");
+                        }
                         let old = self.committed.insert((attempt.job, attempt.task), artefact);
                         if old.is_some_and(|old| old != artefact) {
                             return Err(format!("two results of {}/{} were accepted", attempt.job.0, attempt.task));
