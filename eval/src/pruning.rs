@@ -65,7 +65,8 @@ impl<'a> Pruner<'a> {
     /// # Errors
     /// Without such views, or with photos that cannot be read.
     pub fn held_in_psnr(&self, splats: &Splats) -> Result<f64, EvalError> {
-        self.measured(&self.held_in).psnr(splats, &OwnershipWeights::default()).map_err(no_views)
+        let psnr = self.measured(&self.held_in).psnr(splats, &OwnershipWeights::default());
+        psnr.map(|[all, _]| all).map_err(no_views)
     }
 
     /// Mean PSNR of these splats over the held-out views, as `plat eval` measures it, dB. `None` if there are none.
@@ -76,7 +77,8 @@ impl<'a> Pruner<'a> {
         if self.held_out.is_empty() {
             return Ok(None);
         }
-        self.measured(&self.held_out).psnr(splats, &OwnershipWeights::default()).map(Some).map_err(no_views)
+        let psnr = self.measured(&self.held_out).psnr(splats, &OwnershipWeights::default());
+        psnr.map(|[all, _]| Some(all)).map_err(no_views)
     }
 
     /// Importance of each of the model's splats by this order.
