@@ -341,7 +341,7 @@ impl Plan {
     ///
     /// # Errors
     /// A block that has no task.
-    pub fn dependencies(&self, task: PlannedTask) -> Result<Vec<u32>, CodecError> {
+    pub fn dependencies(&self, task: PlannedTask) -> Result<BTreeSet<u32>, CodecError> {
         let index = |block| {
             let missing = || CodecError::new(format!("a task needs block {block}, which has no task"));
             self.index(block).ok_or_else(missing)

@@ -139,7 +139,8 @@ fn workers_and_coordinators_that_die_while_they_look_for_objects_change_nothing(
     let model: Value = serde_json::from_slice(&fs::read(at.join("calm/model/model.json")).unwrap()).unwrap();
     let blocks = model["blocks"].as_array().unwrap();
     for (index, task) in (0..).zip(&divided.tasks) {
-        let block = blocks.iter().find(|of| of["block"] == task.block.to_string()).unwrap();
+        let name = serde_json::to_value(task.block).unwrap();
+        let block = blocks.iter().find(|of| of["block"] == name).unwrap();
         assert_eq!(block["artefact"], results[&index].to_string(), "block {}", task.block);
     }
     let found = zones(&divided, &store(at, "shared"), |task| results[&task]);

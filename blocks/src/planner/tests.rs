@@ -81,7 +81,7 @@ fn blocks_depend_on_the_detection_of_their_views() {
                 let near = |view: u32| [view.saturating_sub(1), view, (view + 1).min(last)];
                 assert!(task.views.iter().flat_map(|used| near(used.view)).all(seen));
             }
-            PlannedTask::Evaluate(_) => assert!(needed == (0..training).collect::<Vec<_>>() && detections.is_empty()),
+            PlannedTask::Evaluate(_) => assert!(needed == (0..training).collect() && detections.is_empty()),
             PlannedTask::Detect(_) => assert!(needed.is_empty()),
         }
     }
