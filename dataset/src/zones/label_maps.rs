@@ -77,7 +77,7 @@ mod tests {
     use serde_json::json;
     use store::Store;
 
-    use super::super::photos::Photos;
+    use super::super::photos::{reader, whole};
     use super::*;
     use crate::ingest::{IngestOptions, ingest};
     use crate::open::{OpenOptions, open};
@@ -111,7 +111,7 @@ mod tests {
         zones.check(&capture.views).unwrap();
         let ([zone], []) = (zones.of(0), zones.of(1)) else { panic!("{zones:?}") };
         assert_eq!(zones.classes[usize::from(zone.class)], "car");
-        let photo = Photos::new(&capture, &store).whole(0).unwrap();
+        let photo = whole(&reader(&capture, &store), 0).unwrap();
         let mut shown = vec![0; photo.area()];
         for (y, x) in zone.mask.iter().flat_map(|mask| mask.spans(photo.width)) {
             shown[(y * photo.width) as usize..][x.start as usize..x.end as usize].fill(255);
