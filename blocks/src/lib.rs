@@ -4,8 +4,8 @@
 //! [`cut()`] and [`merge()`] share it, so `merge(cut(s)) == s`. [`plan()`] turns a capture into an immutable, hashed
 //! list of tasks. A training task states which block trains on which windows of which views, against which frozen
 //! context and within which budgets; an evaluation task states on which views the merged model is measured, and a
-//! detection task on which views objects are looked for. [`lint()`] checks a plan, [`draw()`] draws it as an SVG. [`densities()`] says where a capture has too few photos, [`Split`] which of them are
-//! held out.
+//! detection task on which views objects are looked for. [`lint()`] checks a plan, [`draw()`] draws it as an SVG.
+//! [`densities()`] says where a capture has too few photos, [`Split`] which of them are held out.
 //!
 //! Architecture invariant: this crate does no I/O, reads no clock, starts no thread and uses no GPU. All functions are
 //! pure, and equal inputs give equal bytes.

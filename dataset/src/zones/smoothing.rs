@@ -7,7 +7,8 @@ use scene::{Zone, Zones};
 const SAME: f32 = 0.5;
 
 /// The zones, each averaged with those of the same object on the photos before and after. An object that both of them show,
-/// and the photo between does not, is added there. Zones with masks are exact and stay as they are. `follows` says whether a view follows the one before it in a sequence.
+/// and the photo between does not, is added there. Zones with masks are exact and stay as they are. `follows` says whether
+/// a view follows the one before it in a sequence.
 pub(super) fn smoothed(of_views: &[Vec<Zone>], follows: impl Fn(usize) -> bool) -> Vec<Vec<Zone>> {
     let middle = |view: usize| view > 0 && view + 1 < of_views.len() && follows(view) && follows(view + 1);
     let smooth = |view: usize| {
