@@ -6,22 +6,12 @@ mod common;
 use std::path::Path;
 use std::time::Duration;
 
-use common::cluster::{Running, has_task};
+use common::cluster::{Running, coordinator, has_task};
 use rcgen::{BasicConstraints, CertificateParams, IsCa, Issuer, KeyPair};
 use serde_json::Value;
 
 #[rustfmt::skip]
 const PLAN: [&str; 8] = ["--steps", "960", "--budget", "900", "--levels", "1", "--blocks", "tree"];
-
-/// A coordinator that is the leader, and its URL.
-fn coordinator(at: &Path) -> (Running, String) {
-    let words = ["coordinator", "--store", "shared", "--listen", "127.0.0.1:0", "--lease-seconds", "1"];
-    let running = Running::start(&mut common::command(at, &words));
-    let line = running.line_with("http://");
-    running.line_with("leading");
-    let url = line.split_whitespace().find(|word| word.starts_with("http://")).unwrap();
-    (running, url.trim_end_matches(',').to_string())
-}
 
 fn worker(at: &Path, url: &str, name: &str) -> Running {
     let words = ["worker", "--coordinator", url, "--name", name, "--threads", "1", "--checkpoint-every", "0.05"];

@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use blocks::{DetectTask, Plan, PlannedTask};
-use common::cluster::{Running, has_task};
+use common::cluster::{Running, coordinator, has_task};
 use common::{city, done, json_of, refused};
 use proto::watch_event::Event;
 use proto::{Access, Outcome, TaskState};
@@ -42,15 +42,6 @@ fn divided(plan: &Plan, count: u32) -> Plan {
     let views = plan.detect_tasks.last().unwrap().views().end;
     let task = |first: u32| DetectTask { first, count: count.min(views - first), ..plan.detect_tasks[0].clone() };
     Plan { detect_tasks: (0..views).step_by(count as usize).map(task).collect(), ..plan.clone() }
-}
-
-fn coordinator(at: &Path) -> (Running, String) {
-    let words = ["coordinator", "--store", "shared", "--listen", "127.0.0.1:0", "--lease-seconds", "1"];
-    let running = Running::start(&mut common::command(at, &words));
-    let line = running.line_with("http://");
-    running.line_with("leading");
-    let url = line.split_whitespace().find(|word| word.starts_with("http://")).unwrap();
-    (running, url.trim_end_matches(',').to_string())
 }
 
 fn worker(at: &Path, url: &str, name: &str) -> Running {

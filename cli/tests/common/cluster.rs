@@ -81,6 +81,16 @@ impl Drop for Running {
     }
 }
 
+/// A coordinator that is the leader, and its URL.
+pub(crate) fn coordinator(at: &Path) -> (Running, String) {
+    let words = ["coordinator", "--store", "shared", "--listen", "127.0.0.1:0", "--lease-seconds", "1"];
+    let running = Running::start(&mut super::command(at, &words));
+    let line = running.line_with("http://");
+    running.line_with("leading");
+    let url = line.split_whitespace().find(|word| word.starts_with("http://")).unwrap();
+    (running, url.trim_end_matches(',').to_string())
+}
+
 /// Waits until the worker has a task of job 1, and returns true; returns false if the job ends first.
 pub(crate) fn has_task(at: &Path, connection: &[&str], name: &str) -> bool {
     loop {
