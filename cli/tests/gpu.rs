@@ -34,6 +34,21 @@ fn gpu() -> Option<String> {
 }
 
 #[test]
+fn auto_is_a_gpu_with_memory_of_its_own_and_never_a_software_adapter() {
+    let Some(name) = gpu() else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    common::city(at, 20, 64, 48);
+    let is_dedicated = Gpu::open().is_ok_and(|gpu| ["discrete", "virtual"].contains(&gpu.class()));
+    let words = ["train", "city", "--steps", "10", "--budget", "300", "--blocks", "whole", "--out", "auto"];
+    let backend = common::json_of(&mut common::command(at, &words))["backend"].as_str().unwrap().to_owned();
+    println!("{backend}, where --backend gpu is {name}");
+    assert!(if is_dedicated { backend == name } else { backend.starts_with("cpu-") }, "{backend}");
+    // A variable that is not understood is an error on any machine.
+    common::stopped(common::command(at, &words).env("PLAT_GPU_PATH", "quick"), 2, "PLAT_GPU_PATH");
+}
+
+#[test]
 fn a_job_on_a_gpu_is_as_good_and_survives_kills() {
     let Some(name) = gpu() else { return };
     let folder = tempfile::tempdir().unwrap();
