@@ -13,7 +13,7 @@ plat=${PLAT:-target/release/plat}
 while read -r scene folder downscale steps budget looks; do
     [[ $# == 0 || " $* " == *" $scene "* ]] || continue
     run() {
-        "$plat" --quiet bench pareto "$data/$folder" --scene "$scene" --threads 1 --tolerance-db 0 --seed 0,1,2 \
+        "$plat" --quiet bench pareto "$data/$folder" --scene "$scene" --threads 1 --backend cpu --tolerance-db 0 --seed 0,1,2 \
             --downscale "$downscale" --out "out/captures/$scene" --fresh "$@" < /dev/null
     }
     run --label "plat whole" --blocks whole --steps "$steps" --budget "$budget" --eval-every "$looks"

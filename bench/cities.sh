@@ -16,7 +16,7 @@ while read -r area views levels; do
     model="$city-model"
     rm -rf "$model"
     "$plat" --quiet bench pareto "$city" --label "plat tree" --scene "city, $area km²" \
-        --levels "$levels" --steps $((${STEPS:-10} * views)) --no-lidar --eval-every 0 --threads 1 --fresh --out "$model"
+        --levels "$levels" --steps $((${STEPS:-10} * views)) --no-lidar --eval-every 0 --threads 1 --backend cpu --fresh --out "$model"
     "$plat" --quiet bench tree "$model" "$city" --scene "city, $area km²"
 done <<'CITIES'
 0.3 500 2

@@ -38,7 +38,7 @@ seconds() { awk -v ticks="$1" -v hertz="$(getconf CLK_TCK)" 'BEGIN { printf "%.2
 run() {
     local followers=$1 training tries n serving all
     rm -rf "$out"
-    "$plat" --quiet train "$capture" --downscale 4 --steps "${STEPS:-6000}" --budget 16000 --levels 1 --threads 1 \
+    "$plat" --quiet train "$capture" --downscale 4 --steps "${STEPS:-6000}" --budget 16000 --levels 1 --threads 1 --backend cpu \
         --serve="127.0.0.1:$port" --out "$out" >/dev/null 2>&1 &
     training=$!
     for ((tries = 0; tries < 100; tries++)); do

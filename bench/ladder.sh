@@ -34,7 +34,7 @@ PYTHON
 run() {
     local label=$1 capture=$2
     shift 2
-    "$plat" --quiet bench pareto "$bed=$capture" --label "$label" --steps "$steps" --seed "${SEED:-0}" --threads 1 --tolerance-db 0 \
+    "$plat" --quiet bench pareto "$bed=$capture" --label "$label" --steps "$steps" --seed "${SEED:-0}" --threads 1 --backend cpu --tolerance-db 0 \
         --eval-every 0 --depth "${detector[@]}" --fresh --results "${RESULTS:-bench/results/ladder}" --out "out/ladder/$bed-run" "$@"
 }
 

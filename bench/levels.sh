@@ -9,7 +9,7 @@ cd "$repository"
 plat=${PLAT:-target/release/plat}
 
 run() {
-    "$plat" --quiet bench pareto "$data/aerial_caliterra" --steps 2400 --budget 16000 --downscale 4 --seed 0,1,2 --threads 1 --tolerance-db 0 \
+    "$plat" --quiet bench pareto "$data/aerial_caliterra" --steps 2400 --budget 16000 --downscale 4 --seed 0,1,2 --threads 1 --backend cpu --tolerance-db 0 \
         --residual 0 --eval-every 0 --fresh --results "${RESULTS:-bench/results/levels}" "$@"
 }
 for levels in 0 1 2; do

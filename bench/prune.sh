@@ -13,7 +13,7 @@ plat=${PLAT:-target/release/plat}
 while read -r scene folder downscale steps budget; do
     [[ $# == 0 || " $* " == *" $scene "* ]] || continue
     "$plat" --quiet train "$data/$folder" --out "out/prune/$scene" --fresh --blocks whole --downscale "$downscale" --steps "$steps" \
-        --budget "$budget" --threads 1 --tolerance-db 0 --eval-every 0 < /dev/null
+        --budget "$budget" --threads 1 --backend cpu --tolerance-db 0 --eval-every 0 < /dev/null
     "$plat" --quiet bench prune "out/prune/$scene" "$data/$folder" --scene "$scene" --order energy --results "${RESULTS:-bench/results}" < /dev/null
 done <<'CAPTURES'
 aerial_caliterra aerial_caliterra 4 2400 16000

@@ -8,7 +8,7 @@ cd "$(dirname "${BASH_SOURCE[0]}")/.."
 plat=${PLAT:-target/release/plat}
 captures=${CAPTURES:-../shared/data}
 detector=(${DETECTOR:+--detector "$(realpath --relative-to=. "$DETECTOR")"})
-common=(--seed "${SEED:-0,1,2}" --threads 1 --tolerance-db 0 --eval-every 0 "${detector[@]}" --fresh)
+common=(--seed "${SEED:-0,1,2}" --threads 1 --backend cpu --tolerance-db 0 --eval-every 0 "${detector[@]}" --fresh)
 ran=
 wanted() { local name=$1; shift; [[ $# == 0 || " $* " == *" $name "* ]] && ran=1; }
 
