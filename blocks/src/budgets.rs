@@ -318,17 +318,17 @@ fn trained_splats(task: &Task, has_children: bool) -> f64 {
 /// Parameters of a splat, by SH degree.
 pub(crate) const COLUMNS: [u64; 4] = [14, 23, 38, 59];
 /// Bytes per trained parameter: value, gradient and two Adam moments, f32 each.
-const BYTES_PER_TRAINED_COLUMN: u64 = 16;
+pub(crate) const BYTES_PER_TRAINED_COLUMN: u64 = 16;
 /// Bytes per frozen parameter.
 pub(crate) const BYTES_PER_FROZEN_COLUMN: u64 = 4;
 /// Bytes per splat under training beyond its parameters: the projected splat, its gradient, densification statistics,
 /// tile entries and copies made by densification. Fitted to twelve bench runs within 15 %; the processes of tree plans
 /// used up to 27 % less.
-const BYTES_PER_PROJECTED: u64 = 1860;
+pub(crate) const BYTES_PER_PROJECTED: u64 = 1860;
 /// The same for a frozen splat, which has no gradient, statistics or copies.
 pub(crate) const BYTES_PER_FROZEN_PROJECTED: u64 = 112;
 /// Bytes per window pixel: colour, depth, alpha, their gradients, the photo, weights and SSIM planes.
-const BYTES_PER_PIXEL: u64 = 120;
+pub(crate) const BYTES_PER_PIXEL: u64 = 120;
 /// Limit of the decoded-window cache. A pixel takes four bytes.
 const IMAGE_CACHE_BYTES: u64 = 128 << 20;
 /// Bytes of the process itself and its threads.

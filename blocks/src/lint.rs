@@ -83,6 +83,17 @@ pub fn lint(plan: &Plan, capture: &Capture) -> Vec<Finding> {
     let evaluating = ("evaluating the merged model", "lower --budget, or leave --evaluate and use plat eval");
     check_memory(plan, plan.eval_tasks.iter().map(|task| task.memory_bytes), evaluating, &mut findings);
     let detecting = ("looking for objects", "give a smaller --detector");
+    let objects = ("training an object that moves", "leave --objects");
+    check_memory(plan, plan.object_tasks.iter().map(|task| task.memory_bytes), objects, &mut findings);
+    if let Some(task) = plan.object_tasks.last().filter(|task| task.object as usize >= capture.objects.len()) {
+        findings.error(None, format!("trains object {}, which the capture does not have", task.object));
+    }
+    let views = plan.object_tasks.iter().flat_map(|task| &task.views);
+    if let Some(used) =
+        views.into_iter().find(|used| used.view as usize >= capture.views.len() || split.is_held_out(used.view))
+    {
+        findings.error(None, format!("trains an object on view {}, which is not there or held out", used.view));
+    }
     check_memory(plan, plan.detect_tasks.iter().map(|task| task.memory_bytes), detecting, &mut findings);
     let finest: u64 = plan.leaves().blocks().iter().filter_map(|&b| plan.task(b)).map(|t| u64::from(t.budget)).sum();
     let deepest: u64 = plan.tasks.iter().filter(|t| t.block.level == plan.levels).map(|t| u64::from(t.budget)).sum();

@@ -8,7 +8,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use glam::DVec3;
 use scene::{BlockId, Splats};
 
-use crate::ground::Ground;
+use crate::ground::{Ground, Square};
 
 /// A set of blocks that represents the whole plane. The deepest block that contains a place owns it.
 ///
@@ -98,23 +98,39 @@ pub fn target_level(level: u8, distance_metres: f64, core_edge_metres: f64) -> u
 /// missing, their nearest ancestor fills in. The root is always a member, for the background. The context of the root
 /// is empty.
 pub fn context_of(ground: &Ground, block: BlockId, existing: &BTreeSet<BlockId>) -> Vec<BlockId> {
+    if block.level == 0 {
+        return Vec::new();
+    }
     let (halo, edge) = (ground.nominal_halo(block), ground.core_edge_metres(block.level));
+    let mut found = cut_around(ground, &halo, block.level, edge, existing);
+    if let Some(parent) = block.parent() {
+        found.extend(existing.get(&BlockId::ROOT));
+        found.remove(&parent);
+    }
+    found.into_iter().collect()
+}
+
+/// The cut of the existing blocks by [`target_level`] around a square: blocks that touch it are of the level above `level`, if they
+/// exist.
+pub(crate) fn cut_around(
+    ground: &Ground,
+    square: &Square,
+    level: u8,
+    edge_metres: f64,
+    existing: &BTreeSet<BlockId>,
+) -> BTreeSet<BlockId> {
     let mut found = BTreeSet::new();
-    let mut open = Vec::from_iter((block.level > 0 && existing.contains(&BlockId::ROOT)).then_some(BlockId::ROOT));
+    let mut open = Vec::from_iter(existing.get(&BlockId::ROOT).copied());
     while let Some(node) = open.pop() {
-        let distance = ground.core(node).distance(&halo);
-        let split = target_level(block.level, distance, edge) > node.level;
+        let distance = ground.core(node).distance(square);
+        let split = target_level(level, distance, edge_metres) > node.level;
         let children = node.children().map(|child| (split && existing.contains(&child)).then_some(child));
         if children.iter().any(Option::is_none) {
             found.insert(node);
         }
         open.extend(children.into_iter().flatten());
     }
-    if let Some(parent) = block.parent() {
-        found.extend(existing.get(&BlockId::ROOT));
-        found.remove(&parent);
-    }
-    found.into_iter().collect()
+    found
 }
 
 /// The sweep, 0 or 1, in which a block is trained: a red-black (checkerboard) colouring of its level. Blocks of one

@@ -11,10 +11,10 @@ use serde::{Deserialize, Serialize};
 
 use crate::ground::Ground;
 use crate::lod::{Cut, training_order};
-use crate::task::{DetectTask, EvalTask, Task, ViewUse, tasks_of_views};
+use crate::task::{DetectTask, EvalTask, ObjectTask, Task, ViewUse, tasks_of_views};
 
 /// The format version of [`Plan`] that this program reads and writes.
-pub const VERSION: u32 = 11;
+pub const VERSION: u32 = 12;
 /// The frame kind of a plan.
 pub const PLAN: Kind = Kind(*b"plan", VERSION);
 /// The maximum depth of a plan: 65,536 blocks a side.
@@ -95,6 +95,8 @@ pub struct PlanSettings {
     pub test_stretches: f64,
     /// Whether the root refines the poses of the training views, which all other blocks reuse unchanged.
     pub refine_poses: bool,
+    /// Whether tasks of the job train the capture's objects that move.
+    pub objects: bool,
 }
 
 impl Default for PlanSettings {
@@ -120,6 +122,7 @@ impl Default for PlanSettings {
             evaluate: false,
             test_stretches: 0.0,
             refine_poses: false,
+            objects: false,
         }
     }
 }
@@ -133,6 +136,8 @@ pub enum PlannedTask<'a> {
     Evaluate(&'a EvalTask),
     /// Looks for objects on photos.
     Detect(&'a DetectTask),
+    /// Trains an object that moves.
+    Object(&'a ObjectTask),
 }
 
 impl PlannedTask<'_> {
@@ -142,6 +147,7 @@ impl PlannedTask<'_> {
             Self::Train(task) => task.steps.into(),
             Self::Evaluate(task) => task.views.len() as u64,
             Self::Detect(task) => task.count.into(),
+            Self::Object(task) => task.steps.into(),
         }
     }
 
@@ -151,6 +157,7 @@ impl PlannedTask<'_> {
             Self::Train(task) => task.memory_bytes,
             Self::Evaluate(task) => task.memory_bytes,
             Self::Detect(task) => task.memory_bytes,
+            Self::Object(task) => task.memory_bytes,
         }
     }
 }
@@ -184,6 +191,8 @@ pub struct Plan {
     /// Tasks before training: together they run the detector on each view of the capture once, in order. Empty unless a
     /// detector is to find the zones.
     pub detect_tasks: Vec<DetectTask>,
+    /// Tasks that train the objects which move, in the order of the capture's objects. Empty without [`PlanSettings::objects`].
+    pub object_tasks: Vec<ObjectTask>,
 }
 
 impl Plan {
@@ -243,17 +252,25 @@ impl Plan {
         if self.rho_metres.len() != usize::from(self.levels) + 1 || !self.rho_metres.iter().all(sane) {
             return bad("has resolutions that do not match its levels".into());
         }
+        let is_bad = |v: &ViewUse| {
+            let Rect { width, height, .. } = v.window;
+            v.mip > 31 || ![width, height].iter().all(|side| (1..=MAX_SIDE).contains(side))
+        };
         let in_tree = |b: &BlockId| b.level <= self.levels && b.x >> b.level == 0 && b.y >> b.level == 0;
         for task in &self.tasks {
             if !task.context.iter().chain(&task.parent).chain([&task.block]).all(in_tree) || !sane(&task.rho_metres) {
                 return bad(format!("has task {}, which is not in its tree", task.block));
             }
-            let is_bad = |v: &ViewUse| {
-                let Rect { width, height, .. } = v.window;
-                v.mip > 31 || ![width, height].iter().all(|side| (1..=MAX_SIDE).contains(side))
-            };
             if task.views.iter().chain(&task.test_views).any(is_bad) {
                 return bad(format!("has an empty or too large window in task {}", task.block));
+            }
+        }
+        if !self.object_tasks.is_sorted_by(|a, b| a.object < b.object) {
+            return bad("has tasks of objects twice or out of order".into());
+        }
+        for task in &self.object_tasks {
+            if task.views.is_empty() || task.views.iter().any(is_bad) || !task.context.iter().all(in_tree) {
+                return bad(format!("has a task of object {} without sound windows or context", task.object));
             }
         }
         let measured = self.eval_tasks.iter().flat_map(|task| &task.views);
@@ -281,7 +298,7 @@ impl Plan {
 
     /// The number of tasks of all kinds.
     pub fn len(&self) -> usize {
-        self.tasks.len() + self.eval_tasks.len() + self.detect_tasks.len()
+        self.first_object() + self.object_tasks.len()
     }
 
     /// Whether there is no task of any kind; false for a plan that passed [`Plan::check`].
@@ -289,7 +306,8 @@ impl Plan {
         self.len() == 0
     }
 
-    /// The task of an index: first the training tasks, then those that evaluate, then those that detect. The index identifies
+    /// The task of an index: first those of blocks, then those that evaluate, that detect, and those of
+    /// objects. The index identifies
     /// the task towards the coordinator and its workers.
     pub fn planned(&self, index: u32) -> Option<PlannedTask<'_>> {
         let index = index as usize;
@@ -298,7 +316,10 @@ impl Plan {
         };
         match index.checked_sub(self.eval_tasks.len()) {
             None => self.eval_tasks.get(index).map(PlannedTask::Evaluate),
-            Some(index) => self.detect_tasks.get(index).map(PlannedTask::Detect),
+            Some(index) => match index.checked_sub(self.detect_tasks.len()) {
+                None => self.detect_tasks.get(index).map(PlannedTask::Detect),
+                Some(index) => self.object_tasks.get(index).map(PlannedTask::Object),
+            },
         }
     }
 
@@ -306,12 +327,18 @@ impl Plan {
     pub fn all_tasks(&self) -> impl Iterator<Item = PlannedTask<'_>> {
         let evaluate = self.eval_tasks.iter().map(PlannedTask::Evaluate);
         let detect = self.detect_tasks.iter().map(PlannedTask::Detect);
-        self.tasks.iter().map(PlannedTask::Train).chain(evaluate).chain(detect)
+        let objects = self.object_tasks.iter().map(PlannedTask::Object);
+        self.tasks.iter().map(PlannedTask::Train).chain(evaluate).chain(detect).chain(objects)
     }
 
     /// The index of the first detection task; that of no task if there are none.
     pub fn first_detection(&self) -> usize {
         self.tasks.len() + self.eval_tasks.len()
+    }
+
+    /// The index of the first task of an object that moves; that of no task if there are none.
+    pub fn first_object(&self) -> usize {
+        self.first_detection() + self.detect_tasks.len()
     }
 
     /// The blocks whose results a task reads.
@@ -320,6 +347,7 @@ impl Plan {
             PlannedTask::Train(task) => task.context_cut().blocks(),
             PlannedTask::Evaluate(_) => self.tasks.iter().map(|task| task.block).collect(),
             PlannedTask::Detect(_) => BTreeSet::new(),
+            PlannedTask::Object(task) => task.context.iter().copied().collect(),
         }
     }
 
@@ -333,7 +361,7 @@ impl Plan {
                 let places = tasks_of_views(&self.detect_tasks, views);
                 places.into_iter().map(|place| (first + place) as u32).collect()
             }
-            PlannedTask::Train(_) | PlannedTask::Evaluate(_) | PlannedTask::Detect(_) => Vec::new(),
+            _ => Vec::new(),
         }
     }
 

@@ -6,6 +6,7 @@ use crate::budgets::{self, BLOCK_SPLATS, DetailShares};
 use crate::evaluation::eval_tasks;
 use crate::ground::{Ground, quantile};
 use crate::layout::{Layout, level_rho_metres};
+use crate::moving::object_tasks;
 use crate::plan::{MAX_EVALUATED_BLOCKS, MAX_LEVELS, MAX_VIEWS_PER_STEP, Mode, Plan, PlanSettings, VERSION};
 use crate::plan_error::PlanError;
 use crate::split::{Part, Split};
@@ -101,6 +102,8 @@ pub fn plan(
         return Err(PlanError::Setting { setting: "--evaluate", problem, advice: "leave it, and use plat eval" });
     }
     let eval_tasks = if settings.evaluate { eval_tasks(capture, &tasks, &split, settings) } else { Vec::new() };
+    let object_tasks =
+        if settings.objects { object_tasks(capture, &tasks, &ground, &split, settings) } else { Vec::new() };
     Ok(Plan {
         version: VERSION,
         capture: capture_id,
@@ -114,6 +117,7 @@ pub fn plan(
         tasks,
         eval_tasks,
         detect_tasks: Vec::new(),
+        object_tasks,
     })
 }
 
@@ -150,6 +154,10 @@ fn check(settings: &PlanSettings) -> Result<(), PlanError> {
     if settings.refine_poses && settings.mode == Mode::Flat {
         let problem = "flat blocks have no root that refines the poses";
         return bad("--refine-poses", problem.into(), "omit it, or use --blocks tree or whole");
+    }
+    if settings.objects && settings.mode == Mode::Flat {
+        let problem = "flat blocks are no scene that objects could be trained in";
+        return bad("--objects", problem.into(), "omit it, or use --blocks tree or whole");
     }
     if settings.sh_degree > 3 {
         return bad("sh_degree", format!("{} is not supported", settings.sh_degree), "give 0 to 3");

@@ -1,4 +1,4 @@
-//! The tasks of a plan: they train a block, measure the model, or look for objects.
+//! The tasks of a plan: they train a block or an object that moves, measure the model, or look for objects.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::ops::Range;
@@ -124,6 +124,25 @@ impl DetectTask {
     pub fn views(&self) -> Range<u32> {
         self.first..self.first.saturating_add(self.count)
     }
+}
+
+/// The task of training an object that moves, in its own axes.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ObjectTask {
+    /// Its place among the capture's objects.
+    pub object: u32,
+    /// Training windows around its box, sorted by view.
+    pub views: Vec<ViewUse>,
+    /// The blocks that are rendered frozen with it, a cut of the tree around its path.
+    pub context: Vec<BlockId>,
+    /// Most splats at the end of training.
+    pub budget: u32,
+    /// Training steps, one window each.
+    pub steps: u32,
+    /// Estimated CPU time, milliseconds, on the machine of [`StepCost::CPU_SECONDS`](crate::StepCost::CPU_SECONDS).
+    pub work_millis: u64,
+    /// Estimated peak memory, bytes.
+    pub memory_bytes: u64,
 }
 
 /// The tasks, by their place among these, of some views and of the views before and after each.

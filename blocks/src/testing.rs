@@ -37,7 +37,14 @@ pub(crate) fn look_at(eye: DVec3, target: DVec3, up: DVec3) -> Camera {
 /// A capture of these cameras and points. With `tracks`, each point has a track of all views it projects into.
 pub(crate) fn capture(cameras: &[Camera], positions: Vec<DVec3>, tracks: bool) -> Capture {
     let views: Vec<View> = (cameras.iter().enumerate())
-        .map(|(i, &camera)| View { name: format!("{i:05}.jpg"), camera, mips: Vec::new(), masked: false, depth: None })
+        .map(|(i, &camera)| View {
+            name: format!("{i:05}.jpg"),
+            camera,
+            mips: Vec::new(),
+            masked: false,
+            depth: None,
+            seconds: None,
+        })
         .collect();
     let mut points = SparsePoints { colours: vec![[120, 90, 60]; positions.len()], positions, ..Default::default() };
     if tracks {
@@ -52,7 +59,7 @@ pub(crate) fn capture(cameras: &[Camera], positions: Vec<DVec3>, tracks: bool) -
             points.track_start.push(points.seen_by.len() as u32);
         }
     }
-    Capture { views, points, geo_origin: None }
+    Capture { views, points, ..Capture::default() }
 }
 
 /// An aerial survey: `n × n` nadir cameras 60 m above a square of `side` metres with `points` points. All cameras head

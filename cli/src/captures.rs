@@ -10,7 +10,7 @@ use dataset::open::{OpenOptions, Source};
 use dataset::zones::{CocoFile, LabelMaps, OwnLabels, ZoneSource};
 use eval::{PhotoOptions, Photos, load_identified_detector};
 use model::Model;
-use scene::{ArtefactId, BadInput, Camera, Capture, Pinhole, Zones};
+use scene::{ArtefactId, BadInput, Camera, Capture, Pinhole, View, Zones};
 use store::BlockingStore;
 
 use crate::args::{DepthKind, OWN_LABELS, PlanOptions, ZoneFinder};
@@ -190,10 +190,10 @@ pub(crate) fn resized(camera: &Camera, width: u32, height: u32) -> Camera {
     Camera { pinhole, ..*camera }
 }
 
-/// The names and cameras of a capture or of a `transforms.json`; photos need not exist.
-pub(crate) fn read_cameras(path: &Path) -> Result<Vec<(String, Camera)>, BadInput> {
+/// The views of a capture or of a `transforms.json`; photos need not exist.
+pub(crate) fn read_cameras(path: &Path) -> Result<Vec<View>, BadInput> {
     let source = dataset::open::open(path, &OpenOptions { cameras_only: true, ..OpenOptions::default() })?;
-    Ok(source.capture.views.into_iter().map(|view| (view.name, view.camera)).collect())
+    Ok(source.capture.views)
 }
 
 /// Paths of the views' files below an output folder: their names without extensions.

@@ -5,8 +5,8 @@ use std::path::PathBuf;
 use eval::cuts::CutFigures;
 use eval::seams::SeamReport;
 use eval::{
-    AgainstTruth, BudgetFigures, ByKind, Correlation, Correlations, DepthReport, DetectionReport, Group, Summary,
-    ViewFigures, mean,
+    AgainstTruth, BudgetFigures, ByKind, Correlation, Correlations, DepthReport, DetectionReport, Group, MovingFigures,
+    ObjectFigures, Summary, ViewFigures, mean,
 };
 use perceive::{Counts, Precision};
 use serde::Serialize;
@@ -53,6 +53,9 @@ pub(crate) struct Evaluated {
     /// With `--seams` or `--seams-of`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) seams: Option<SeamReport>,
+    /// Of objects that move, where the capture has some.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(crate) moving: Option<MovingFigures>,
 }
 
 impl Evaluated {
@@ -74,6 +77,7 @@ impl Evaluated {
             cuts: Vec::new(),
             budgets: Vec::new(),
             seams: None,
+            moving: None,
         }
     }
 }
@@ -120,6 +124,9 @@ pub(crate) fn text(evaluated: &Evaluated) -> String {
         text += &line(&name, [psnr, cc_psnr, ssim, ssimulacra2, lpips, None, None]);
     }
     text += &format!("rendered on {}\n", record.backend);
+    if let Some(figures) = &evaluated.moving {
+        text += &format!("\n{}", moving(figures));
+    }
     if let Some(report) = &evaluated.depth {
         text += &format!("\n{}", depth(report));
     }
@@ -151,6 +158,17 @@ fn summaries(evaluated: &Evaluated) -> Vec<(String, Summary)> {
         all.extend(by_kind(&format!("{name}, "), group.by_kind));
     }
     all
+}
+
+fn moving(figures: &MovingFigures) -> String {
+    let MovingFigures { views, pixels, psnr, whole_psnr, objects } = figures;
+    let mut text = format!("{:>8} {:>6} {:>11}  objects that move\n", "PSNR", "views", "pixels");
+    text += &format!("{:>8} {views:>6} {pixels:>11}  all, mean over views\n", figure(*psnr, 2));
+    for object in objects {
+        let ObjectFigures { id, class, views, pixels, psnr } = object;
+        text += &format!("{psnr:>8.2} {views:>6} {pixels:>11}  {id}, {class}\n");
+    }
+    text + &format!("{:>8} {:>18}  whole pictures, masked pixels included\n", figure(*whole_psnr, 2), "")
 }
 
 fn depth(report: &DepthReport) -> String {

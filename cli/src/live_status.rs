@@ -31,13 +31,16 @@ pub(crate) struct TaskNames {
     pub(crate) blocks: Vec<BlockId>,
     /// The first task that looks for objects; 0 if there is none.
     pub(crate) first_detection: u32,
+    /// The first task that trains an object that moves; 0 if there is none.
+    pub(crate) first_object: u32,
 }
 
 impl TaskNames {
     /// Those of a plan.
     pub(crate) fn of(plan: &Plan) -> Self {
         let first_detection = if plan.detect_tasks.is_empty() { 0 } else { plan.first_detection() as u32 };
-        Self { blocks: plan.tasks.iter().map(|task| task.block).collect(), first_detection }
+        let first_object = if plan.object_tasks.is_empty() { 0 } else { plan.first_object() as u32 };
+        Self { blocks: plan.tasks.iter().map(|task| task.block).collect(), first_detection, first_object }
     }
 
     /// A task's block; what it does and its number if it trains none, or its number if the blocks are not known.
@@ -45,6 +48,7 @@ impl TaskNames {
         match self.blocks.get(task as usize) {
             Some(block) => format!("block {block}"),
             None if self.blocks.is_empty() => format!("task {task}"),
+            None if self.first_object > 0 && task >= self.first_object => format!("object task {task}"),
             None if self.first_detection > 0 && task >= self.first_detection => format!("detection task {task}"),
             None => format!("evaluation task {task}"),
         }
@@ -209,10 +213,11 @@ mod tests {
     #[test]
     fn tasks_are_named_by_their_kind() {
         let blocks = vec![BlockId::ROOT];
-        let names = TaskNames { blocks: blocks.clone(), first_detection: 3 };
-        let all: Vec<String> = (0..4).map(|task| names.name(task)).collect();
-        assert_eq!(all, ["block 0/0/0", "evaluation task 1", "evaluation task 2", "detection task 3"]);
-        assert_eq!(TaskNames { blocks, first_detection: 0 }.name(1), "evaluation task 1");
+        let names = TaskNames { blocks: blocks.clone(), first_detection: 3, first_object: 4 };
+        let all: Vec<String> = (0..5).map(|task| names.name(task)).collect();
+        assert_eq!(all[..3], ["block 0/0/0", "evaluation task 1", "evaluation task 2"]);
+        assert_eq!(all[3..], ["detection task 3", "object task 4"]);
+        assert_eq!(TaskNames { blocks, ..TaskNames::default() }.name(1), "evaluation task 1");
         assert_eq!(TaskNames::default().name(3), "task 3");
     }
 

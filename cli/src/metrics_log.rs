@@ -56,6 +56,8 @@ pub(crate) struct MetricsLog {
     measured_views: u64,
     /// The first detection task, and the number of views that those tasks look at.
     detection: (usize, u64),
+    /// The first task of an object that moves, and the steps of all of them.
+    objects: (usize, u64),
     /// CPU and wall seconds when the first evaluation task began. Evaluation does not count.
     trained_at: Option<(f64, f64)>,
     failed: Option<Failure>,
@@ -83,6 +85,7 @@ impl MetricsLog {
             done: 0,
             measured_views: plan.eval_tasks.iter().map(|task| task.views.len() as u64).sum(),
             detection: (plan.first_detection(), plan.detect_tasks.iter().map(|task| u64::from(task.count)).sum()),
+            objects: (plan.first_object(), plan.object_tasks.iter().map(|task| u64::from(task.steps)).sum()),
             trained_at: None,
             failed: None,
         })
@@ -92,6 +95,9 @@ impl MetricsLog {
     pub(crate) fn update(&mut self, update: &Event) {
         match update {
             Event::Changed(changed) => {
+                if changed.task as usize >= self.objects.0 {
+                    return self.object_changed(changed);
+                }
                 if changed.task as usize >= self.detection.0 {
                     return self.detection_changed(changed);
                 }
@@ -138,6 +144,14 @@ impl MetricsLog {
         }
     }
 
+    /// Tasks of objects that move come after the blocks around their paths.
+    fn object_changed(&mut self, changed: &TaskChanged) {
+        if let TaskState::Failed | TaskState::Quarantined = changed.state() {
+            let (number, why) = (changed.task as usize - self.objects.0, proto::one_line(&changed.message));
+            self.progress.note(format!("object {number} that moves failed: {why}"));
+        }
+    }
+
     /// Takes over progress and times of a task; false if there is no such task.
     fn spend(&mut self, task: usize, spent: Spent) -> bool {
         let Some(before) = self.tasks.get_mut(task) else { return false };
@@ -152,6 +166,7 @@ impl MetricsLog {
     fn report(&mut self, task: usize, attempt: u32, report: &proto::Report) {
         let &proto::Report { step, cpu_seconds, wall_seconds, .. } = report;
         let (first_detection, looked_at) = self.detection;
+        let (first_object, trained) = self.objects;
         let Some(&(block, planned)) = self.planned.get(task) else {
             let done = |tasks: &[Spent]| tasks.iter().map(|spent| spent.step).sum();
             if task < first_detection {
@@ -160,7 +175,12 @@ impl MetricsLog {
                 let measured = done(&self.tasks[self.planned.len()..first_detection]);
                 self.progress.at("evaluating", measured, self.measured_views, "");
             } else if self.spend(task, Spent { attempt, step, cpu_seconds, wall_seconds }) && !self.is_training() {
-                self.progress.at("objects", done(&self.tasks[first_detection..]), looked_at, "");
+                match task < first_object {
+                    true => {
+                        self.progress.at("objects", done(&self.tasks[first_detection..first_object]), looked_at, "")
+                    }
+                    false => self.progress.at("moving objects", done(&self.tasks[first_object..]), trained, ""),
+                }
             }
             return;
         };

@@ -67,7 +67,7 @@ impl Remote {
         let blocks = columns.map(|((level, x), y)| format!("{level}/{x}/{y}").parse::<BlockId>());
         let blocks = blocks.collect::<Result<_, _>>();
         let blocks = blocks.map_err(|error| Failure::Work(format!("the coordinator's answer: {error}")))?;
-        Ok(TaskNames { blocks, first_detection: reply.first_detection })
+        Ok(TaskNames { blocks, first_detection: reply.first_detection, first_object: reply.first_object })
     }
 
     /// Follows a job of this many tasks to its end and passes on each update. If the coordinator is lost, it reconnects and receives the

@@ -34,6 +34,7 @@ fn work_of(plan: &Plan, task: PlannedTask) -> u64 {
             task.pixels as f64 * SECONDS_PER_EVALUATED_PIXEL + splats * SECONDS_PER_READ_SPLAT
         }
         PlannedTask::Detect(task) => return task.work_millis,
+        PlannedTask::Object(task) => return task.work_millis,
     };
     // `as` saturates: a plan may have any number of steps.
     (seconds * 1e3) as u64

@@ -294,6 +294,7 @@ impl Coordinator for Service {
                 x: column(|block| block.x),
                 y: column(|block| block.y),
                 first_detection: if plan.detect_tasks.is_empty() { 0 } else { plan.first_detection() as u32 },
+                first_object: if plan.object_tasks.is_empty() { 0 } else { plan.first_object() as u32 },
             })
         };
         Ok(Response::new(self.read_plan(plan, columns).await?))

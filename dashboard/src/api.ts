@@ -20,6 +20,7 @@ export interface Job {
   blocks: number;
   evaluations: number;
   detections: number;
+  objects: number;
   levels: number;
   counts: { waiting: number; ready: number; leased: number; done: number; failed: number; quarantined: number };
   started_unix_ms: number | null;
@@ -118,6 +119,7 @@ export interface Plan {
   blocks: { level: number[]; x: number[]; y: number[]; steps: number[]; budget: number[]; rho_metres: number[]; views: number[] };
   evaluations: number;
   detections: number;
+  objects: number;
   cameras: { x: number[]; y: number[]; test: number[] };
   points: { x: number[]; y: number[] };
 }
@@ -148,7 +150,7 @@ export type Band = [p10: number, p50: number, p90: number];
 export interface Task {
   task: number;
   block: string | null;
-  kind: 'train' | 'evaluate' | 'detect';
+  kind: 'train' | 'evaluate' | 'detect' | 'object';
   state: string;
   steps: number;
   budget: number;

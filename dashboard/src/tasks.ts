@@ -56,7 +56,10 @@ export class TaskTable {
     const b = this.plan.blocks;
     if (task < this.blocks) return `${b.level[task]}/${b.x[task]}/${b.y[task]}`;
     const other = task - this.blocks;
-    return other < this.plan.evaluations ? `evaluation ${other + 1}` : `detection ${other - this.plan.evaluations + 1}`;
+    const { evaluations, detections } = this.plan;
+    if (other < evaluations) return `evaluation ${other + 1}`;
+    const rest = other - evaluations;
+    return rest < detections ? `detection ${rest + 1}` : `object ${rest - detections + 1}`;
   }
 
   /** Edge of a block of this level, in metres. */

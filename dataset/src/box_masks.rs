@@ -8,8 +8,6 @@ use scene::Pinhole;
 /// A box grows by this share and this many metres on each side: annotations are not exact.
 const GROWTH: f64 = 0.05;
 const GROWTH_METRES: f64 = 0.1;
-/// Depth of the plane that boxes are cut at, metres.
-const NEAR_METRES: f64 = 0.1;
 
 /// Sets the pixels that these boxes cover to 0. `boxes` are corners in the camera's axes, numbered by the bits of their signs along
 /// the three sides.
@@ -23,8 +21,8 @@ pub(crate) fn exclude(mask: &mut [u8], pinhole: &Pinhole, boxes: &[[DVec3; 8]]) 
 }
 
 /// The pixels that a box covers, the convex hull of its picture: for each row from the top the columns.
-pub(crate) fn covered(corners: &[DVec3; 8], pinhole: &Pinhole) -> impl Iterator<Item = (u32, Range<u32>)> {
-    let outline = outline(corners, pinhole);
+pub fn covered(corners: &[DVec3; 8], pinhole: &Pinhole) -> impl Iterator<Item = (u32, Range<u32>)> {
+    let outline = pinhole.outline(corners);
     let bound =
         |pick: fn(&DVec2) -> f64, start: f64, fold: fn(f64, f64) -> f64| outline.iter().map(pick).fold(start, fold);
     let top = bound(|p| p.y, f64::INFINITY, f64::min).floor().max(0.0) as u32;
@@ -51,21 +49,6 @@ fn grown(corners: &[DVec3; 8]) -> [DVec3; 8] {
         let arm = corner - centre;
         corner + arm * GROWTH + arm.normalize_or_zero() * (GROWTH_METRES * 3f64.sqrt())
     })
-}
-
-/// Pixels whose convex hull is the picture of the part of the box before the near plane.
-fn outline(corners: &[DVec3; 8], k: &Pinhole) -> Vec<DVec2> {
-    let pixel = |p: DVec3| DVec2::new(k.fx * p.x / p.z + k.cx, k.fy * p.y / p.z + k.cy);
-    let mut points: Vec<DVec2> = corners.iter().filter(|p| p.z >= NEAR_METRES).map(|p| pixel(*p)).collect();
-    for (i, a) in corners.iter().enumerate() {
-        for bit in [1, 2, 4].into_iter().filter(|bit| i & bit == 0) {
-            let b = corners[i | bit];
-            if (a.z < NEAR_METRES) != (b.z < NEAR_METRES) {
-                points.push(pixel(a.lerp(b, (NEAR_METRES - a.z) / (b.z - a.z)).with_z(NEAR_METRES)));
-            }
-        }
-    }
-    points
 }
 
 #[cfg(test)]

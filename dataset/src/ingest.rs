@@ -32,7 +32,7 @@ use crate::undistortion::Undistorter;
 use crate::{box_masks, mip_tiles, mips, photo};
 
 /// An ingested capture in the store.
-pub const CAPTURE: Kind = Kind(*b"capt", 2);
+pub const CAPTURE: Kind = Kind(*b"capt", 3);
 /// The ingest record of a photo.
 const RECORD: Kind = Kind(*b"memo", 1);
 /// Part of the hash of a photo. Raise it with each change of decoding, undistortion, downscaling, mips or their format.
@@ -91,7 +91,9 @@ pub fn ingest(
     })?;
     let decoded = views.iter().filter(|(_, decoded)| *decoded).count();
     let views = views.into_iter().map(|(view, _)| view).collect();
-    let mut capture = Capture { views, points: source.capture.points.clone(), geo_origin: source.capture.geo_origin };
+    let Capture { points, geo_origin, objects, .. } = &source.capture;
+    let (points, objects) = (points.clone(), objects.clone());
+    let mut capture = Capture { views, points, geo_origin: *geo_origin, objects };
     let depths = Depths::new(source, options.downscale);
     let concerned: Vec<usize> = (0..photos.len()).filter(|&view| depths.concerns(view)).collect();
     let measured = in_threads(options.threads, concerned.len(), |i, undistorter: &mut LastUndistorter| {
@@ -214,6 +216,7 @@ impl Job<'_> {
                 mips: record.mips.iter().map(|(id, _)| *id).collect(),
                 masked: record.masked,
                 depth: None,
+                seconds: view.seconds,
             },
             decoded,
         ))
@@ -232,7 +235,7 @@ impl Job<'_> {
             box_masks::exclude(photo.mask.get_or_insert_with(all), &undistorter.pinhole(), &moving);
         }
         let mut pixels =
-            Pixels { width, height, rgb: photo::planes(&photo.rgb), mask: photo.mask, weights: None, depth: None };
+            Pixels { width, height, rgb: photo::planes(&photo.rgb), mask: photo.mask, ..Pixels::default() };
         drop(photo.rgb);
         if self.downscale > 1 {
             pixels = mips::downscale(&pixels, self.downscale);

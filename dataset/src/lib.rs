@@ -4,7 +4,7 @@
 //! Architecture invariant: this is the only crate that opens a capture's files. It returns plain data (`scene`) and artefact
 //! ids; crates above it do not know the files or the lenses of photos.
 
-mod box_masks;
+pub mod box_masks;
 pub mod byte_lru;
 pub mod depth_maps;
 pub mod depth_samples;

@@ -240,7 +240,7 @@ impl TileIndex {
             copy_overlap(&tile_bytes, tile, &mut planes, rect);
         }
         let mask = self.layout.masked.then(|| planes.split_off(3 * area));
-        Ok(Pixels { width: rect.width, height: rect.height, rgb: planes, mask, weights: None, depth: None })
+        Ok(Pixels { width: rect.width, height: rect.height, rgb: planes, mask, ..Pixels::default() })
     }
 
     /// The tiles that a window inside the image intersects.
@@ -280,14 +280,7 @@ mod tests {
             rows.flat_map(|row| &row[r.x as usize..(r.x + r.width) as usize]).copied().collect()
         };
         let rgb = p.rgb.chunks(p.area()).flat_map(cut).collect();
-        Pixels {
-            width: r.width,
-            height: r.height,
-            rgb,
-            mask: p.mask.as_ref().map(|m| cut(m)),
-            weights: None,
-            depth: None,
-        }
+        Pixels { width: r.width, height: r.height, rgb, mask: p.mask.as_ref().map(|m| cut(m)), ..Pixels::default() }
     }
 
     fn index(bytes: &[u8], p: &Pixels) -> Result<TileIndex, CodecError> {
@@ -341,6 +334,6 @@ mod tests {
             assert!(window(&bytes[..at], &finest, whole).is_err(), "the truncation at {at} was not detected");
         }
         assert!(index(&bytes, &image(40, 150, true)).is_err() && index(&bytes, &image(150, 40, false)).is_err());
-        assert!(encode(&Pixels { width: 0, height: 4, rgb: vec![], mask: None, weights: None, depth: None }).is_err());
+        assert!(encode(&Pixels { width: 0, height: 4, rgb: vec![], ..Pixels::default() }).is_err());
     }
 }

@@ -44,7 +44,7 @@ impl PixelSums {
     fn mean(&self, m: u8) -> Pixels {
         let half = (1u64 << (2 * m)) / 2;
         let rgb = self.rgb.iter().map(|&sum| ((u64::from(sum) + half) >> (2 * m)) as u8).collect();
-        Pixels { width: self.width, height: self.height, rgb, mask: self.mask.clone(), weights: None, depth: None }
+        Pixels { width: self.width, height: self.height, rgb, mask: self.mask.clone(), ..Pixels::default() }
     }
 }
 
@@ -101,7 +101,7 @@ pub fn downscale(pixels: &Pixels, factor: u32) -> Pixels {
         shrink(mask, &mut all, |sum, n| if sum == 255 * n { 255 } else { 0 });
         all
     });
-    Pixels { width, height, rgb, mask, weights: None, depth: None }
+    Pixels { width, height, rgb, mask, ..Pixels::default() }
 }
 
 #[cfg(test)]
@@ -113,7 +113,7 @@ pub(crate) mod tests {
         let n = (width * height) as usize;
         let byte = |i: usize| ((i / 7) as u32 ^ (i as u32).wrapping_mul(2_654_435_761) >> 27) as u8;
         let mask = masked.then(|| (0..n).map(|i| if i % 97 < 5 { 0 } else { 255 }).collect());
-        Pixels { width, height, rgb: (0..3 * n).map(byte).collect(), mask, weights: None, depth: None }
+        Pixels { width, height, rgb: (0..3 * n).map(byte).collect(), mask, ..Pixels::default() }
     }
 
     /// Reference implementation: means of `edge × edge` pixels, one pixel at a time.
@@ -130,7 +130,7 @@ pub(crate) mod tests {
         let mean = |v: &[u8]| (v.iter().map(|&v| f64::from(v)).sum::<f64>() / v.len() as f64 + 0.5).floor() as u8;
         let all = |v: &[u8]| if v.iter().all(|&v| v == 255) { 255 } else { 0 };
         let rgb = p.rgb.chunks(p.area()).flat_map(|plane| pool(plane, &mean)).collect();
-        Pixels { width, height, rgb, mask: p.mask.as_ref().map(|m| pool(m, &all)), weights: None, depth: None }
+        Pixels { width, height, rgb, mask: p.mask.as_ref().map(|m| pool(m, &all)), ..Pixels::default() }
     }
 
     #[test]

@@ -22,6 +22,7 @@ mod masks;
 mod nuscenes;
 mod opensfm;
 mod parsed;
+mod tracks;
 mod transforms;
 mod truth;
 mod waymo;
@@ -118,7 +119,7 @@ impl Source {
 pub fn open(path: &Path, options: &OpenOptions) -> Result<Source, BadInput> {
     let (named, segment) = (nuscenes::named_scene(path), waymo::named_segment(path));
     let root = CaptureRoot::new(named.or(segment).map_or(path, |(folder, _)| folder))?;
-    let ParsedCapture { mut format, images, points, origin, left_out: unused, sweeps, labels, root: other } =
+    let ParsedCapture { mut format, images, points, origin, left_out: unused, sweeps, labels, objects, root: other } =
         match (named, segment) {
             (Some((_, scene)), _) => nuscenes::read(&root, Some(scene), options)?,
             (None, Some((_, segment))) => waymo::read(&root, Some(segment), options)?,
@@ -127,7 +128,12 @@ pub fn open(path: &Path, options: &OpenOptions) -> Result<Source, BadInput> {
     let root = other.unwrap_or(root);
     let (images, photos, mut left_out) = find_photos(&root, images, options)?;
     left_out.extend(unused);
-    let views = views(&images, &photos)?;
+    let mut views = views(&images, &photos)?;
+    let mut objects = objects;
+    if let Some(found) = tracks::find(&root)? {
+        views.iter_mut().for_each(|view| view.seconds = tracks::seconds(&found, &view.name).or(view.seconds));
+        objects = found.objects;
+    }
     let mut points = points.with_view_indices(images.iter().map(|image| image.id));
     let cameras: Vec<Camera> = views.iter().map(|view| view.camera).collect();
     let sweeps = match sweeps {
@@ -154,7 +160,7 @@ pub fn open(path: &Path, options: &OpenOptions) -> Result<Source, BadInput> {
             _ => "kitti360 without points",
         };
     }
-    let capture = Capture { views, points, geo_origin: geo_origin(&root)?.or(origin) };
+    let capture = Capture { views, points, geo_origin: geo_origin(&root)?.or(origin), objects };
     Ok(Source { capture, photos, left_out, format, sweeps, seeds, labels })
 }
 
@@ -338,6 +344,7 @@ fn views(images: &[PosedImage], photos: &[Photo]) -> Result<Vec<View>, BadInput>
             mips: Vec::new(),
             masked: photo.mask.is_some() || photo.boxes.iter().any(|of| of.moves),
             depth: None,
+            seconds: image.seconds,
         })
     };
     images.iter().zip(photos).map(view).collect()

@@ -152,7 +152,13 @@ impl<'a> CutMeter<'a> {
         let options = Options { antialiased: way.antialiased, sh_degree: splats.sh_degree(), ..Options::default() };
         let mut splats = Cow::Borrowed(splats);
         if way.thinned && way.mip > 0 {
-            let at_mip = TrainView { view: index, mip: way.mip, rect: camera.full(), camera: view.camera };
+            let at_mip = TrainView {
+                view: index,
+                mip: way.mip,
+                rect: camera.full(),
+                camera: view.camera,
+                camera_from_context: None,
+            };
             from_full_resolution(splats.to_mut(), &[at_mip]);
         }
         let frame = renderer.render_once(&splats, &camera, &options)?;

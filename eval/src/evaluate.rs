@@ -13,12 +13,14 @@ use scene::{BadInput, Camera, Splats};
 use train::Backend;
 
 use crate::budgets::{BudgetFigures, BudgetMeter};
+use crate::composition::Composition;
 use crate::cuts::{CutFigures, CutMeter};
 use crate::details::Details;
 use crate::figures::{Comparison, ViewFigures, clamped};
 use crate::fits::{Fits, Fitter};
 use crate::images::{colour_image, photo_image, write_png};
 use crate::judges::{DepthReport, DetectionReport, Judged, Judges};
+use crate::moving::{MovingFigures, MovingMeter};
 use crate::seams::{SeamFrames, SeamMeter, SeamReport};
 use crate::sheet::{SheetRow, contact_sheet};
 use crate::summary::{ByKind, Group};
@@ -77,6 +79,8 @@ pub struct Evaluation {
     pub detections: Vec<DetectionReport>,
     /// The contact sheet.
     pub sheet: PathBuf,
+    /// Of objects that move, where the capture has some.
+    pub moving: Option<MovingFigures>,
     /// In the order of the request.
     pub cuts: Vec<CutFigures>,
     /// In the order of the request.
@@ -108,6 +112,8 @@ pub fn evaluate(request: &Request, observer: &dyn Observer) -> Result<Evaluation
     let mut renderer = Renderer::new(backend)?;
     let mut fitter = Fitter::new(fits, &model.splats, model.antialiased, &held_out, &reader)?;
     let splats = renderer.upload(&model.splats)?;
+    let objects = Composition::new(&renderer, model.objects.iter())?;
+    let mut moving = MovingMeter::new(&photos.capture.objects);
 
     // The finest cut of the model's own tree is the model itself.
     let own = details.own.as_ref().map(|tree| Scene::new(tree, Cow::Borrowed(&model.splats)));
@@ -130,11 +136,14 @@ pub fn evaluate(request: &Request, observer: &dyn Observer) -> Result<Evaluation
         let view = &photos.capture.views[index as usize];
         let photo = reader.window(index, 0, view.camera.full())?;
         let began = observer.now();
-        let frame = renderer.render(&splats, &view.camera, &options)?;
+        let frame = renderer.compose(&splats, &objects.at(view.seconds), &view.camera, &options)?;
         render_seconds.add(began, observer.now());
         let part = if i < test.len() { Part::Test } else { Part::Stretch };
         let compared = Comparison::new(&view.name, &frame.colour, &photo);
         let mut figures = compared.figures(lpips)?;
+        if let Some(moving) = &mut moving {
+            moving.add(view, &photo, &compared);
+        }
         judges.add((part, index), view, &photo, frame, (&compared, &figures))?;
         let rendering = (&mut renderer, &splats, &model.options());
         fitter.add(&mut figures, (index, &photo), &compared, rendering, &photos.capture)?;
@@ -174,7 +183,7 @@ pub fn evaluate(request: &Request, observer: &dyn Observer) -> Result<Evaluation
     for (i, &index) in trained.iter().enumerate() {
         let view = &photos.capture.views[index as usize];
         let photo = reader.window(index, 0, view.camera.full())?;
-        let frame = renderer.render(&splats, &view.camera, &options)?;
+        let frame = renderer.compose(&splats, &objects.at(view.seconds), &view.camera, &options)?;
         let compared = Comparison::new(&view.name, &frame.colour, &photo);
         let figures = compared.figures(lpips)?;
         judges.add((Part::Trained, index), view, &photo, frame, (&compared, &figures))?;
@@ -197,6 +206,7 @@ pub fn evaluate(request: &Request, observer: &dyn Observer) -> Result<Evaluation
         depth,
         detections,
         sheet,
+        moving: moving.map(MovingMeter::figures),
         cuts: cuts.map_or(Vec::new(), CutMeter::figures),
         budgets: budgets.map_or(Vec::new(), BudgetMeter::figures),
         seams: seams.map(|seams| seams.finish(&photos.capture, out, &mut renderer)).transpose()?,

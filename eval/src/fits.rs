@@ -75,5 +75,5 @@ impl<'a> Fitter<'a> {
 /// The whole photo of a view.
 fn window(capture: &Capture, view: u32) -> Option<TrainView> {
     let camera = capture.views.get(view as usize)?.camera;
-    Some(TrainView { view, mip: 0, rect: camera.full(), camera })
+    Some(TrainView { view, mip: 0, rect: camera.full(), camera, camera_from_context: None })
 }

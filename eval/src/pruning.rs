@@ -50,7 +50,7 @@ impl<'a> Pruner<'a> {
             let window = |i: u32| {
                 let given = photos.capture.views[i as usize].camera;
                 let camera = poses.map_or(given, |poses| poses.apply(i, given));
-                TrainView { view: i, mip: 0, rect: camera.full(), camera }
+                TrainView { view: i, mip: 0, rect: camera.full(), camera, camera_from_context: None }
             };
             photos.split.views(part).into_iter().map(window).collect()
         };

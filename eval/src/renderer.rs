@@ -1,10 +1,19 @@
 //! Renders views on the CPU or on a GPU behind one interface.
 
-use render::{Frame, Options, cpu};
+#[cfg(feature = "gpu")]
+use render::gpu::GpuSplats;
+use render::{Frame, Options, Part, cpu};
+#[cfg(feature = "gpu")]
+use scene::Rigid;
 use scene::{Camera, Splats};
 use train::Backend;
 
 use crate::EvalError;
+use crate::composition::Placed;
+
+/// What a caller of [`Renderer`] did wrong.
+#[cfg(feature = "gpu")]
+const OTHER_BACKEND: &str = "splats were uploaded to another backend";
 
 /// A renderer of one backend. Keeps its buffers between views.
 pub struct Renderer(Inner);
@@ -21,7 +30,7 @@ pub struct Uploaded<'a>(Place<'a>);
 enum Place<'a> {
     Cpu(&'a Splats),
     #[cfg(feature = "gpu")]
-    Gpu(Box<render::gpu::GpuSplats>),
+    Gpu(Box<GpuSplats>),
 }
 
 impl Renderer {
@@ -66,12 +75,45 @@ impl Renderer {
     /// # Panics
     /// If the splats were uploaded to a renderer of another backend.
     pub fn render(&mut self, splats: &Uploaded, camera: &Camera, options: &Options) -> Result<&Frame, EvalError> {
+        self.compose(splats, &[], camera, options)
+    }
+
+    /// As [`render`](Self::render), with objects in their places.
+    ///
+    /// # Errors
+    /// As `render`.
+    ///
+    /// # Panics
+    /// As `render`.
+    pub fn compose(
+        &mut self,
+        splats: &Uploaded,
+        objects: &[Placed],
+        camera: &Camera,
+        options: &Options,
+    ) -> Result<&Frame, EvalError> {
+        let pose = |object: &Placed| camera.camera_from_world.after(&object.world_from_object);
         match (&mut self.0, &splats.0) {
-            (Inner::Cpu(renderer), Place::Cpu(splats)) => Ok(renderer.forward(splats, None, camera, options)),
+            (Inner::Cpu(renderer), Place::Cpu(splats)) => {
+                let parts = objects.iter().map(|object| match &object.splats.0 {
+                    Place::Cpu(splats) => Part { splats, camera_from_part: Some(pose(object)) },
+                    #[cfg(feature = "gpu")]
+                    Place::Gpu(_) => panic!("{OTHER_BACKEND}"),
+                });
+                let parts: Vec<Part> = parts.collect();
+                Ok(renderer.forward(splats, &parts, camera, options))
+            }
             #[cfg(feature = "gpu")]
-            (Inner::Gpu(gpu), Place::Gpu(splats)) => gpu.render(splats, camera, options),
+            (Inner::Gpu(gpu), Place::Gpu(splats)) => {
+                let parts = objects.iter().map(|object| match &object.splats.0 {
+                    Place::Gpu(splats) => (&**splats, [pose(object)]),
+                    Place::Cpu(_) => panic!("{OTHER_BACKEND}"),
+                });
+                let parts: Vec<(&GpuSplats, [Rigid; 1])> = parts.collect();
+                gpu.render(splats, &parts, camera, options)
+            }
             #[cfg(feature = "gpu")]
-            _ => panic!("splats were uploaded to another backend"),
+            _ => panic!("{OTHER_BACKEND}"),
         }
     }
 
@@ -89,9 +131,9 @@ impl Renderer {
 mod gpu {
     use std::sync::Arc;
 
-    use render::gpu::{Gpu, GpuError, GpuRenderer, GpuSplats};
+    use render::gpu::{Gpu, GpuError, GpuPart, GpuRenderer, GpuSplats};
     use render::{Frame, Options};
-    use scene::{Camera, Splats};
+    use scene::{Camera, Rigid, Splats};
 
     use crate::EvalError;
 
@@ -118,10 +160,13 @@ mod gpu {
         pub(super) fn render(
             &mut self,
             splats: &GpuSplats,
+            parts: &[(&GpuSplats, [Rigid; 1])],
             camera: &Camera,
             options: &Options,
         ) -> Result<&Frame, EvalError> {
-            self.frame = self.renderer.draw(splats, None, camera, options).map_err(failed)?;
+            let parts: Vec<GpuPart> =
+                parts.iter().map(|(splats, pose)| GpuPart { splats, cameras_from_part: Some(pose) }).collect();
+            self.frame = self.renderer.draw(splats, &parts, camera, options).map_err(failed)?;
             Ok(&self.frame)
         }
     }

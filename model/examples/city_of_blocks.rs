@@ -84,6 +84,7 @@ fn plan(levels: u8, sh_degree: u8, seed: u64, splats: u64) -> Plan {
         tasks,
         eval_tasks: Vec::new(),
         detect_tasks: Vec::new(),
+        object_tasks: Vec::new(),
     }
 }
 

@@ -34,6 +34,12 @@ pub enum ModelError {
     /// The artefact of this block is damaged.
     #[error("block {0}: {1}")]
     DamagedResult(BlockId, CodecError),
+    /// The plan's results have no artefact of this object, or the capture does not have it.
+    #[error("object {0} has no result")]
+    NoObject(u32),
+    /// The artefact of this object is damaged.
+    #[error("object {0}: {1}")]
+    DamagedObject(String, CodecError),
     /// The artefact of the refined poses is damaged.
     #[error("refined poses: {0}")]
     DamagedPoses(CodecError),

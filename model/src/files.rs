@@ -13,6 +13,8 @@ pub(crate) const EXPOSURES_FILE: &str = "exposures.plat";
 pub(crate) const POSES_FILE: &str = "poses.plat";
 pub(crate) const CAMERAS_FILE: &str = "cameras.json";
 pub(crate) const MERGED_FILE: &str = "merged.ply";
+pub(crate) const OBJECTS_FOLDER: &str = "objects";
+pub(crate) const PATHS_FILE: &str = "paths.json";
 
 /// File name of a block's splats.
 pub(crate) fn block_file(block: BlockId) -> String {

@@ -8,6 +8,8 @@
 //! OUT/model/poses.plat          poses of the training views, where they were refined
 //! OUT/model/blocks/L-x-y.plat   splats of one block with its halo, as a frame
 //! OUT/merged.ply                the finest cut, merged
+//! OUT/objects/paths.json        objects that move: names, boxes, paths
+//! OUT/objects/ID.ply            splats of each, in its own axes
 //! OUT/cameras.json              the refined cameras as transforms.json, where poses were refined
 //! ```
 //!
@@ -30,7 +32,7 @@ mod write;
 use std::path::{Path, PathBuf};
 
 use blocks::{Ground, Split};
-use scene::{BadInput, Capture, Exposures, GeoOrigin, Poses, Splats, ply, spz};
+use scene::{BadInput, Capture, Exposures, GeoOrigin, MovingObject, Poses, Splats, ply, spz};
 
 pub use error::ModelError;
 pub use export::Exported;
@@ -50,11 +52,22 @@ const ANTIALIASED: &str = "antialiased";
 /// `--test-every` of a model whose training is unknown.
 const DEFAULT_TEST_EVERY: u32 = 8;
 
+/// An object that moves.
+#[derive(Debug, Clone)]
+pub struct ModelObject {
+    /// Its name, class, box and path.
+    pub about: MovingObject,
+    /// Its splats, in its own axes.
+    pub splats: Splats,
+}
+
 /// A model in memory.
 #[derive(Debug)]
 pub struct Model {
     /// The finest cut.
     pub splats: Splats,
+    /// Objects that move, by name.
+    pub objects: Vec<ModelObject>,
     /// Whether opacity is compensated for the screen-space dilation (Mip-Splatting's 2D filter).
     pub antialiased: bool,
     /// Where on Earth the origin lies, if known; x is east, y north, z up there.
@@ -70,7 +83,7 @@ pub struct Model {
 impl Model {
     /// Splats of which no more is known.
     pub(crate) fn of(splats: Splats, antialiased: bool) -> Self {
-        Self { splats, antialiased, geo_origin: None, exposures: None, poses: None, trained: None }
+        Self { splats, objects: Vec::new(), antialiased, geo_origin: None, exposures: None, poses: None, trained: None }
     }
 
     /// The options to render it with.

@@ -7,12 +7,16 @@ use std::path::{Path, PathBuf};
 
 use blocks::{Cut, Ground, Mode, Plan};
 use glam::DVec3;
-use scene::{BLOCK_ATTRIBUTE, BadInput, BlockId, CodecError, Exposures, GeoOrigin, Poses, Splats, frame};
+use scene::{
+    BLOCK_ATTRIBUTE, BadInput, BlockId, CodecError, Exposures, GeoOrigin, MovingObject, Poses, Splats, frame, ply,
+};
 
-use crate::Model;
-use crate::files::{EXPOSURES_FILE, MANIFEST_FILE, PLAN_FILE, POSES_FILE, block_file, damaged, load};
+use crate::files::{
+    EXPOSURES_FILE, MANIFEST_FILE, OBJECTS_FOLDER, PATHS_FILE, PLAN_FILE, POSES_FILE, block_file, damaged, load,
+};
 use crate::import::{self, Imported, Kind};
 use crate::manifest::{Manifest, VERSION};
+use crate::{Model, ModelObject};
 
 /// Reads a model: a folder that `plat train` wrote, its `model` folder, or any file or folder that [`kind`](crate::kind) knows. A
 /// model of another kind than the first is one set of splats, the finest.
@@ -48,7 +52,25 @@ fn read_trained(folder: &Path) -> Result<Model, BadInput> {
         None => None,
     };
     let Manifest { antialiased, geo_origin, .. } = manifest;
-    Ok(Model { splats, antialiased, geo_origin, exposures, poses, trained: Some((manifest, out.to_path_buf())) })
+    let objects = read_objects(&out.join(OBJECTS_FOLDER))?;
+    let trained = Some((manifest, out.to_path_buf()));
+    Ok(Model { splats, objects, antialiased, geo_origin, exposures, poses, trained })
+}
+
+/// The objects of a folder, by name; none without their paths.
+fn read_objects(folder: &Path) -> Result<Vec<ModelObject>, BadInput> {
+    let path = folder.join(PATHS_FILE);
+    if !path.is_file() {
+        return Ok(Vec::new());
+    }
+    let tracks = scene::objects::read(&load(&path)?).map_err(|error| damaged(&path, &error))?;
+    let object = |about: MovingObject| {
+        // Names have no separators, so that no path leads out of the folder.
+        let path = folder.join(format!("{}.ply", about.id));
+        let splats = ply::read(&load(&path)?).map_err(|error| damaged(&path, &error))?;
+        Ok(ModelObject { about, splats })
+    };
+    tracks.objects.into_iter().map(object).collect()
 }
 
 /// A model whose blocks are read one at a time. A file is one block.

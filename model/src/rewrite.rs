@@ -10,7 +10,7 @@ use crate::error::{ModelError, cannot};
 use crate::files::{EXPOSURES_FILE, MANIFEST_FILE, MERGED_FILE, POSES_FILE, block_file, save_json};
 use crate::import::{Kind, kind};
 use crate::read::{Tree, read_tree};
-use crate::write::begin;
+use crate::write::{begin, save_objects};
 use crate::{BlockEntry, Manifest, Model};
 
 /// Checks where a rewritten model shall go.
@@ -82,6 +82,7 @@ pub fn rewrite(path: &Path, out: &Path, model: Model, splats: Splats) -> Result<
 fn finish(out: &Path, folder: &Path, manifest: &Manifest, model: &Model) -> Result<u64, ModelError> {
     let merged = model.to_ply();
     save(&out.join(MERGED_FILE), &merged)?;
+    save_objects(out, &model.objects, model.antialiased)?;
     if let Some(exposures) = &model.exposures {
         save(&folder.join(EXPOSURES_FILE), &exposures.to_frame())?;
     }

@@ -4,7 +4,8 @@ use std::collections::BTreeSet;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use blocks::Plan;
+use blocks::{ObjectTask, Plan};
+use scene::objects::{self, Tracks};
 use scene::transforms::{self, Frame, Intrinsics, Transforms};
 use scene::{ArtefactId, BlockId, CameraModel, Capture, Poses, Splats, frame, ply};
 use store::BlockingStore;
@@ -12,11 +13,12 @@ use store::file::{AtomicFile, save};
 
 use crate::error::{ModelError, cannot};
 use crate::files::{
-    CAMERAS_FILE, EXPOSURES_FILE, MANIFEST_FILE, MERGED_FILE, PLAN_FILE, POSES_FILE, block_file, save_json,
+    CAMERAS_FILE, EXPOSURES_FILE, MANIFEST_FILE, MERGED_FILE, OBJECTS_FOLDER, PATHS_FILE, PLAN_FILE, POSES_FILE,
+    block_file, save_json,
 };
 use crate::manifest::{BlockEntry, Manifest, VERSION};
-use crate::ply_comments;
 use crate::read::read_block;
+use crate::{ModelObject, ply_comments};
 
 /// Creates the model folder under `out` and writes the plan. First removes an older model's manifest, merged file and reports,
 /// so that an interrupted write never passes for a model, nor old figures for those of this model.
@@ -31,6 +33,10 @@ pub(crate) fn begin(out: &Path, plan: &Plan) -> Result<PathBuf, ModelError> {
         if file.exists() {
             fs::remove_file(&file).map_err(cannot("replaced", &file))?;
         }
+    }
+    let objects = out.join(OBJECTS_FOLDER);
+    if objects.join(PATHS_FILE).exists() {
+        fs::remove_dir_all(&objects).map_err(cannot("replaced", &objects))?;
     }
     let blocks = folder.join("blocks");
     fs::create_dir_all(&blocks).map_err(cannot("made", &blocks))?;
@@ -93,6 +99,7 @@ pub fn write(
     }
     merged.commit()?;
 
+    save_objects(out, &objects_of(plan, results, store, capture)?, plan.settings.antialiased)?;
     if let Some(id) = exposures {
         save(&folder.join(EXPOSURES_FILE), &store.get(id)?)?;
     }
@@ -119,6 +126,39 @@ pub fn write(
     };
     save_json(&folder.join(MANIFEST_FILE), &manifest)?;
     Ok(Written { splats: count as u64, bytes })
+}
+
+/// The objects that move, of a plan that trains some. Where a job was cut short before them, there are none.
+fn objects_of(
+    plan: &Plan,
+    results: &[ArtefactId],
+    store: &BlockingStore,
+    capture: &Capture,
+) -> Result<Vec<ModelObject>, ModelError> {
+    let results = results.get(plan.first_object()..).unwrap_or_default();
+    let object = |(task, id): (&ObjectTask, &ArtefactId)| {
+        let about = capture.objects.get(task.object as usize).ok_or(ModelError::NoObject(task.object))?.clone();
+        let decoded = frame::decode_splats(&store.get(*id)?);
+        let splats = decoded.map_err(|error| ModelError::DamagedObject(about.id.clone(), error))?;
+        Ok(ModelObject { about, splats })
+    };
+    plan.object_tasks.iter().zip(results).map(object).collect()
+}
+
+/// Writes the splats of each object, in its own axes, and the paths of all; nothing without any.
+pub(crate) fn save_objects(out: &Path, objects: &[ModelObject], antialiased: bool) -> Result<(), ModelError> {
+    if objects.is_empty() {
+        return Ok(());
+    }
+    let folder = out.join(OBJECTS_FOLDER);
+    fs::create_dir_all(&folder).map_err(cannot("made", &folder))?;
+    for ModelObject { about, splats } in objects {
+        save(&folder.join(format!("{}.ply", about.id)), &ply::write(splats, ply_comments(antialiased)))?;
+    }
+    // Last: objects without their paths are none.
+    let objects = objects.iter().map(|object| object.about.clone()).collect();
+    save(&folder.join(PATHS_FILE), &objects::write(&Tracks { objects, ..Tracks::default() }))?;
+    Ok(())
 }
 
 /// A `transforms.json` of the views that have a refined pose, with the names of the capture's views as paths.

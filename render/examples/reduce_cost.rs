@@ -84,7 +84,7 @@ impl Timed {
     fn new(gpu: &Arc<Gpu>, splats: &Splats) -> Result<Self, GpuError> {
         let splats = GpuSplats::upload(gpu, splats, 0)?;
         let mut renderer = GpuRenderer::new(Arc::clone(gpu))?;
-        renderer.draw(&splats, None, &camera(), &Options::default())?;
+        renderer.draw(&splats, &[], &camera(), &Options::default())?;
         gpu.upload(renderer.upstream(), 0, &vec![1e-3f32; (3 * WIDTH * HEIGHT) as usize])?;
         Ok(Self { gpu: Arc::clone(gpu), renderer, splats, millis: Default::default() })
     }
@@ -105,7 +105,7 @@ impl Timed {
             Ok::<(), GpuError>(())
         };
         time(0, &mut |encoder| {
-            renderer.forward(encoder, splats, None, &[camera()], &Options::default())?;
+            renderer.forward(encoder, splats, &[], &[camera()], &Options::default())?;
             renderer.backward(encoder, splats, planes)
         })?;
         time(1, &mut |encoder| renderer.reduce_moments(encoder, planes, Reduction::Ordered))?;

@@ -16,6 +16,8 @@ pub mod cpu;
 #[cfg(feature = "gpu")]
 pub mod gpu;
 
+use scene::{Rigid, Splats};
+
 /// Near plane, metres: nearer splats are culled.
 pub const NEAR_METRES: f32 = 0.01;
 /// EWA's low-pass filter, px²: added to the diagonal of the projected covariance (gsplat's `eps2d`).
@@ -26,6 +28,23 @@ pub const ALPHA_MIN: f32 = 1.0 / 255.0;
 pub const ALPHA_MAX: f32 = 0.999;
 /// A pixel stops before its transmittance falls to this.
 pub const TRANSMITTANCE_MIN: f32 = 1e-4;
+
+/// Frozen splats that are drawn with the trainable ones.
+#[derive(Debug, Clone, Copy)]
+pub struct Part<'a> {
+    /// The splats.
+    pub splats: &'a Splats,
+    /// Takes their axes to the camera's, where theirs are not those of the trainable splats: the camera stands elsewhere for an object
+    /// that moves.
+    pub camera_from_part: Option<Rigid>,
+}
+
+impl<'a> Part<'a> {
+    /// Splats in the axes of the trainable ones.
+    pub fn beside(splats: &'a Splats) -> Self {
+        Self { splats, camera_from_part: None }
+    }
+}
 
 /// Rendering options.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -64,7 +83,7 @@ pub struct Frame {
     /// Σ αTz, metres, or Σ αT/z with [`Options::inverse_depth`]; empty without [`Options::extras`]. Divide by
     /// `1 - transmittance` for the mean.
     pub depth: Vec<f32>,
-    /// Σ αT over the trainable splats, without the context; empty without [`Options::extras`].
+    /// Σ αT over the trainable splats, without the frozen parts; empty without [`Options::extras`].
     pub trainable_alpha: Vec<f32>,
 }
 
@@ -77,12 +96,14 @@ pub struct Upstream {
     pub transmittance: Vec<f32>,
     /// dL/d depth, the plane of [`Frame`].
     pub depth: Vec<f32>,
+    /// dL/d trainable_alpha.
+    pub trainable_alpha: Vec<f32>,
 }
 
 /// Results of the stages before `rasterize`, in a form that all backends share.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct ForwardIntermediates {
-    /// Indices of the visible splats, nearest first. Context indices start after the trainable ones.
+    /// Indices of the visible splats, nearest first. Indices of frozen parts start after the trainable ones.
     pub order: Vec<u32>,
     /// The projected splats in this order: mean x, y (pixels); a, b, c, log2 opacity with
     /// `α = 2^(log2 opacity - (a dx + b dy)² - (c dy)²)`; red, green, blue; depth (metres, or its inverse); half extents x, y

@@ -4,7 +4,7 @@ mod reference;
 
 use reference::{Random, camera};
 use render::cpu::Renderer;
-use render::{Contributions, Options};
+use render::{Contributions, Options, Part};
 use scene::{Camera, Splats, column};
 
 const AREA: usize = 37 * 26;
@@ -30,7 +30,7 @@ fn weights(seed: u64) -> Vec<f32> {
 
 fn contributions(splats: &Splats, context: Option<&Splats>, camera: &Camera, weights: &[f32]) -> Contributions {
     let mut renderer = Renderer::default();
-    renderer.forward(splats, context, camera, &OPTIONS);
+    renderer.forward(splats, context.map(Part::beside).as_slice(), camera, &OPTIONS);
     renderer.contributions(weights).clone()
 }
 
@@ -40,7 +40,8 @@ fn energy_is_the_squared_error_of_the_frame_without_the_splat() {
         let ((splats, camera), (context, _)) = (self::splats(seed, 40), self::splats(seed + 50, 10));
         let weights = weights(seed);
         let mut renderer = Renderer::default();
-        let mut draw = |splats: &Splats| renderer.forward(splats, Some(&context), &camera, &OPTIONS).colour.clone();
+        let mut draw =
+            |splats: &Splats| renderer.forward(splats, &[Part::beside(&context)], &camera, &OPTIONS).colour.clone();
         let all = draw(&splats);
         let computed = contributions(&splats, Some(&context), &camera, &weights).energy;
         assert_eq!(computed.len(), splats.len());
@@ -64,7 +65,7 @@ fn weights_sum_to_the_covered_pixels() {
     let ((splats, camera), weights) = (splats(7, 40), weights(7));
     let computed = contributions(&splats, None, &camera, &weights).weight;
     let mut renderer = Renderer::default();
-    let rest = &renderer.forward(&splats, None, &camera, &OPTIONS).transmittance;
+    let rest = &renderer.forward(&splats, &[], &camera, &OPTIONS).transmittance;
     let covered: f64 = rest.iter().zip(&weights).map(|(rest, weight)| f64::from((1.0 - rest) * weight)).sum();
     let sum: f64 = computed.iter().map(|weight| f64::from(*weight)).sum();
     assert!((sum / covered - 1.0).abs() < 1e-4, "{sum} {covered}");
@@ -78,7 +79,7 @@ fn squared_is_energy_without_the_falloff() {
         let one = splats.filter(|k| k == i);
         let computed = contributions(&one, None, &camera, &weights);
         let mut renderer = Renderer::default();
-        let rest = &renderer.forward(&one, None, &camera, &OPTIONS).transmittance;
+        let rest = &renderer.forward(&one, &[], &camera, &OPTIONS).transmittance;
         let drawn = || rest.iter().zip(&weights).filter(|(rest, _)| **rest < 1.0);
         let alphas: f64 = drawn().map(|(rest, weight)| f64::from(*weight) * f64::from(1.0 - rest).powi(2)).sum();
         let counted: f64 = drawn().map(|(_, weight)| f64::from(*weight)).sum();
@@ -108,11 +109,11 @@ fn contributions_do_not_depend_on_threads_or_on_earlier_views() {
     assert_eq!((&one.energy, &one.squared, &one.weight), (&three.energy, &three.squared, &three.weight));
     assert!(one.energy.iter().any(|value| *value > 0.0));
     let mut renderer = Renderer::default();
-    renderer.forward(&splats, None, &camera, &OPTIONS);
+    renderer.forward(&splats, &[], &camera, &OPTIONS);
     renderer.contributions(&[]);
     let mut away = camera;
     away.camera_from_world.translation.z -= 100.0;
-    renderer.forward(&splats, None, &away, &OPTIONS);
+    renderer.forward(&splats, &[], &away, &OPTIONS);
     let nothing = renderer.contributions(&[]);
     assert!(nothing.weight.iter().chain(&nothing.squared).chain(&nothing.energy).all(|value| *value == 0.0));
 }

@@ -4,7 +4,7 @@ mod reference;
 
 use reference::{Random, camera};
 use render::cpu::{Isa, Renderer};
-use render::{Options, Upstream};
+use render::{Options, Part, Upstream};
 use scene::Splats;
 
 /// Every number of a frame and of its gradients, as bits.
@@ -22,8 +22,12 @@ fn bits(isa: Isa, threads: usize, antialiased: bool) -> Vec<u32> {
     };
     let (splats, context) = (cloud(5000), cloud(3000));
     let area = 250 * 187;
-    let upstream =
-        Upstream { colour: random.plane(3 * area), transmittance: random.plane(area), depth: random.plane(area) };
+    let upstream = Upstream {
+        colour: random.plane(3 * area),
+        transmittance: random.plane(area),
+        depth: random.plane(area),
+        trainable_alpha: random.plane(area),
+    };
     let options =
         Options { antialiased, sh_degree: 1, background: [0.1, 0.2, 0.3], extras: true, inverse_depth: false };
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("threads");
@@ -32,7 +36,7 @@ fn bits(isa: Isa, threads: usize, antialiased: bool) -> Vec<u32> {
         let mut all = Vec::new();
         // Twice, to cover reused buffers.
         for _ in 0..2 {
-            let frame = renderer.forward(&splats, Some(&context), &camera, &options);
+            let frame = renderer.forward(&splats, &[Part::beside(&context)], &camera, &options);
             for plane in [&frame.colour, &frame.transmittance, &frame.depth, &frame.trainable_alpha] {
                 all.extend(plane.iter().map(|v| v.to_bits()));
             }

@@ -7,7 +7,7 @@ use glam::{DQuat, DVec3, Vec3};
 use reference::mixture::{KINDS, Kind, SIZES, TOLERANCE, Tally, camera_of, mixture};
 use reference::{Random, Scene, camera};
 use render::cpu::{Isa, Renderer};
-use render::{Frame, Gradients, Options, Upstream};
+use render::{Frame, Gradients, Options, Part, Upstream};
 use scene::{Camera, Rigid, Splats};
 
 fn options(antialiased: bool) -> Options {
@@ -27,7 +27,7 @@ fn images_equal_the_reference() {
                     let splats = mixture(&mut random, &camera, kind, 150);
                     let options = options(antialiased);
                     let mut renderer = Renderer::new(isa);
-                    let frame = renderer.forward(&splats, None, &camera, &options);
+                    let frame = renderer.forward(&splats, &[], &camera, &options);
                     tally.add(frame, &Scene::new(&splats, None, &camera, &options));
                 }
                 let Tally { pixels, ambiguous, off, off_unambiguous, worst_unambiguous } = tally;
@@ -70,7 +70,7 @@ fn long_needles_do_not_cancel() {
                     splats.push(&splat);
                     let options = options(antialiased);
                     let mut renderer = Renderer::new(isa);
-                    let frame = renderer.forward(&splats, None, &camera, &options);
+                    let frame = renderer.forward(&splats, &[], &camera, &options);
                     tally.add(frame, &Scene::new(&splats, None, &camera, &options));
                 }
                 let Tally { pixels, off, worst_unambiguous, .. } = tally;
@@ -91,13 +91,15 @@ fn long_needles_do_not_cancel() {
 /// A frame, and its gradients for a random upstream gradient.
 fn draw(isa: Isa, splats: &Splats, context: Option<&Splats>, camera: &Camera, options: &Options) -> (Frame, Gradients) {
     let mut renderer = Renderer::new(isa);
-    let frame = renderer.forward(splats, context, camera, options).clone();
+    let part = context.map(Part::beside);
+    let frame = renderer.forward(splats, part.as_slice(), camera, options).clone();
     let mut random = Random(7);
     let area = frame.transmittance.len();
     let upstream = Upstream {
         colour: random.plane(3 * area),
         transmittance: random.plane(area),
         depth: if options.extras { random.plane(area) } else { Vec::new() },
+        trainable_alpha: if options.extras { random.plane(area) } else { Vec::new() },
     };
     let gradients = renderer.backward(splats, &upstream).clone();
     (frame, gradients)
@@ -316,13 +318,14 @@ fn reused_buffers_do_not_affect_later_views() {
             let splats = mixture(&mut Random(seed), &camera, Kind::Behind, count);
             let options = Options { extras: seed % 2 == 0, ..options(true) };
             let (frame, gradients) = draw(isa, &splats, None, &camera, &options);
-            assert_eq!(used.forward(&splats, None, &camera, &options), &frame);
+            assert_eq!(used.forward(&splats, &[], &camera, &options), &frame);
             let mut random = Random(7);
             let area = frame.transmittance.len();
             let upstream = Upstream {
                 colour: random.plane(3 * area),
                 transmittance: random.plane(area),
                 depth: if options.extras { random.plane(area) } else { Vec::new() },
+                trainable_alpha: if options.extras { random.plane(area) } else { Vec::new() },
             };
             let again = used.backward(&splats, &upstream);
             for i in 0..count {

@@ -5,7 +5,7 @@ mod reference;
 use glam::{DQuat, DVec2, DVec3};
 use reference::{Image, Random, Scene, camera};
 use render::cpu::{Isa, Renderer};
-use render::{Frame, Gradients, Options, Upstream};
+use render::{Frame, Gradients, Options, Part, Upstream};
 use scene::splats::sh_coefficients;
 use scene::{Camera, Splats, column};
 
@@ -37,6 +37,7 @@ fn smooth(fill: impl Fn(&mut Random, &Camera) -> (Splats, Option<Splats>), optio
                 colour: random.plane(3 * area),
                 transmittance: random.plane(area),
                 depth: random.plane(area),
+                trainable_alpha: random.plane(area),
             };
             return Smooth { splats, context, camera, options, upstream, scene };
         }
@@ -69,6 +70,7 @@ fn losses(image: &Image, upstream: &Upstream) -> Vec<f64> {
             (0..3).map(|c| product(&upstream.colour, &image.colour, c * area + i)).sum::<f64>()
                 + product(&upstream.transmittance, &image.transmittance, i)
                 + product(&upstream.depth, &image.depth, i)
+                + product(&upstream.trainable_alpha, &image.trainable_alpha, i)
         })
         .collect()
 }
@@ -150,7 +152,8 @@ fn pose_slopes(scene: &Scene, upstream: &Upstream) -> Vec<f64> {
 
 fn analytic(isa: Isa, s: &Smooth, upstream: &Upstream) -> (Frame, Gradients) {
     let mut renderer = Renderer::new(isa);
-    let frame = renderer.forward(&s.splats, s.context.as_ref(), &s.camera, &s.options).clone();
+    let part = s.context.as_ref().map(Part::beside);
+    let frame = renderer.forward(&s.splats, part.as_slice(), &s.camera, &s.options).clone();
     (frame, renderer.backward(&s.splats, upstream).clone())
 }
 
@@ -194,15 +197,16 @@ fn fewer_sh_degrees_in_use_than_stored() {
 }
 
 #[test]
-fn colour_transmittance_and_depth_each_alone() {
+fn every_plane_alone() {
     for antialiased in [false, true] {
         let s = smooth(|random, camera| (soft(random, camera, 11, 1), None), options(antialiased, 1));
         let zeros = |plane: &[f32]| vec![0.0; plane.len()];
-        let Upstream { colour, transmittance, depth } = s.upstream.clone();
+        let Upstream { colour, transmittance, depth, trainable_alpha } = s.upstream.clone();
         for (name, upstream) in [
             ("colour", Upstream { colour: colour.clone(), ..Upstream::default() }),
-            ("transmittance", Upstream { colour: zeros(&colour), transmittance, depth: Vec::new() }),
-            ("depth", Upstream { colour: zeros(&colour), transmittance: Vec::new(), depth }),
+            ("transmittance", Upstream { colour: zeros(&colour), transmittance, ..Upstream::default() }),
+            ("depth", Upstream { colour: zeros(&colour), depth, ..Upstream::default() }),
+            ("trainable alpha", Upstream { colour: zeros(&colour), trainable_alpha, ..Upstream::default() }),
         ] {
             check(&format!("{name} alone, antialiased {antialiased}"), &s, &upstream, TOLERANCE);
         }

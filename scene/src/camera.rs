@@ -81,6 +81,27 @@ pub struct Pinhole {
     pub cy: f64,
 }
 
+/// Depth of the plane that boxes are cut at, metres.
+const NEAR_METRES: f64 = 0.1;
+
+impl Pinhole {
+    /// Pixels whose convex hull is the picture of a box: of its part before the camera. `corners` are in the camera's axes, numbered by
+    /// the bits of their signs along the three sides. Empty for a box behind the camera.
+    pub fn outline(&self, corners: &[DVec3; 8]) -> Vec<DVec2> {
+        let pixel = |p: DVec3| DVec2::new(self.fx * p.x / p.z + self.cx, self.fy * p.y / p.z + self.cy);
+        let mut points: Vec<DVec2> = corners.iter().filter(|p| p.z >= NEAR_METRES).map(|p| pixel(*p)).collect();
+        for (i, a) in corners.iter().enumerate() {
+            for bit in [1, 2, 4].into_iter().filter(|bit| i & bit == 0) {
+                let b = corners[i | bit];
+                if (a.z < NEAR_METRES) != (b.z < NEAR_METRES) {
+                    points.push(pixel(a.lerp(b, (NEAR_METRES - a.z) / (b.z - a.z)).with_z(NEAR_METRES)));
+                }
+            }
+        }
+        points
+    }
+}
+
 /// A posed pinhole.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Camera {

@@ -6,6 +6,7 @@ use serde::{Deserialize, Serialize};
 use crate::camera::Camera;
 use crate::error::CodecError;
 use crate::ids::ArtefactId;
+use crate::objects::{self, MovingObject};
 
 /// WGS84 origin of the capture's local east-north-up frame.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -79,6 +80,8 @@ pub struct View {
     pub masked: bool,
     /// Artefact of the view's target depths from lidar and depth maps, if any. `None` before ingest.
     pub depth: Option<ArtefactId>,
+    /// When the photo was taken, seconds on the clock of the capture's objects; `None` if it is not known.
+    pub seconds: Option<f64>,
 }
 
 /// Structure-from-motion points and their tracks.
@@ -155,6 +158,8 @@ pub struct Capture {
     pub points: SparsePoints,
     /// Geographic origin of the local frame, if known.
     pub geo_origin: Option<GeoOrigin>,
+    /// Objects that move, by name.
+    pub objects: Vec<MovingObject>,
 }
 
 impl Capture {
@@ -172,10 +177,14 @@ impl Capture {
             if !view.camera.camera_from_world.is_sane() {
                 return bad("has a pose that is not finite or not a rotation");
             }
+            if view.seconds.is_some_and(|seconds| !seconds.is_finite()) {
+                return bad("was taken at a time that is not finite");
+            }
             if view.mips.len() > 32 {
                 return bad("has more mips than an image can have");
             }
         }
+        objects::check_all(&self.objects)?;
         let SparsePoints { positions, colours, track_start, seen_by } = &self.points;
         if colours.len() != positions.len() || !positions.iter().all(|p| p.is_finite()) {
             return Err(CodecError::new("sparse points are not finite, or their colours do not match their number"));
@@ -205,7 +214,7 @@ pub(crate) mod tests {
         let (cx, cy) = (0.5 * f64::from(width), 0.5 * f64::from(height));
         let camera =
             Camera { pinhole: Pinhole { width, height, fx: 5.0, fy: 5.0, cx, cy }, camera_from_world: Rigid::IDENTITY };
-        View { name: "a.png".into(), camera, mips: Vec::new(), masked: false, depth: None }
+        View { name: "a.png".into(), camera, mips: Vec::new(), masked: false, depth: None, seconds: None }
     }
 
     #[test]
@@ -216,7 +225,7 @@ pub(crate) mod tests {
             track_start: vec![0, 1, 1],
             seen_by: vec![0],
         };
-        let good = Capture { views: vec![view(4, 3)], points, geo_origin: None };
+        let good = Capture { views: vec![view(4, 3)], points, ..Capture::default() };
         assert_eq!([good.check(), Capture::default().check()], [Ok(()), Ok(())]);
         let changes: [fn(&mut Capture); 12] = [
             |c| c.views[0].camera.pinhole.width = 0,

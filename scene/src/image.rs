@@ -1,7 +1,7 @@
 //! Pixels of an image or of a window of a view.
 
 /// An 8-bit sRGB image or window, as planes: all red, all green, all blue, rows from the top.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, Default, PartialEq)]
 pub struct Pixels {
     /// Width in pixels.
     pub width: u32,
@@ -16,6 +16,8 @@ pub struct Pixels {
     pub weights: Option<Vec<f32>>,
     /// `width · height` target depths along the camera's z axis, metres; 0 = no target.
     pub depth: Option<Vec<f32>>,
+    /// `width · height` bytes where it is known which pixels show the trained object: 255 = it is there, 0 = it is not, 128 = unknown.
+    pub silhouette: Option<Vec<u8>>,
 }
 
 impl Pixels {

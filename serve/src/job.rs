@@ -326,7 +326,8 @@ impl JobRecord {
     pub(crate) fn view(&self, now: u64) -> views::Job {
         let counts = self.counts();
         let (blocks, plan) = (self.project.blocks(), &self.project.plan);
-        let is_trained = self.tasks[..blocks].iter().all(|task| task.state == TaskState::Done);
+        let objects = &self.tasks[plan.first_object()..];
+        let is_trained = self.tasks[..blocks].iter().chain(objects).all(|task| task.state == TaskState::Done);
         let state = match self.outcome {
             Some(Outcome::Done) => JobState::Done,
             Some(Outcome::Incomplete) => JobState::Incomplete,
@@ -334,7 +335,7 @@ impl JobRecord {
             None if self.paused => JobState::Paused,
             None => JobState::Running,
         };
-        let detections = &self.tasks[plan.first_detection()..];
+        let detections = &self.tasks[plan.first_detection()..plan.first_object()];
         let photos = plan.detect_tasks.iter().map(|task| u64::from(task.count));
         let photos_done = photos.clone().zip(detections).map(|(count, task)| count * u64::from(task.permille) / 1000);
         let is_waiting = |task: &TaskRecord| matches!(task.state, TaskState::Waiting | TaskState::Ready);
@@ -362,6 +363,7 @@ impl JobRecord {
             blocks,
             evaluations: plan.eval_tasks.len(),
             detections: plan.detect_tasks.len(),
+            objects: plan.object_tasks.len(),
             levels: plan.levels + 1,
             counts,
             started_unix_ms: self.started_unix_ms,
@@ -429,6 +431,7 @@ impl JobRecord {
             kind: match self.project.plan.planned(task) {
                 Some(PlannedTask::Evaluate(_)) => "evaluate",
                 Some(PlannedTask::Detect(_)) => "detect",
+                Some(PlannedTask::Object(_)) => "object",
                 Some(PlannedTask::Train(_)) | None => "train",
             },
             state: record.letter(),

@@ -145,7 +145,7 @@ impl Project {
                 rho_metres: task.rho_metres,
                 memory_bytes: task.memory_bytes,
             },
-            Some(other @ (PlannedTask::Evaluate(_) | PlannedTask::Detect(_))) => {
+            Some(other @ (PlannedTask::Evaluate(_) | PlannedTask::Detect(_) | PlannedTask::Object(_))) => {
                 About { steps: other.steps() as u32, memory_bytes: other.memory_bytes(), ..none }
             }
             None => none,
@@ -198,6 +198,7 @@ impl Project {
             },
             "evaluations": plan.eval_tasks.len(),
             "detections": plan.detect_tasks.len(),
+            "objects": plan.object_tasks.len(),
             "cameras": {"x": camera_x, "y": camera_y, "test": is_test},
             "points": {"x": point_x, "y": point_y},
         })

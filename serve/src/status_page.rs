@@ -39,7 +39,7 @@ fn write_body(out: &mut String, snapshot: &crate::views::Snapshot<'_>, now: u64)
     }
     for job in &snapshot.jobs {
         let counts = &job.counts;
-        let all = job.blocks + job.evaluations + job.detections;
+        let all = job.blocks + job.evaluations + job.detections + job.objects;
         let state = match job.state {
             JobState::Running => "running",
             JobState::Paused => "paused",

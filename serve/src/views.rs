@@ -111,6 +111,7 @@ pub(crate) struct Job {
     pub(crate) blocks: usize,
     pub(crate) evaluations: usize,
     pub(crate) detections: usize,
+    pub(crate) objects: usize,
     pub(crate) levels: u8,
     pub(crate) counts: Counts,
     pub(crate) started_unix_ms: Option<u64>,

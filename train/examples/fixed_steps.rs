@@ -4,8 +4,8 @@
 use std::sync::Arc;
 
 use glam::{DMat3, DQuat, DVec3, Vec3};
-use render::Options;
 use render::cpu::{Isa, Renderer};
+use render::{Options, Part};
 use scene::{Camera, Pinhole, Pixels, Rect, Rigid, Splat, Splats};
 use train::{Backend, Flow, Job, Recipe, TrainView, WindowSource, random, train};
 
@@ -36,9 +36,9 @@ fn steps() -> Splats {
     let (truth, context) = (cloud(1, 1.0), cloud(2, 3.0));
     let photo = |view: &TrainView| {
         let mut renderer = Renderer::default();
-        let frame = renderer.forward(&truth, Some(&context), &view.camera, &Options::default());
+        let frame = renderer.forward(&truth, &[Part::beside(&context)], &view.camera, &Options::default());
         let rgb = frame.colour.iter().map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u8).collect();
-        Arc::new(Pixels { width: WIDTH, height: HEIGHT, rgb, mask: None, weights: None, depth: None })
+        Arc::new(Pixels { width: WIDTH, height: HEIGHT, rgb, ..Pixels::default() })
     };
     let photos = Photos(views.iter().map(photo).collect());
     let recipe = Recipe { coarse: Vec::new(), sh_from: [0.0; 3], ..Recipe::default() };
@@ -75,7 +75,7 @@ fn view(n: u32) -> TrainView {
     let [cx, cy] = [WIDTH, HEIGHT].map(|side| 0.5 * f64::from(side));
     let pinhole = Pinhole { width: WIDTH, height: HEIGHT, fx: 102.0, fy: 102.0, cx, cy };
     let camera = Camera { pinhole, camera_from_world: Rigid { rotation, translation: rotation * -centre } };
-    TrainView { view: n, mip: 0, rect: camera.full(), camera }
+    TrainView { view: n, mip: 0, rect: camera.full(), camera, camera_from_context: None }
 }
 
 /// Coloured splats of SH degree 3 in a ball of `radius` times 1.2 m. If `radius` is above 1, its inner part is empty.

@@ -140,7 +140,7 @@ mod tests {
             let grey = |x: u32| if mip > 0 { 100 } else { 80 + 40 * ((rect.x + x) % 2) as u8 };
             let row: Vec<u8> = (0..rect.width).map(grey).collect();
             let rgb = row.repeat(3 * rect.height as usize);
-            Ok(Arc::new(Pixels { width: rect.width, height: rect.height, rgb, mask: None, weights: None, depth: None }))
+            Ok(Arc::new(Pixels { width: rect.width, height: rect.height, rgb, ..Pixels::default() }))
         }
     }
 
@@ -149,7 +149,7 @@ mod tests {
         let pinhole = Pinhole { width: 128, height: 96, fx: 90.0, fy: 90.0, cx: 64.0, cy: 48.0 };
         let camera = Camera { pinhole, camera_from_world: Rigid { translation: DVec3::ZERO, ..Rigid::IDENTITY } };
         let rect = Rect { x: 7, y: 3, width: 40, height: 36 };
-        let view = TrainView { view: 0, mip: 0, rect, camera };
+        let view = TrainView { view: 0, mip: 0, rect, camera, camera_from_context: None };
         let found = missing_detail(&[view; 40], &Stripes, 1).unwrap();
         assert!((found - 20.0 / 255.0).abs() < 1e-9, "{found}");
         assert_eq!(missing_detail(&[view], &Stripes, 2), Ok(0.0));

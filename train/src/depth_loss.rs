@@ -80,7 +80,7 @@ mod tests {
         let pinhole = Pinhole { width: WIDTH, height: HEIGHT, fx: 20.0, fy: 20.0, cx: 12.0, cy: 10.0 };
         let camera_from_world = Rigid { rotation: DQuat::IDENTITY, translation: DVec3::ZERO };
         let options = Options { extras: true, inverse_depth: true, sh_degree: 0, ..Options::default() };
-        renderer.forward(splats, None, &Camera { pinhole, camera_from_world }, &options)
+        renderer.forward(splats, &[], &Camera { pinhole, camera_from_world }, &options)
     }
 
     #[test]

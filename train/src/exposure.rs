@@ -179,8 +179,7 @@ mod tests {
         let colour: Vec<f32> = (0..3 * area).map(|i| uniform(1, i as u64)).collect();
         let mask = (0..area).map(|i| if i % width < 100 { 255 } else { 0 }).collect();
         let rgb = (0..3 * area).map(|i| (255.0 * uniform(2, i as u64)) as u8).collect();
-        let photo =
-            Pixels { width: width as u32, height: height as u32, rgb, mask: Some(mask), weights: None, depth: None };
+        let photo = Pixels { width: width as u32, height: height as u32, rgb, mask: Some(mask), ..Pixels::default() };
         let weights: Vec<f32> = photo.mask.iter().flatten().map(|&mask| f32::from(mask) / 255.0).collect();
         // A quadratic loss, in f64, so that differences are exact: half the weighted squared error.
         let loss = |exposure: &[[f64; 4]; 3], colour: &[f64]| -> f64 {

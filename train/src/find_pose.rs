@@ -87,8 +87,15 @@ impl<'a> PoseFinder<'a> {
             let Some((mip, rect, camera)) = view.at(coarser) else { continue };
             let photo = self.source.window(view.view, mip, rect).map_err(TrainError::Source)?;
             for _ in 0..if coarser == 0 { FINEST_STEPS } else { of_mip } {
-                let sample =
-                    ViewSample { view: view.view, mip, rect, photo: Arc::clone(&photo), camera, exposure: None };
+                let sample = ViewSample {
+                    view: view.view,
+                    mip,
+                    rect,
+                    photo: Arc::clone(&photo),
+                    camera,
+                    camera_from_context: None,
+                    exposure: None,
+                };
                 let progress = done as f32 / all as f32;
                 let step = Step {
                     samples: vec![sample],
@@ -99,6 +106,7 @@ impl<'a> PoseFinder<'a> {
                     },
                     rates: None,
                     depth_weight: 0.0,
+                    silhouette_weight: 0.0,
                     picture_weight: 0.0,
                     exposure_rate: 0.0,
                     pose_rates: Some(PoseRates {

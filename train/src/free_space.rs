@@ -208,7 +208,7 @@ mod tests {
             let pinhole = Pinhole { width: 64, height: 48, fx: 40.0, fy: 40.0, cx: 32.0, cy: 24.0 };
             let translation = -DVec3::new(0.0, f64::from(n), 5.0);
             let camera = Camera { pinhole, camera_from_world: Rigid { translation, ..Rigid::IDENTITY } };
-            View { name: format!("{n}.png"), camera, masked: false, mips: Vec::new(), depth: None }
+            View { name: format!("{n}.png"), camera, masked: false, mips: Vec::new(), depth: None, seconds: None }
         };
         let points = SparsePoints {
             colours: vec![[0; 3]; positions.len()],
@@ -217,7 +217,7 @@ mod tests {
             positions,
         };
         // A point behind the cameras, so that the grid reaches there.
-        let mut capture = Capture { views: vec![view(0), view(1)], points, geo_origin: None };
+        let mut capture = Capture { views: vec![view(0), view(1)], points, ..Capture::default() };
         for i in 0..40 {
             capture.points.positions.push(DVec3::new(-5.0, f64::from(i) * 0.5 - 5.0, 5.0));
             capture.points.colours.push([0; 3]);

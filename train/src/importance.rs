@@ -4,7 +4,7 @@
 //! ([`render::Contributions`]).
 
 use render::cpu::Renderer;
-use render::{Frame, Options};
+use render::{Frame, Options, Part};
 use scene::{Exposures, Pixels, Splats, column};
 use serde::{Deserialize, Serialize};
 
@@ -221,7 +221,9 @@ impl<'a> EvaluationViews<'a> {
                 extras,
                 ..Options::default()
             };
-            let frame = renderer.forward(splats, self.context, &camera, &options);
+            let camera_from_part = view.camera_from_context;
+            let context = self.context.map(|splats| Part { splats, camera_from_part });
+            let frame = renderer.forward(splats, context.as_slice(), &camera, &options);
             pixel_weights(frame, &photo, fixed.and_then(|fixed| fixed.0.get(n)), &mut weights);
             let area = photo.area();
             let weight = |i: usize| if weights.is_empty() { 1.0 } else { f64::from(weights[i % area]) };

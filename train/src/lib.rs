@@ -24,6 +24,7 @@ mod pose;
 pub mod prune;
 pub mod random;
 mod recipe;
+mod silhouette_loss;
 mod size_limit;
 pub mod source;
 mod trainer;

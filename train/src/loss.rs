@@ -395,8 +395,7 @@ mod tests {
             height: height as u32,
             rgb: noise(3 * area, 1).iter().map(|v| (v * 255.0) as u8).collect(),
             mask: None,
-            weights: None,
-            depth: None,
+            ..Pixels::default()
         };
         let x = noise(3 * area, 2);
         let weights = noise(area, 3);

@@ -60,7 +60,7 @@ mod tests {
     fn view(mip: u8) -> TrainView {
         let pinhole = Pinhole { width: 256, height: 256, fx: 200.0, fy: 200.0, cx: 128.0, cy: 128.0 };
         let camera = Camera { pinhole, camera_from_world: Rigid::IDENTITY };
-        TrainView { view: 0, mip, rect: camera.mip(mip).full(), camera }
+        TrainView { view: 0, mip, rect: camera.mip(mip).full(), camera, camera_from_context: None }
     }
 
     fn splats() -> Splats {
@@ -76,7 +76,7 @@ mod tests {
     fn splats_of_a_coarse_mip_render_alike_at_full_resolution() {
         let (coarse, fine, trained) = (view(2), view(0), splats());
         let draw = |splats: &Splats, view: &TrainView| {
-            Renderer::default().forward(splats, None, &view.camera.mip(view.mip), &Options::default()).colour.clone()
+            Renderer::default().forward(splats, &[], &view.camera.mip(view.mip), &Options::default()).colour.clone()
         };
         // Each pixel of the coarse render against the mean of its sixteen pixels at full resolution.
         let expected = draw(&trained, &coarse);

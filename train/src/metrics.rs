@@ -39,7 +39,7 @@ pub fn psnr(a: &[f32], b: &[f32], mask: Option<&[u8]>) -> Option<f64> {
 }
 
 /// PSNR of a mean squared error, dB, at most [`MAX_PSNR_DB`]. An error that is not a number counts as 1: 0 dB.
-pub(crate) fn psnr_of(mse: f64) -> f64 {
+pub fn psnr_of(mse: f64) -> f64 {
     let mse = if mse.is_nan() { 1.0 } else { mse };
     (-10.0 * mse.log10()).min(MAX_PSNR_DB)
 }

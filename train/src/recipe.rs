@@ -13,6 +13,9 @@ pub struct Recipe {
     /// Weight of the depth loss, for windows with target depths; 0 leaves it out.
     #[serde(default)]
     pub depth_weight: f32,
+    /// Weight of the silhouette loss, for windows that say which pixels show the trained object; 0 leaves it out.
+    #[serde(default)]
+    pub silhouette_weight: f32,
     /// Weight of the picture loss of a job that has one; 0 leaves it out.
     #[serde(default)]
     pub picture_weight: f32,
@@ -80,6 +83,7 @@ impl Default for Recipe {
         Self {
             lambda: 0.2,
             depth_weight: 0.0,
+            silhouette_weight: 0.0,
             picture_weight: 0.0,
             picture_from: 0.7,
             picture_every: 1,

@@ -61,7 +61,13 @@ mod tests {
     fn view(place: DVec3) -> TrainView {
         let pinhole = Pinhole { width: 64, height: 48, fx: 40.0, fy: 40.0, cx: 32.0, cy: 24.0 };
         let camera = Camera { pinhole, camera_from_world: Rigid { translation: -place, ..Rigid::IDENTITY } };
-        TrainView { view: 0, mip: 0, rect: Rect { x: 0, y: 0, width: 64, height: 48 }, camera }
+        TrainView {
+            view: 0,
+            mip: 0,
+            rect: Rect { x: 0, y: 0, width: 64, height: 48 },
+            camera,
+            camera_from_context: None,
+        }
     }
 
     #[test]

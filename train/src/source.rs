@@ -49,7 +49,7 @@ mod tests {
             if view == 20 {
                 Err("gone".into())
             } else {
-                Ok(Arc::new(Pixels { width: 0, height: 0, rgb: Vec::new(), mask: None, weights: None, depth: None }))
+                Ok(Arc::new(Pixels { width: 0, height: 0, rgb: Vec::new(), ..Pixels::default() }))
             }
         }
 

@@ -215,6 +215,8 @@ impl<'a> Trainer<'a> {
 
         let has_depth = samples.iter().any(|sample| sample.photo.depth.is_some());
         let depth_weight = if has_depth { recipe.depth_weight } else { 0.0 };
+        let has_silhouette = samples.iter().any(|sample| sample.photo.silhouette.is_some());
+        let silhouette_weight = if has_silhouette { recipe.silhouette_weight } else { 0.0 };
         let is_due = progress >= recipe.picture_from
             && (step..step + count).any(|step| step.is_multiple_of(recipe.picture_every.max(1)));
         let sh_degree = recipe.sh_from.iter().filter(|&&from| progress >= from).count() as u8;
@@ -222,7 +224,7 @@ impl<'a> Trainer<'a> {
             antialiased: self.job.antialiased,
             sh_degree: sh_degree.min(self.state.splats.sh_degree()),
             background: [0.0; 3],
-            extras: context.is_some() || depth_weight > 0.0,
+            extras: context.is_some() || depth_weight > 0.0 || silhouette_weight > 0.0,
             inverse_depth: depth_weight > 0.0,
         };
         let visits = (steps as f32 / views.len() as f32).max(1.0);
@@ -231,6 +233,7 @@ impl<'a> Trainer<'a> {
             options,
             rates: Some(learning_rates(recipe, progress, (count as f32).sqrt(), self.log_scale_bounds)),
             depth_weight,
+            silhouette_weight,
             picture_weight: if is_due { recipe.picture_weight } else { 0.0 },
             exposure_rate: geometric(recipe.exposure, progress) / visits,
             pose_rates: (self.job.trains_poses && progress >= recipe.pose_from).then(|| PoseRates {
@@ -260,7 +263,8 @@ impl<'a> Trainer<'a> {
             let (mip, rect, camera) = window(view);
             let photo = source.window(view.view, mip, rect).map_err(TrainError::Source)?;
             let exposure = exposures.and_then(|exposures| exposures.of(view.view).copied());
-            Ok(ViewSample { view: view.view, mip, rect, photo, camera, exposure })
+            let camera_from_context = view.camera_from_context;
+            Ok(ViewSample { view: view.view, mip, rect, photo, camera, camera_from_context, exposure })
         };
         let samples =
             (step..step + count).map(|step| sample(&views[self.order.of(step)])).collect::<Result<Vec<_>, _>>()?;

@@ -1,6 +1,6 @@
 //! The windows of views that a block is trained on.
 
-use scene::{Camera, Rect};
+use scene::{Camera, Rect, Rigid};
 
 /// A window of a view that a block trains on.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -11,8 +11,10 @@ pub struct TrainView {
     pub mip: u8,
     /// Window, in pixels of that mip.
     pub rect: Rect,
-    /// Camera of the whole image at mip 0.
+    /// Camera of the whole image at mip 0, in the axes of the trained splats.
     pub camera: Camera,
+    /// Takes the axes of the frozen context to the camera's, where they are not those of the trained splats: for an object that moves.
+    pub camera_from_context: Option<Rigid>,
 }
 
 impl TrainView {

@@ -6,8 +6,8 @@ use std::sync::{Arc, Mutex};
 
 use common::*;
 use glam::Vec3;
-use render::Options;
 use render::cpu::Renderer;
+use render::{Options, Part};
 use scene::{Pixels, Rect, Splat, Splats, column};
 use train::{Backend, Flow, Job, Recipe, TrainError, TrainView, WindowSource, random, train};
 
@@ -184,7 +184,7 @@ fn half(splats: &Splats, sign: f32) -> Splats {
 fn trainable_alpha(own: &Splats, context: &Splats) -> Vec<f32> {
     let options = Options { sh_degree: 1, extras: true, ..Options::default() };
     let draw = |view: &TrainView| {
-        Renderer::default().forward(own, Some(context), &view.camera, &options).trainable_alpha.clone()
+        Renderer::default().forward(own, &[Part::beside(context)], &view.camera, &options).trainable_alpha.clone()
     };
     views().iter().flat_map(draw).collect()
 }

@@ -3,8 +3,8 @@
 use std::sync::Arc;
 
 use glam::{DMat3, DQuat, DVec3, Vec3};
-use render::Options;
 use render::cpu::Renderer;
+use render::{Options, Part};
 use scene::{Camera, Pinhole, Pixels, Rect, Rigid, Splat, Splats, column};
 use train::importance::Order;
 use train::prune::{Pruned, Pruning, keep, to_share, within_tolerance};
@@ -34,7 +34,7 @@ fn views() -> Vec<TrainView> {
         let rotation = DQuat::from_mat3(&DMat3::from_cols(right, forward.cross(right), forward).transpose());
         let pinhole = Pinhole { width: WIDTH, height: HEIGHT, fx: 70.0, fy: 70.0, cx: 32.0, cy: 24.0 };
         let camera = Camera { pinhole, camera_from_world: Rigid { rotation, translation: rotation * -centre } };
-        TrainView { view: n, mip: 0, rect: camera.full(), camera }
+        TrainView { view: n, mip: 0, rect: camera.full(), camera, camera_from_context: None }
     };
     (0..10).map(view).collect()
 }
@@ -64,7 +64,7 @@ fn with_faint_splats(ground_truth: &Splats) -> Splats {
 
 fn render(splats: &Splats, context: Option<&Splats>, view: &TrainView) -> Vec<f32> {
     let options = Options { sh_degree: 1, ..Options::default() };
-    Renderer::default().forward(splats, context, &view.camera, &options).colour.clone()
+    Renderer::default().forward(splats, context.map(Part::beside).as_slice(), &view.camera, &options).colour.clone()
 }
 
 fn photos(splats: &Splats) -> Photos {
@@ -74,8 +74,7 @@ fn photos(splats: &Splats) -> Photos {
         height: HEIGHT,
         rgb: bytes(render(splats, None, view)),
         mask: None,
-        weights: None,
-        depth: None,
+        ..Pixels::default()
     };
     Photos(views().iter().map(|view| Arc::new(photo(view))).collect())
 }

@@ -160,7 +160,7 @@ mod tests {
         let rgb: Vec<u8> = (0..3 * width * height).map(|i| (255.0 * wave(i)).round() as u8).collect();
         let planes = (0..).zip(&rgb).map(|(i, &byte)| f32::from(byte) / 255.0 + 0.05 * ((i * 7919 % 97) as f32 / 97.0));
         let planes = planes.collect();
-        (Pixels { width: WIDTH, height: HEIGHT, rgb, mask: None, weights: None, depth: None }, planes)
+        (Pixels { width: WIDTH, height: HEIGHT, rgb, ..Pixels::default() }, planes)
     }
 
     #[test]

@@ -45,7 +45,7 @@ impl Block<'_> {
             let view = self.capture.views.get(use_.view as usize);
             let view = view.ok_or_else(|| ExecuteError::work(format!("the capture has no view {}", use_.view)))?;
             let camera = self.given_poses.map_or(view.camera, |poses| poses.apply(use_.view, view.camera));
-            Ok(TrainView { view: use_.view, mip: use_.mip, rect: use_.window, camera })
+            Ok(TrainView { view: use_.view, mip: use_.mip, rect: use_.window, camera, camera_from_context: None })
         };
         uses.iter().map(window).collect()
     }

@@ -63,7 +63,8 @@ impl Estimate {
         let splats: u64 = plan.tasks.iter().filter(leaf).map(|task| u64::from(task.budget)).sum();
         let training: f64 = plan.tasks.iter().map(|task| cpu_seconds(plan, task)).sum();
         let detecting = plan.detect_tasks.iter().map(|task| task.work_millis).sum::<u64>() as f64 * 1e-3;
-        let cpu_seconds = training + DETECTION_COST * detecting;
+        let moving = plan.object_tasks.iter().map(|task| task.work_millis).sum::<u64>() as f64 * 1e-3;
+        let cpu_seconds = training + DETECTION_COST * detecting + moving;
         let cpu_seconds = cpu_seconds / relative_speed;
         Self {
             cpu_seconds,

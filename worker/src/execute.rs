@@ -1,4 +1,4 @@
-//! Carries out a task of a plan: looks for objects on photos, trains a block, or measures the merged model.
+//! Carries out a task of a plan: looks for objects on photos, trains a block or an object that moves, or measures the merged model.
 //!
 //! ```text
 //! detect:   plan, capture, detector ──from the store──▶ network
@@ -14,7 +14,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
-use blocks::{DetectTask, EvalTask, Plan, PlannedTask, Task};
+use blocks::{DetectTask, EvalTask, ObjectTask, Plan, PlannedTask, Task};
 use dataset::ingest::IngestError;
 use dataset::windows::{SharedTileCache, WindowReader};
 use perceive::Detector;
@@ -32,6 +32,7 @@ use crate::inputs::{Inputs, KeptResults};
 use crate::latest::Latest;
 use crate::memory_budget::memory_budget;
 use crate::merged_eval::{MergedEvaluator, evaluates_after};
+use crate::object::ObjectTraining;
 use crate::result_cache::ResultCache;
 use crate::task::{Execute, ExecuteError, Flow, Report, Reporter, TaskOrder};
 use crate::train_block::TrainedBlock;
@@ -108,6 +109,7 @@ impl Execute for PlanExecutor {
             PlannedTask::Train(task) => self.train(&job, task, &mut stopwatch, report),
             PlannedTask::Evaluate(task) => self.evaluate(&job, task, &stopwatch, report),
             PlannedTask::Detect(task) => self.detect(&job, task, &stopwatch, report),
+            PlannedTask::Object(task) => self.object(&job, task, &stopwatch, report),
         }
     }
 }
@@ -221,6 +223,34 @@ impl PlanExecutor {
             let found = span.in_scope(|| detect(&detection, memory_budget(options.memory_bytes), stopwatch, report));
             shared.metrics.count_reads(reader.stats());
             Ok(dataset::zones::objects_to_frame(&found?))
+        })
+    }
+
+    /// Trains an object that moves; the artefact is its splats, in its own axes.
+    fn object(
+        &self,
+        job: &Assignment,
+        task: &ObjectTask,
+        stopwatch: &Stopwatch,
+        report: &mut Reporter,
+    ) -> Result<ArtefactId, ExecuteError> {
+        let &Assignment { order, plan, capture, .. } = job;
+        let TrainerContext { store, shared, options, .. } = &self.context;
+        let is_sound = |bytes: &[u8]| frame::decode_splats(bytes).is_ok();
+        self.kept_or(job, is_sound, || {
+            let reader = job.reader(store, options.cache_bytes - 2 * self.remote_bytes);
+            let mut results = BTreeMap::new();
+            job.fetch_span.in_scope(|| {
+                self.inputs(job).blocks(PlannedTask::Object(task), report, |block, splats, _| {
+                    results.insert(block, splats);
+                })
+            })?;
+            let training = ObjectTraining { plan, task, order, capture, reader: &reader };
+            let memory = memory_budget(options.memory_bytes);
+            let span = tracing::info_span!("train", object = task.object);
+            let trained = self.pool.install(|| span.in_scope(|| training.train(results, memory, stopwatch, report)));
+            shared.metrics.count_reads(reader.stats());
+            Ok(frame::encode_result(&trained?, TrainingInfo::default()))
         })
     }
 

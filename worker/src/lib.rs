@@ -24,6 +24,7 @@ mod latest;
 pub mod memory_budget;
 pub mod merged_eval;
 pub mod metrics;
+mod object;
 pub mod one_block;
 mod options;
 mod recipe;
@@ -31,6 +32,7 @@ mod recompute;
 mod refine;
 mod result_cache;
 mod run;
+mod silhouettes;
 pub mod speed;
 mod task;
 #[cfg(test)]

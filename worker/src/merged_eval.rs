@@ -140,7 +140,7 @@ impl MergedEvaluator {
             self.views.iter().map(|&(view, mip)| (view, mip, capture.views[view as usize].camera.mip(mip).full()));
         for ((view, mip, _), photo) in windows.clone().zip(source::each(&self.reader, windows)) {
             let (photo, camera) = (photo.ok()?, capture.views[view as usize].camera.mip(mip));
-            let frame = self.renderer.forward(model, None, &camera, &options);
+            let frame = self.renderer.forward(model, &[], &camera, &options);
             let reference: Vec<f32> = photo.rgb.iter().map(|&value| f32::from(value) / 255.0).collect();
             let render: Vec<f32> = frame.colour.iter().map(|value| value.clamp(0.0, 1.0)).collect();
             if let Some(psnr) = metrics::psnr(&render, &reference, photo.mask.as_deref()) {

@@ -37,7 +37,8 @@ fn step_seconds() -> f64 {
     let [width, height] = SIZE;
     let pinhole = Pinhole { width, height, fx: 200.0, fy: 200.0, cx: 128.0, cy: 72.0 };
     let camera = Camera { pinhole, camera_from_world: Rigid::IDENTITY };
-    let views = [TrainView { view: 0, mip: 0, rect: Rect { x: 0, y: 0, width, height }, camera }];
+    let views =
+        [TrainView { view: 0, mip: 0, rect: Rect { x: 0, y: 0, width, height }, camera, camera_from_context: None }];
     let recipe = Recipe { coarse: Vec::new(), sh_from: [0.0; 3], ..Recipe::default() };
     let everywhere = |_: Vec3| true;
     let job = Job {
@@ -90,7 +91,7 @@ impl WindowSource for Photo {
     fn window(&self, _: u32, _: u8, rect: Rect) -> Result<Arc<Pixels>, String> {
         let value = |i: u32| (i % rect.width * 255 / rect.width) as u8;
         let rgb = (0..3 * rect.width * rect.height).map(value).collect();
-        Ok(Arc::new(Pixels { width: rect.width, height: rect.height, rgb, mask: None, weights: None, depth: None }))
+        Ok(Arc::new(Pixels { width: rect.width, height: rect.height, rgb, ..Pixels::default() }))
     }
 }
 

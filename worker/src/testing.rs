@@ -43,5 +43,6 @@ pub(crate) fn plan_of(mode: Mode, tasks: Vec<Task>) -> Plan {
         tasks,
         eval_tasks: Vec::new(),
         detect_tasks: Vec::new(),
+        object_tasks: Vec::new(),
     }
 }

@@ -46,7 +46,7 @@ fn evaluation_tasks_come_after_training_and_read_all_blocks() {
             PlannedTask::Evaluate(_) => {
                 assert_eq!(inputs.into_iter().collect::<BTreeSet<u32>>(), (0..training).collect());
             }
-            PlannedTask::Detect(_) => unreachable!("no one looks for objects"),
+            PlannedTask::Detect(_) | PlannedTask::Object(_) => unreachable!("none was asked for"),
         }
     }
     let none = PlanSettings { test_every: 0, ..settings };
@@ -82,7 +82,7 @@ fn blocks_depend_on_the_detection_of_their_views() {
                 assert!(task.views.iter().flat_map(|used| near(used.view)).all(seen));
             }
             PlannedTask::Evaluate(_) => assert!(needed == (0..training).collect() && detections.is_empty()),
-            PlannedTask::Detect(_) => assert!(needed.is_empty()),
+            PlannedTask::Detect(_) | PlannedTask::Object(_) => assert!(needed.is_empty()),
         }
     }
     // Where zones have no weight, nobody waits for them.

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use clap::{Args, ValueEnum};
 use eval::Levels;
 
-use super::values::{Backend, Size, decibels, levels, metres, share};
+use super::values::{Backend, ObjectMove, Size, clock_seconds, decibels, levels, metres, share};
 use super::zones::ZoneOptions;
 
 #[derive(Debug, Clone, Default, Args)]
@@ -127,6 +127,20 @@ pub(crate) struct RenderArgs {
     /// has block: the block that a splat belongs to
     #[arg(long, value_name = "ATTRIBUTE")]
     pub(crate) by: Option<String>,
+    /// Draw the objects that move where they are at this time, seconds on the clock of their paths; by default when each camera's photo
+    /// was taken
+    #[arg(long, value_name = "T", value_parser = clock_seconds, allow_hyphen_values = true)]
+    pub(crate) time: Option<f64>,
+    /// Leave out the object of this name, or `all` of them; may be given several times
+    #[arg(long, value_name = "ID", conflicts_with = "only")]
+    pub(crate) without: Vec<String>,
+    /// Draw the object of this name and nothing else; may be given several times
+    #[arg(long, value_name = "ID")]
+    pub(crate) only: Vec<String>,
+    /// Draw the object of this name these metres beside its path, in the world, and turned by so many degrees to the left; may be given
+    /// several times
+    #[arg(long = "move", value_name = "ID=X,Y,Z[,DEGREES]", allow_hyphen_values = true)]
+    pub(crate) moves: Vec<ObjectMove>,
     /// Also write depth as <view>.depth.npy: float32, metres, 0 = no surface
     #[arg(long)]
     pub(crate) depth: bool,

@@ -84,6 +84,11 @@ pub(crate) struct PlanOptions {
     /// with errors of some pixels; not with --blocks flat. The refined cameras go to OUT/cameras.json
     #[arg(long)]
     pub(crate) refine_poses: bool,
+    /// Also model what moves: each object that the capture has a box and a path for gets splats of its own, in tasks of the job, which
+    /// go to OUT/objects. Its pixels are left out of the static scene, and `plat render` draws it where it is at a time; not with
+    /// --blocks flat
+    #[arg(long)]
+    pub(crate) objects: bool,
     /// Label each splat with the block that trained it, as the integer property `block` of merged.ply
     #[arg(long)]
     pub(crate) label_blocks: bool,
@@ -150,6 +155,7 @@ impl PlanOptions {
             antialiased: self.antialiased,
             exposure: self.exposure,
             refine_poses: self.refine_poses,
+            objects: self.objects,
             label_blocks: self.label_blocks,
             depth_weight: self.depth_weight,
             evaluate: self.evaluate,

@@ -6,6 +6,7 @@ use std::str::FromStr;
 use clap::ValueEnum;
 use clap::builder::TypedValueParser;
 use eval::Levels;
+use glam::DVec3;
 use serde::{Serialize, Serializer};
 use train::importance::Order;
 
@@ -40,6 +41,41 @@ impl<T: Serialize> Serialize for Auto<T> {
             None => to.serialize_str("auto"),
         }
     }
+}
+
+/// A shift of an object, written `ID=X,Y,Z` or `ID=X,Y,Z,DEGREES`.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct ObjectMove {
+    pub(crate) id: String,
+    /// Metres in the world.
+    pub(crate) metres: DVec3,
+    /// Around its own vertical axis, to the left.
+    pub(crate) degrees: f64,
+}
+
+impl FromStr for ObjectMove {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let numbers = |text: &str| {
+            let numbers: Vec<f64> = text.split(',').map(|part| part.trim().parse().ok()).collect::<Option<_>>()?;
+            Some(numbers).filter(|of| of.iter().all(|number| number.is_finite() && number.abs() < 1e6))
+        };
+        let parsed = text.split_once('=').and_then(|(id, rest)| Some((id, numbers(rest)?)));
+        match parsed {
+            Some((id, of)) if matches!(of.len(), 3 | 4) => Ok(Self {
+                id: id.to_owned(),
+                metres: DVec3::new(of[0], of[1], of[2]),
+                degrees: of.get(3).copied().unwrap_or(0.0),
+            }),
+            _ => Err("give ID=X,Y,Z or ID=X,Y,Z,DEGREES, such as 160=2.5,0,0".into()),
+        }
+    }
+}
+
+/// A time in seconds.
+pub(crate) fn clock_seconds(text: &str) -> Result<f64, String> {
+    text.parse().ok().filter(|value: &f64| value.is_finite()).ok_or_else(|| "give seconds, such as 2.5".into())
 }
 
 /// Width and height in pixels, written `640x480`.

@@ -103,7 +103,7 @@ fn render_overviews(model: &Model, capture: &Capture, birdseye: &Path, oblique: 
     for (path, camera) in
         [(birdseye, birdseye_camera(capture, up, PICTURE_WIDTH)), (oblique, oblique_camera(capture, up, PICTURE_WIDTH))]
     {
-        let frame = renderer.forward(&model.splats, None, &camera, &model.options());
+        let frame = renderer.forward(&model.splats, &[], &camera, &model.options());
         write_png(path, &frame_image(frame))?;
     }
     Ok(())
@@ -140,6 +140,7 @@ pub(crate) fn settings(args: &DemoArgs) -> (Settings, TrainArgs) {
             antialiased: false,
             exposure: false,
             refine_poses: false,
+            objects: false,
             label_blocks: false,
             depth_weight: 0.0,
             no_lidar: true,

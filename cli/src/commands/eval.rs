@@ -123,8 +123,20 @@ fn evaluated(request: &Request, output: &Output) -> Result<Evaluated, Failure> {
     if let Some(found) = evaluation.detections.first().map(|found| &found.groups.held_out.all) {
         (record.detections_kept, record.zone_psnr) = (found.share_kept, found.zones.zone_psnr);
     }
-    let Evaluation { views, by_kind, stretches, trained_on, depth, detections, sheet, cuts, budgets, seams, .. } =
-        evaluation;
+    let Evaluation {
+        views,
+        by_kind,
+        stretches,
+        trained_on,
+        depth,
+        detections,
+        sheet,
+        moving,
+        cuts,
+        budgets,
+        seams,
+        ..
+    } = evaluation;
     let evaluated = Evaluated::new(record, views);
     Ok(Evaluated {
         by_kind,
@@ -133,6 +145,7 @@ fn evaluated(request: &Request, output: &Output) -> Result<Evaluated, Failure> {
         depth,
         detections,
         sheet: Some(sheet),
+        moving,
         cuts,
         budgets,
         seams,

@@ -57,8 +57,15 @@ impl Judges<'_> {
 
     fn judged(&self, splats: &Splats) -> Result<Vec<Judged>, Failure> {
         let Model { antialiased, geo_origin, .. } = *self.model;
-        let model =
-            Model { splats: splats.clone(), antialiased, geo_origin, exposures: None, poses: None, trained: None };
+        let model = Model {
+            splats: splats.clone(),
+            objects: Vec::new(),
+            antialiased,
+            geo_origin,
+            exposures: None,
+            poses: None,
+            trained: None,
+        };
         let request = Request {
             model: &model,
             details: &eval::Details::default(),

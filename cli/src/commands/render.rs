@@ -5,7 +5,9 @@
 use std::path::{Path, PathBuf};
 
 use ::render::{Frame, Options};
-use eval::{Renderer, frame_image, write_png};
+use eval::{Composition, Renderer, frame_image, write_png};
+use glam::DQuat;
+use model::ModelObject;
 use scene::{BLOCK_ATTRIBUTE, BadInput, Splats, npy};
 use serde::Serialize;
 use store::file::save;
@@ -25,6 +27,8 @@ struct Rendered<'a> {
     out: &'a Path,
     views: usize,
     splats: usize,
+    /// Objects that move, in their own splats.
+    objects: usize,
     backend: String,
     antialiased: bool,
     cpu_seconds: f64,
@@ -41,16 +45,23 @@ pub(crate) fn run(args: &RenderArgs, output: &Output) -> Result<(), Failure> {
     }
     let views = captures::read_cameras(&args.cameras)?;
     // All names are checked before the first picture is rendered.
-    let names = captures::stems(&args.cameras, views.iter().map(|(name, _)| name.as_str()))?;
+    let names = captures::stems(&args.cameras, views.iter().map(|view| view.name.as_str()))?;
     let antialiased = (model.antialiased || args.antialiased) && !args.classic;
     let options = Options { antialiased, extras: args.depth, ..model.options() };
     let clock = Stopwatch::start();
     let mut renderer = Renderer::new(&backend)?;
+    let objects = placed(&model.objects, args)?;
+    if !args.only.is_empty() {
+        model.splats = Splats::new(0);
+    }
     let splats = renderer.upload(&model.splats)?;
+    let composition = Composition::new(&renderer, objects.iter())?;
     let progress = output.progress("rendering", views.len() as u64);
-    for (i, ((_, camera), name)) in views.iter().zip(&names).enumerate() {
+    for (i, (view, name)) in views.iter().zip(&names).enumerate() {
+        let camera = &view.camera;
         let camera = args.size.map_or(*camera, |size| captures::resized(camera, size.width, size.height));
-        let frame = renderer.render(&splats, &camera, &options)?;
+        let placed = composition.at(args.time.or(view.seconds));
+        let frame = renderer.compose(&splats, &placed, &camera, &options)?;
         let file = |ending: &str| {
             let mut path = args.out.join(name).into_os_string();
             path.push(ending);
@@ -70,6 +81,7 @@ pub(crate) fn run(args: &RenderArgs, output: &Output) -> Result<(), Failure> {
         out: &args.out,
         views: views.len(),
         splats: model.splats.len(),
+        objects: objects.len(),
         backend: renderer.name(),
         antialiased,
         cpu_seconds: clock.cpu_seconds(),
@@ -84,6 +96,39 @@ pub(crate) fn run(args: &RenderArgs, output: &Output) -> Result<(), Failure> {
         args.out.display()
     );
     output.result(&rendered, &text)
+}
+
+/// The objects to draw, where they are to be.
+fn placed(objects: &[ModelObject], args: &RenderArgs) -> Result<Vec<ModelObject>, Failure> {
+    const ALL: &str = "all";
+    let moved = args.moves.iter().map(|of| &of.id);
+    for id in args.without.iter().filter(|id| *id != ALL).chain(&args.only).chain(moved) {
+        if objects.iter().all(|object| object.about.id != *id) {
+            let names: Vec<&str> = objects.iter().map(|object| object.about.id.as_str()).collect();
+            let has = if names.is_empty() { "none".into() } else { names.join(", ") };
+            let problem = format!("has no object '{id}', it has {has}");
+            return Err(BadInput::new(args.model.display().to_string(), problem, "give one of its objects").into());
+        }
+    }
+    let is_drawn = |object: &&ModelObject| {
+        let is = |ids: &[String]| ids.contains(&object.about.id);
+        if args.only.is_empty() {
+            !is(&args.without) && !args.without.iter().any(|id| id == ALL)
+        } else {
+            is(&args.only)
+        }
+    };
+    let mut drawn: Vec<ModelObject> = objects.iter().filter(is_drawn).cloned().collect();
+    for of in &args.moves {
+        for object in drawn.iter_mut().filter(|object| object.about.id == of.id) {
+            for pose in &mut object.about.path {
+                let at = &mut pose.world_from_object;
+                at.translation += of.metres;
+                at.rotation = (at.rotation * DQuat::from_rotation_z(of.degrees.to_radians())).normalize();
+            }
+        }
+    }
+    Ok(drawn)
 }
 
 /// The model's splats, coloured by an attribute.

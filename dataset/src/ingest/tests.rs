@@ -37,7 +37,7 @@ fn source(folder: &Path, count: u32) -> Source {
         };
         let camera_from_world = Rigid { translation: [f64::from(i), 0.0, 0.0].into(), ..Rigid::IDENTITY };
         let camera = Camera { pinhole: ideal_pinhole(&model(), WIDTH, HEIGHT).unwrap(), camera_from_world };
-        (View { name, camera, mips: Vec::new(), masked: false, depth: None }, photo)
+        (View { name, camera, mips: Vec::new(), masked: false, depth: None, seconds: None }, photo)
     };
     let (views, photos) = (0..count).map(photo).unzip();
     let capture = Capture { views, ..Capture::default() };
@@ -162,14 +162,8 @@ fn windows_are_crops_of_the_mips_and_the_cache_keeps_its_limit() {
     assert_eq!(view.mips.len(), 3);
     let capture = Arc::new(ingested.capture.clone());
     let photo = crate::photo::decode(&std::fs::read(&source.photos[2].path).unwrap(), WIDTH, HEIGHT).unwrap();
-    let decoded = Pixels {
-        width: WIDTH,
-        height: HEIGHT,
-        rgb: crate::photo::planes(&photo.rgb),
-        mask: None,
-        weights: None,
-        depth: None,
-    };
+    let decoded =
+        Pixels { width: WIDTH, height: HEIGHT, rgb: crate::photo::planes(&photo.rgb), mask: None, ..Pixels::default() };
     let limit = 40_000;
     let reader = WindowReader::new(Arc::clone(&capture), store.clone(), limit);
     assert!(*reader.window(2, 0, whole(&view.camera)).unwrap() == decoded);

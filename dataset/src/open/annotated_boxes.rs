@@ -1,9 +1,10 @@
 //! Boxes of annotated objects: which of them move, and where they are at a photo's time.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::fmt::Display;
 
 use glam::DVec3;
-use scene::{CameraModel, Rigid};
+use scene::{CameraModel, MovingObject, PathPose, Rigid};
 
 use super::parsed::LabelledBox;
 
@@ -43,9 +44,14 @@ pub(super) struct Placed {
 }
 
 /// For each object its boxes, by time.
-pub(super) struct Tracks(Vec<Track>);
+pub(super) struct Tracks {
+    tracks: Vec<Track>,
+    /// When the clock of the objects starts: with the first box.
+    start_microseconds: i64,
+}
 
 struct Track {
+    name: String,
     class: String,
     moves: bool,
     boxes: Vec<Placed>,
@@ -53,14 +59,47 @@ struct Track {
 
 impl Tracks {
     /// Of boxes with their objects and classes, each object's in the order of time; `moves` says which objects move.
-    pub(super) fn new<'a, K: Ord>(
+    pub(super) fn new<'a, K: Ord + Display>(
         boxes: impl Iterator<Item = (K, &'a str, Placed)>,
         moves: impl Fn(&K) -> bool,
     ) -> Self {
         let mut by_object: BTreeMap<K, (&str, Vec<Placed>)> = BTreeMap::new();
         boxes.for_each(|(object, class, found)| by_object.entry(object).or_insert((class, Vec::new())).1.push(found));
-        let track = |(object, (class, boxes))| Track { class: String::from(class), moves: moves(&object), boxes };
-        Self(by_object.into_iter().map(track).collect())
+        let track = |(object, (class, boxes)): (K, (&str, Vec<Placed>))| {
+            let is_allowed = |c: char| c.is_ascii_alphanumeric() || c == '-' || c == '_';
+            let name = object.to_string().chars().map(|c| if is_allowed(c) { c } else { '_' }).collect();
+            Track { name, class: String::from(class), moves: moves(&object), boxes }
+        };
+        let tracks: Vec<Track> = by_object.into_iter().map(track).collect();
+        let start_microseconds = tracks.iter().flat_map(|track| &track.boxes).map(|found| found.microseconds).min();
+        Self { tracks, start_microseconds: start_microseconds.unwrap_or(0) }
+    }
+
+    /// A time on the clock of the objects, if there are any.
+    pub(super) fn seconds(&self, microseconds: i64) -> Option<f64> {
+        let since = microseconds.checked_sub(self.start_microseconds)?;
+        (!self.tracks.is_empty()).then_some(since as f64 * 1e-6)
+    }
+
+    /// The objects that move, by name. A box that turns or grows between two annotations is drawn at its largest.
+    pub(super) fn objects(&self) -> Vec<MovingObject> {
+        let object = |track: &Track| {
+            let half = 0.5 * track.boxes.iter().fold(DVec3::ZERO, |size, found| size.max(found.size));
+            let mut path: Vec<PathPose> = Vec::new();
+            for found in &track.boxes {
+                let seconds = self.seconds(found.microseconds).unwrap_or(0.0);
+                if path.last().is_none_or(|last| seconds > last.seconds) {
+                    path.push(PathPose { seconds, world_from_object: found.world_from_box });
+                }
+            }
+            MovingObject { id: track.name.clone(), class: track.class.clone(), low: -half, high: half, path }
+        };
+        // Annotations of one that jumps are wrong; its pixels are left out all the same.
+        let sane = |of: &MovingObject| of.check().is_ok();
+        let mut objects: Vec<MovingObject> =
+            self.tracks.iter().filter(|of| of.moves).map(object).filter(sane).collect();
+        objects.sort_by(|a, b| a.id.cmp(&b.id));
+        objects
     }
 
     /// The objects that may be in a photo.
@@ -77,7 +116,7 @@ impl Tracks {
             let labelled = || LabelledBox { class: track.class.clone(), moves: track.moves, corners };
             is_in_view(&corners, lens, size).then(labelled)
         };
-        self.0.iter().filter_map(seen).collect()
+        self.tracks.iter().filter_map(seen).collect()
     }
 }
 

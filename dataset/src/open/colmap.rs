@@ -49,6 +49,7 @@ pub(super) fn read(root: &CaptureRoot, folder: &str, options: &OpenOptions) -> R
             intrinsics: Intrinsics::from_model(&camera.model, size),
             camera_from_world: image.camera_from_world,
             boxes: Vec::new(),
+            seconds: None,
         })
     });
     let images = images.collect::<Result<Vec<_>, BadInput>>()?;

@@ -61,6 +61,7 @@ pub(super) fn read(root: &CaptureRoot, path: &Path, options: &OpenOptions) -> Re
                 intrinsics: Intrinsics::from_model(model, Some(photo.size).filter(|size| size.0 > 0)),
                 camera_from_world: photo.world_from_sensor.inverse(),
                 boxes: Vec::new(),
+                seconds: None,
             });
         }
         for sweep in sample.sweeps.iter().filter(|_| options.lidar) {

@@ -90,6 +90,7 @@ pub(super) fn read(root: &CaptureRoot, of: &Sequence, options: &OpenOptions) -> 
                 intrinsics: Intrinsics::from_model(model, None),
                 camera_from_world: from_first.compose(&world_from_first.inverse()),
                 boxes: Vec::new(),
+                seconds: None,
             });
         }
         let sweep = root.file(&format!("{folder}velodyne/{frame:06}.bin")).filter(|_| options.lidar);

@@ -86,6 +86,7 @@ pub(super) fn read(root: &CaptureRoot, options: &OpenOptions) -> Result<ParsedCa
                     intrinsics: Intrinsics::from_model(&lens.model, Some((lens.width, lens.height))),
                     camera_from_world: world_from_camera.inverse(),
                     boxes: Vec::new(),
+                    seconds: None,
                 });
             }
         }

@@ -133,6 +133,7 @@ pub(super) fn read(drive: Drive, options: &OpenOptions) -> Result<ParsedCapture,
                 intrinsics: Intrinsics::from_model(&lens.model, Some((lens.width, lens.height))),
                 camera_from_world: lens.from_first.compose(&first_from_imu).after(&world_from_imu.inverse()),
                 boxes: Vec::new(),
+                seconds: None,
             });
         }
         let sweep = root.file(&format!("{drive}/velodyne_points/data/{frame}.bin")).filter(|_| options.lidar);

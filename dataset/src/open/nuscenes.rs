@@ -95,6 +95,7 @@ pub(super) fn read(root: &CaptureRoot, scene: Option<&str>, options: &OpenOption
         return Err(tables.bad("sample_data", problem.into()));
     }
     Ok(ParsedCapture {
+        objects: boxes.tracks.objects(),
         labels: boxes.labels,
         sweeps: sweeps.into_iter().map(|(_, sweep)| sweep).collect(),
         ..ParsedCapture::new("nuscenes", images, RawPoints::default())
@@ -151,6 +152,7 @@ fn image(
         intrinsics: Intrinsics::from_model(model, size),
         camera_from_world,
         boxes: boxes.tracks.seen(datum.microseconds, &camera_from_world, model, size),
+        seconds: boxes.tracks.seconds(datum.microseconds),
     })
 }
 

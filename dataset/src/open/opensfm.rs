@@ -32,6 +32,7 @@ pub(super) fn read(root: &CaptureRoot, path: &Path) -> Result<ParsedCapture, Bad
         intrinsics: Intrinsics::from_model(&shot.camera.model, Some((shot.camera.width, shot.camera.height))),
         camera_from_world: shot.camera_from_world,
         boxes: Vec::new(),
+        seconds: None,
     });
     let reason = "it belongs to another reconstruction, which is smaller";
     let points = RawPoints(SparsePoints { positions, colours, ..Default::default() });

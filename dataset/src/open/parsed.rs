@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use glam::DVec3;
 use scene::lidar::Turn;
 use scene::transforms::Intrinsics;
-use scene::{GeoOrigin, Rigid, SparsePoints};
+use scene::{GeoOrigin, MovingObject, Rigid, SparsePoints};
 
 use super::files::CaptureRoot;
 use crate::depth_maps::DepthMapOptions;
@@ -38,6 +38,8 @@ pub(super) struct ParsedCapture {
     pub(super) sweeps: Vec<ParsedSweep>,
     /// Number of annotated boxes by class.
     pub(super) labels: BTreeMap<String, usize>,
+    /// Objects that move, by name.
+    pub(super) objects: Vec<MovingObject>,
     /// The folder that its paths are relative to, if not the one that was given.
     pub(super) root: Option<CaptureRoot>,
 }
@@ -74,6 +76,8 @@ pub(super) struct PosedImage {
     pub(super) intrinsics: Intrinsics,
     pub(super) camera_from_world: Rigid,
     pub(super) boxes: Vec<LabelledBox>,
+    /// When it was taken, seconds on the clock of the objects, if it is known.
+    pub(super) seconds: Option<f64>,
 }
 
 /// An annotated object that may be in a photo.

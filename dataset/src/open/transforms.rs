@@ -49,6 +49,7 @@ pub(super) fn read(root: &CaptureRoot, paths: &[PathBuf]) -> Result<ParsedCaptur
                 intrinsics: frame.intrinsics,
                 camera_from_world: frame.camera_from_world,
                 boxes: Vec::new(),
+                seconds: None,
             });
         }
     }

@@ -71,7 +71,12 @@ pub(super) fn read(
         Some(_) if options.lidar => segment.sweeps(&photos, vehicles.as_ref())?,
         _ => Vec::new(),
     };
-    Ok(ParsedCapture { labels, sweeps, ..ParsedCapture::new("waymo", images, RawPoints::default()) })
+    Ok(ParsedCapture {
+        labels,
+        sweeps,
+        objects: tracks.objects(),
+        ..ParsedCapture::new("waymo", images, RawPoints::default())
+    })
 }
 
 fn choose<'a>(root: &'a CaptureRoot, wanted: Option<&str>) -> Result<Segment<'a>, BadInput> {
@@ -154,6 +159,7 @@ impl Segment<'_> {
                 intrinsics: Intrinsics::from_model(&camera.lens, size),
                 camera_from_world,
                 boxes: tracks.seen(photo.microseconds, &camera_from_world, &camera.lens, seen),
+                seconds: tracks.seconds(photo.microseconds),
             })
         };
         (0..).zip(photos).map(image).collect()

@@ -53,8 +53,13 @@ pub(super) fn write_tracks(out: &Path, city: &City, shots: &[Shot]) -> Result<()
     };
     let lines = city.actors.iter().filter_map(track).map(|value| value.to_string());
     let about = "poses: [seconds, [x, y, z], quaternion [x, y, z, w]], world_from_object, straight and by slerp between \
-                 them; low, high: the object's corners in its own axes (x ahead, y left, z up), metres";
-    save(&out.join("tracks.json"), json_lines("tracks", about, lines).as_bytes())
+                 them; low, high: the object's corners in its own axes (x ahead, y left, z up), metres; seconds: when each photo was \
+                 taken";
+    let times: BTreeMap<String, f64> =
+        shots.iter().map(|shot| (format!("images/{}.png", shot.name), shot.seconds)).collect();
+    let text = json_lines("tracks", about, lines);
+    let text = text.trim_end().trim_end_matches('}');
+    save(&out.join("tracks.json"), format!("{text}, \"seconds\": {}}}\n", json!(times)).as_bytes())
 }
 
 /// Writes the lines made by [`Instances::boxes`], one per shot.

@@ -105,6 +105,7 @@ fn a_dropped_reader_discards_queued_prefetches_and_ends_its_threads() {
         mips: mips.clone(),
         masked: false,
         depth: None,
+        seconds: None,
     });
     let capture = Arc::new(Capture { views: views.collect(), ..Capture::default() });
     let reader = WindowReader::new(capture, store.blocking(), 10 << 20);
@@ -137,7 +138,14 @@ fn windows_carry_the_depths_of_the_points_that_their_view_observed() {
         let camera_from_world = Rigid { translation: DVec3::new(x, 0.0, 0.0), ..Rigid::IDENTITY };
         Camera { pinhole, camera_from_world }
     };
-    let view = |x| View { name: format!("{x}"), camera: camera(x), mips: mips.clone(), masked: false, depth: None };
+    let view = |x| View {
+        name: format!("{x}"),
+        camera: camera(x),
+        mips: mips.clone(),
+        masked: false,
+        depth: None,
+        seconds: None,
+    };
     // Views 0 and 1 observed the first two points, which share a pixel in view 0; view 1 the third, which is also in
     // view 0; view 0 the last, which is behind it.
     let points = SparsePoints {

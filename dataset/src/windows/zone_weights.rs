@@ -94,7 +94,7 @@ mod tests {
     fn weights(zones: &[Zone], finest: &Pinhole, m: u8, rect: Rect) -> Option<Vec<f32>> {
         let (width, height) = (rect.width, rect.height);
         let rgb = vec![0; 3 * (width * height) as usize];
-        let mut pixels = Pixels { width, height, rgb, mask: None, weights: None, depth: None };
+        let mut pixels = Pixels { width, height, rgb, ..Pixels::default() };
         weigh(&mut pixels, zones, 3.0, finest, m, rect);
         pixels.weights
     }

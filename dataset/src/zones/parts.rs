@@ -55,7 +55,7 @@ mod tests {
     fn view(name: String) -> View {
         let pinhole = Pinhole { width: 100, height: 50, fx: 50.0, fy: 50.0, cx: 50.0, cy: 25.0 };
         let camera = Camera { pinhole, camera_from_world: Rigid::IDENTITY };
-        View { name, camera, mips: Vec::new(), masked: false, depth: None }
+        View { name, camera, mips: Vec::new(), masked: false, depth: None, seconds: None }
     }
 
     #[test]

@@ -83,7 +83,7 @@ mod tests {
     fn an_object_is_masked_by_its_own_pixels() {
         // The left half of 8 × 4 pixels is masked.
         let mask = (0..32).map(|i| if i % 8 < 4 { 0 } else { 255 }).collect();
-        let mut photo = Pixels { width: 8, height: 4, rgb: vec![0; 96], mask: Some(mask), weights: None, depth: None };
+        let mut photo = Pixels { width: 8, height: 4, rgb: vec![0; 96], mask: Some(mask), ..Pixels::default() };
         let zone = |spans: &[(u32, std::ops::Range<u32>)]| {
             let mut builder = MaskBuilder::new(8);
             spans.iter().for_each(|(y, x)| builder.push(*y, x.clone()));

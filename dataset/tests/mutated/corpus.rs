@@ -287,7 +287,7 @@ impl Corpus {
         self.put("plan", plan.to_frame(), &plan_codec(source.capture.clone()), Seal::Frame, PLAIN);
         // The size that the fuzz target expects.
         let bytes = (0..3 * 150 * 140).map(|i| (i * 7 / 11) as u8).collect();
-        let pixels = Pixels { width: 150, height: 140, rgb: bytes, mask: None, weights: None, depth: None };
+        let pixels = Pixels { width: 150, height: 140, rgb: bytes, ..Pixels::default() };
         self.plain("mip", mip_tiles::encode(&pixels).expect("an image"), &mip_codec());
 
         let [photo, mask] = [photo_codec(false), photo_codec(true)];

@@ -25,7 +25,7 @@ mod tile;
 use rayon::prelude::*;
 use scene::{Camera, Splats};
 
-use crate::{Contributions, Frame, Gradients, Options, Upstream};
+use crate::{Contributions, Frame, Gradients, Options, Part, Upstream};
 use bin::{Bins, SortScratch, TILE};
 use project::{Projected, View};
 use project_backward::GradientChunk;
@@ -132,16 +132,16 @@ impl Renderer {
         format!("cpu-{}", self.isa.name())
     }
 
-    /// Draws the trainable splats together with a frozen context.
-    pub fn forward(&mut self, splats: &Splats, context: Option<&Splats>, camera: &Camera, options: &Options) -> &Frame {
-        self.forward_timed(splats, context, camera, options, &mut |_| ())
+    /// Draws the trainable splats together with frozen parts. The camera is in the axes of the trainable splats.
+    pub fn forward(&mut self, splats: &Splats, parts: &[Part], camera: &Camera, options: &Options) -> &Frame {
+        self.forward_timed(splats, parts, camera, options, &mut |_| ())
     }
 
     /// As [`forward`](Self::forward); calls `done` after each stage, for timing.
     pub fn forward_timed(
         &mut self,
         splats: &Splats,
-        context: Option<&Splats>,
+        parts: &[Part],
         camera: &Camera,
         options: &Options,
         done: &mut dyn FnMut(Stage),
@@ -149,7 +149,7 @@ impl Renderer {
         let options = Options { sh_degree: options.sh_degree.min(splats.sh_degree()), ..*options };
         let view = View::new(camera);
         self.last_forward = Some((view, options, splats.len()));
-        self.project(splats, context, &view, &options);
+        self.project(splats, parts, camera, &options);
         done(Stage::Project);
         bin::sort_by_depth(&self.records, &self.seen, &mut self.order, &mut self.sort);
         self.ranked.resize(self.order.len(), Projected::default());
@@ -222,31 +222,36 @@ impl Renderer {
         self.visited.iter().map(|tile| u64::from(tile.blocks)).sum()
     }
 
-    fn project(&mut self, splats: &Splats, context: Option<&Splats>, view: &View, options: &Options) {
-        // Context records start at a multiple of LANES.
-        let first_context = splats.len().next_multiple_of(simd::LANES);
-        let total = first_context + context.map_or(0, Splats::len);
+    fn project(&mut self, splats: &Splats, parts: &[Part], camera: &Camera, options: &Options) {
+        // Records of every part start at a multiple of LANES.
+        let padded = |splats: &Splats| splats.len().next_multiple_of(simd::LANES);
+        let total = padded(splats) + parts.iter().map(|part| padded(part.splats)).sum::<usize>();
         self.records.resize(total, Projected::default());
         self.seen.clear();
-        self.seen.resize(total.div_ceil(simd::LANES), 0);
-        let (trainable_records, context_records) = self.records.split_at_mut(first_context.min(total));
-        let (trainable_seen, context_seen) = self.seen.split_at_mut(first_context / simd::LANES);
+        self.seen.resize(total / simd::LANES, 0);
         let isa = self.isa;
-        let draw = |splats: &Splats, options: &Options, trainable: f32, records: &mut [Projected], seen: &mut [u16]| {
-            records
+        let (mut records, mut seen) = (self.records.as_mut_slice(), self.seen.as_mut_slice());
+        let mut draw = |splats: &Splats, camera: &Camera, options: &Options, trainable: f32| {
+            let view = View::new(camera);
+            let (of_records, rest) = std::mem::take(&mut records).split_at_mut(padded(splats));
+            records = rest;
+            let (of_seen, rest) = std::mem::take(&mut seen).split_at_mut(padded(splats) / simd::LANES);
+            seen = rest;
+            of_records[..splats.len()]
                 .par_chunks_mut(CHUNK)
-                .zip(seen.par_chunks_mut(CHUNK / simd::LANES))
+                .zip(of_seen.par_chunks_mut(CHUNK / simd::LANES))
                 .enumerate()
                 .with_max_len(1)
                 .for_each(|(chunk, (records, seen))| {
-                    project::project(isa, splats, chunk * CHUNK, view, options, trainable, records, seen);
+                    project::project(isa, splats, chunk * CHUNK, &view, options, trainable, records, seen);
                 });
         };
-        draw(splats, options, 1.0, &mut trainable_records[..splats.len()], trainable_seen);
-        if let Some(context) = context {
-            // The context is frozen: it is drawn at its full SH degree, whatever degree training has reached.
-            let options = Options { sh_degree: context.sh_degree(), ..*options };
-            draw(context, &options, 0.0, context_records, context_seen);
+        draw(splats, camera, options, 1.0);
+        for Part { splats, camera_from_part } in parts {
+            // Frozen splats are drawn at their full SH degree, whatever degree training has reached.
+            let options = Options { sh_degree: splats.sh_degree(), ..*options };
+            let camera_from_world = camera_from_part.unwrap_or(camera.camera_from_world);
+            draw(splats, &Camera { camera_from_world, ..*camera }, &options, 0.0);
         }
     }
 

@@ -38,9 +38,11 @@ pub(crate) struct BackwardBand<'a> {
     colour: [&'a [f32]; 3],
     transmittance: &'a [f32],
     depth: &'a [f32],
+    trainable_alpha: &'a [f32],
     d_colour: [&'a [f32]; 3],
     d_transmittance: &'a [f32],
     d_depth: &'a [f32],
+    d_trainable_alpha: &'a [f32],
 }
 
 impl<'a> BackwardBand<'a> {
@@ -53,9 +55,11 @@ impl<'a> BackwardBand<'a> {
             colour: [0, 1, 2].map(|c| rows(&frame.colour, c)),
             transmittance: rows(&frame.transmittance, 0),
             depth: rows(&frame.depth, 0),
+            trainable_alpha: rows(&frame.trainable_alpha, 0),
             d_colour: [0, 1, 2].map(|c| rows(&upstream.colour, c)),
             d_transmittance: rows(&upstream.transmittance, 0),
             d_depth: rows(&upstream.depth, 0),
+            d_trainable_alpha: rows(&upstream.trainable_alpha, 0),
         }
     }
 }
@@ -68,7 +72,7 @@ kernel!(
 
 #[inline(always)]
 fn rasterize_backward_lanes<L: Lanes>(tile: &TileInput, band: &BackwardBand, out: &mut [Moments]) {
-    if band.d_depth.is_empty() {
+    if band.d_depth.is_empty() && band.d_trainable_alpha.is_empty() {
         rasterize_backward_tile::<L, false>(tile, band, out);
     } else {
         rasterize_backward_tile::<L, true>(tile, band, out);
@@ -76,7 +80,7 @@ fn rasterize_backward_lanes<L: Lanes>(tile: &TileInput, band: &BackwardBand, out
 }
 
 #[inline(always)]
-fn rasterize_backward_tile<L: Lanes, const DEPTH: bool>(tile: &TileInput, band: &BackwardBand, out: &mut [Moments]) {
+fn rasterize_backward_tile<L: Lanes, const EXTRAS: bool>(tile: &TileInput, band: &BackwardBand, out: &mut [Moments]) {
     let (mut live, mut alive) = tile.start();
     let (ends, with_gradient) = last_trainable_pairs(tile.pairs);
     let mut ended = 0;
@@ -89,7 +93,7 @@ fn rasterize_backward_tile<L: Lanes, const DEPTH: bool>(tile: &TileInput, band: 
             .for_each(|(out, _)| *out = Moments::default());
     }
     let mut d_colour = [Plane::filled(0.0); 3];
-    let mut d_depth = Plane::filled(0.0);
+    let [mut d_depth, mut d_trainable] = [Plane::filled(0.0); 2];
     for c in 0..3 {
         tile.gather(band.d_colour[c], 1.0, &mut d_colour[c]);
     }
@@ -109,9 +113,11 @@ fn rasterize_backward_tile<L: Lanes, const DEPTH: bool>(tile: &TileInput, band: 
         product(band.colour[c], band.d_colour[c]);
     }
     product(band.transmittance, band.d_transmittance);
-    if DEPTH {
+    if EXTRAS {
         product(band.depth, band.d_depth);
+        product(band.trainable_alpha, band.d_trainable_alpha);
         tile.gather(band.d_depth, 1.0, &mut d_depth);
+        tile.gather(band.d_trainable_alpha, 1.0, &mut d_trainable);
     }
 
     let [mut alphas, mut vs, mut weights] = [Plane::filled(0.0); 3];
@@ -156,8 +162,9 @@ fn rasterize_backward_tile<L: Lanes, const DEPTH: bool>(tile: &TileInput, band: 
                 L::splat(r[at::RED]),
                 L::load(&d_colour[1][b]).fma(L::splat(r[at::GREEN]), L::load(&d_colour[2][b]) * L::splat(r[at::BLUE])),
             );
-            if DEPTH {
-                d_weight = L::load(&d_depth[b]).fma(L::splat(r[at::Z]), d_weight);
+            if EXTRAS {
+                let d_trainable = L::load(&d_trainable[b]) * L::splat(r[at::TRAINABLE]);
+                d_weight = L::load(&d_depth[b]).fma(L::splat(r[at::Z]), d_weight + d_trainable);
             }
             let rest = L::load(&behind[b]) - weight * d_weight;
             rest.store(&mut behind[b]);
@@ -190,7 +197,7 @@ fn rasterize_backward_tile<L: Lanes, const DEPTH: bool>(tile: &TileInput, band: 
             for c in 0..3 {
                 sums[moment::RED + c] = weight.fma(L::load(&d_colour[c][b]), sums[moment::RED + c]);
             }
-            if DEPTH {
+            if EXTRAS {
                 sums[moment::Z] = weight.fma(L::load(&d_depth[b]), sums[moment::Z]);
             }
             sums[moment::WEIGHT] = sums[moment::WEIGHT] + weight;

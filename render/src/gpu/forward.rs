@@ -6,12 +6,12 @@ use shaders::{SCAN_BLOCK, SplatSet, Views, WORKGROUP_SIZE, args, status_word};
 use super::error::GpuError;
 use super::renderer::{Displacements, GpuRenderer, LastForward};
 use super::sort::{Groups, SortInput};
-use super::splats::GpuSplats;
-use super::views::views_of;
+use super::splats::{GpuPart, GpuSplats};
+use super::views::{seen_from, views_of};
 use crate::Options;
 
 impl GpuRenderer {
-    /// Encodes a forward pass of the trainable splats and a frozen context into [`frame`](Self::frame), with one view
+    /// Encodes a forward pass of the trainable splats and frozen parts into [`frame`](Self::frame), with one view
     /// per camera.
     ///
     /// # Errors Unless there are 1 to [`MAX_VIEWS`](shaders::MAX_VIEWS) cameras, or if a buffer does not fit. Errors of
@@ -20,11 +20,11 @@ impl GpuRenderer {
         &mut self,
         encoder: &mut wgpu::CommandEncoder,
         splats: &GpuSplats,
-        context: Option<&GpuSplats>,
+        parts: &[GpuPart],
         cameras: &[Camera],
         options: &Options,
     ) -> Result<(), GpuError> {
-        self.forward_displaced(encoder, splats, context, cameras, options, None)
+        self.forward_displaced(encoder, splats, parts, cameras, options, None)
     }
 
     /// As [`forward`](Self::forward), of cameras that are first moved in their own axes, on the device, where there are displacements. A backward pass
@@ -36,12 +36,12 @@ impl GpuRenderer {
         &mut self,
         encoder: &mut wgpu::CommandEncoder,
         splats: &GpuSplats,
-        context: Option<&GpuSplats>,
+        parts: &[GpuPart],
         cameras: &[Camera],
         options: &Options,
         displacements: Option<Displacements>,
     ) -> Result<(), GpuError> {
-        let counts = [splats.len(), context.map_or(0, GpuSplats::len)];
+        let counts = [splats.len(), parts.iter().map(|part| part.splats.len()).sum()];
         let mut views = views_of(cameras, options, counts, self.pair_capacity, self.gpu.max_binding_bytes())?;
         for (view, row) in views.view.iter_mut().zip(displacements.map_or(&[][..], |of| of.of_camera)) {
             view.displacement = row.map_or(0, |row| row + 1);
@@ -52,13 +52,19 @@ impl GpuRenderer {
         self.gpu.write(encoder, &self.views, 0, &[views]);
         encoder.clear_buffer(&self.tile_ranges, 0, Some(8 * u64::from(views.tiles)));
 
-        // The context is frozen: it is drawn at its full SH degree, whatever degree training has reached.
-        let context = context.map(|context| (context, set_of(context, splats.len(), context.sh_degree())));
+        let mut sets = vec![(splats, set, None)];
+        let mut first = splats.len();
+        for GpuPart { splats, cameras_from_part } in parts {
+            let own = cameras_from_part.map(|poses| self.gpu.uniform(&seen_from(&views, cameras, poses)));
+            // Frozen splats are drawn at their full SH degree, whatever degree training has reached.
+            sets.push((splats, set_of(splats, first, splats.sh_degree()), own));
+            first += splats.len();
+        }
         let pass = &mut encoder.begin_compute_pass(&wgpu::ComputePassDescriptor::default());
         if let Some(Displacements { rows, .. }) = displacements {
             self.kernels.displace.run(&self.gpu, pass, &[(0, &self.views), (1, rows)], 1);
         }
-        self.encode_project(pass, &views, [Some((splats, set)), context].into_iter().flatten());
+        self.encode_project(pass, &views, &sets);
         let sorted = self.encode_sort_and_bin(pass, views.tiles);
         self.encode_rasterize(pass, views.tiles, sorted);
         self.last_forward = Some(LastForward { views, set, sorted });
@@ -66,24 +72,25 @@ impl GpuRenderer {
     }
 
     /// Projects all entries and compacts the visible ones.
-    fn encode_project<'a>(
+    /// A set may have views of its own.
+    fn encode_project(
         &self,
         pass: &mut wgpu::ComputePass,
         views: &Views,
-        sets: impl Iterator<Item = (&'a GpuSplats, SplatSet)>,
+        sets: &[(&GpuSplats, SplatSet, Option<wgpu::Buffer>)],
     ) {
         let (gpu, kernels, entries, status) = (&*self.gpu, &self.kernels, &self.entries, &*self.status);
         let plan = self.plan_bindings();
         kernels.plan_start.run(gpu, pass, &plan[..3], 1);
-        for (splats, set) in sets {
-            let uniform = gpu.uniform(&set);
+        for (splats, set, own_views) in sets {
+            let uniform = gpu.uniform(set);
             let [a, b, c, d] = splats.columns().banks();
             let bindings = [
                 (0, a),
                 (1, b),
                 (2, c),
                 (3, d),
-                (4, &self.views),
+                (4, own_views.as_ref().unwrap_or(&self.views)),
                 (5, &uniform),
                 (6, &*entries.records),
                 (7, &*entries.is_visible),

@@ -46,7 +46,7 @@ pub use error::GpuError;
 pub use kernel::Kernel;
 pub use options::{GpuOptions, Path};
 pub use renderer::{Displacements, GpuRenderer, UpstreamPlanes};
-pub use splats::{Columns, GpuSplats};
+pub use splats::{Columns, GpuPart, GpuSplats};
 pub use timestamps::TimedDispatch;
 
 #[cfg(test)]

@@ -7,7 +7,7 @@ use shaders::{MOMENTS, Views};
 
 use super::error::GpuError;
 use super::renderer::{GpuRenderer, LastForward};
-use super::splats::GpuSplats;
+use super::splats::{GpuPart, GpuSplats};
 use crate::{BackwardIntermediates, ForwardIntermediates, Frame, Gradients, Options};
 
 impl GpuRenderer {
@@ -18,13 +18,13 @@ impl GpuRenderer {
     pub fn draw(
         &mut self,
         splats: &GpuSplats,
-        context: Option<&GpuSplats>,
+        parts: &[GpuPart],
         camera: &Camera,
         options: &Options,
     ) -> Result<Frame, GpuError> {
         loop {
             let mut encoder = self.gpu.encoder();
-            self.forward(&mut encoder, splats, context, slice::from_ref(camera), options)?;
+            self.forward(&mut encoder, splats, parts, slice::from_ref(camera), options)?;
             self.gpu.submit(encoder)?;
             if !self.grow_after_overflow()? {
                 return self.read_frame(0);

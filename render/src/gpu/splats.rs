@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use scene::splats::sh_coefficients;
-use scene::{Splats, column};
+use scene::{Rigid, Splats, column};
 
 use super::buffer::Buffer;
 use super::device::Gpu;
@@ -107,6 +107,22 @@ pub(super) fn max_splats(binding_bytes: u64, sh_degree: u8) -> usize {
 fn columns_of(sh_degree: u8, bank: usize) -> usize {
     let columns = column::SH + 3 * sh_coefficients(sh_degree);
     columns.min(BANKS[bank + 1]).saturating_sub(BANKS[bank])
+}
+
+/// Frozen splats on the device that are drawn with the trainable ones, as [`Part`](crate::Part).
+#[derive(Debug, Clone, Copy)]
+pub struct GpuPart<'a> {
+    /// The splats.
+    pub splats: &'a GpuSplats,
+    /// For each camera what takes their axes to the camera's, where theirs are not those of the trainable splats.
+    pub cameras_from_part: Option<&'a [Rigid]>,
+}
+
+impl<'a> GpuPart<'a> {
+    /// Splats in the axes of the trainable ones.
+    pub fn beside(splats: &'a GpuSplats) -> Self {
+        Self { splats, cameras_from_part: None }
+    }
 }
 
 /// [`Splats`] on the device.

@@ -1,7 +1,7 @@
 //! The uniform `Views` of a dispatch, from cameras and options.
 
 use bytemuck::Zeroable;
-use scene::Camera;
+use scene::{Camera, Rigid};
 use shaders::{MAX_VIEWS, TILE, View, Views};
 
 use super::error::GpuError;
@@ -49,6 +49,16 @@ pub(super) fn views_of(
         views.pixels += view.pixels[0] * view.pixels[1];
     }
     Ok(views)
+}
+
+/// The same views, from these poses instead of the cameras'; nothing displaces them.
+pub(super) fn seen_from(views: &Views, cameras: &[Camera], poses: &[Rigid]) -> Views {
+    let mut own = *views;
+    for ((view, camera), pose) in own.view.iter_mut().zip(cameras).zip(poses) {
+        let View { rows, centre, .. } = view_of(&Camera { camera_from_world: *pose, ..*camera });
+        *view = View { rows, centre, displacement: 0, ..*view };
+    }
+    own
 }
 
 fn view_of(camera: &Camera) -> View {

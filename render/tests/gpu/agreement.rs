@@ -3,8 +3,8 @@
 use std::collections::BTreeMap;
 
 use render::cpu::{Isa, Renderer};
-use render::gpu::{GpuRenderer, GpuSplats};
-use render::{ForwardIntermediates, Options};
+use render::gpu::{GpuPart, GpuRenderer, GpuSplats};
+use render::{ForwardIntermediates, Options, Part};
 use scene::Splats;
 
 use crate::common::{GRADIENTS, NEEDLES, gpu, gpus, noise, on_cpu, on_gpu, options, worst};
@@ -36,7 +36,7 @@ fn images_equal_the_reference() {
                 let splats = mixture(&mut Random(seed as u64 + 100), &camera, kind, 150);
                 let options = options(antialiased);
                 let on_device = GpuSplats::upload(&gpu, &splats, 0).expect("splats fit");
-                let frame = renderer.draw(&on_device, None, &camera, &options).expect("drawn");
+                let frame = renderer.draw(&on_device, &[], &camera, &options).expect("drawn");
                 tally.add(&frame, &Scene::new(&splats, None, &camera, &options));
             }
             let Tally { pixels, ambiguous, off, off_unambiguous, worst_unambiguous } = tally;
@@ -110,10 +110,10 @@ fn forward_intermediates_agree_with_the_cpu() {
         let context = mixture(&mut random, &camera, Kind::Common, 100);
         let options = options(true);
         let mut cpu = Renderer::default();
-        cpu.forward(&splats, Some(&context), &camera, &options);
+        cpu.forward(&splats, &[GpuPart::beside(&context)], &camera, &options);
         let [on_device, context_on_device] =
             [&splats, &context].map(|s| GpuSplats::upload(&gpu, s, 0).expect("splats fit"));
-        renderer.draw(&on_device, Some(&context_on_device), &camera, &options).expect("drawn");
+        renderer.draw(&on_device, &[GpuPart::beside(&context_on_device)], &camera, &options).expect("drawn");
         let (ours, theirs) = (renderer.read_forward_intermediates().expect("stages"), cpu.forward_intermediates());
 
         // The same visible splats; compare their records by index.

@@ -3,8 +3,8 @@
 use std::sync::{Arc, OnceLock};
 
 use render::cpu::{Isa, Renderer};
-use render::gpu::{Gpu, GpuOptions, GpuRenderer, GpuSplats, Path, UpstreamPlanes};
-use render::{Frame, Gradients, Options, Upstream};
+use render::gpu::{Gpu, GpuOptions, GpuPart, GpuRenderer, GpuSplats, Path, UpstreamPlanes};
+use render::{Frame, Gradients, Options, Part, Upstream};
 use scene::{Camera, Splats};
 
 use crate::reference::Random;
@@ -54,6 +54,7 @@ pub(crate) fn noise(camera: &Camera, options: &Options) -> Upstream {
         colour: random.plane(3 * area),
         transmittance: random.plane(area),
         depth: if options.extras { random.plane(area) } else { Vec::new() },
+        ..Upstream::default()
     }
 }
 
@@ -66,7 +67,8 @@ pub(crate) fn on_cpu(
     upstream: &Upstream,
 ) -> Drawn {
     let mut renderer = Renderer::new(isa);
-    let frame = renderer.forward(splats, context, camera, options).clone();
+    let part = context.map(Part::beside);
+    let frame = renderer.forward(splats, part.as_slice(), camera, options).clone();
     let gradients = renderer.backward(splats, upstream).clone();
     Drawn { frame, gradients }
 }
@@ -82,7 +84,8 @@ pub(crate) fn on_gpu(
 ) -> Drawn {
     let on_device = GpuSplats::upload(gpu, splats, 0).expect("splats fit");
     let context = context.map(|context| GpuSplats::upload(gpu, context, 0).expect("context fits"));
-    let frame = renderer.draw(&on_device, context.as_ref(), camera, options).expect("drawn");
+    let part = context.as_ref().map(GpuPart::beside);
+    let frame = renderer.draw(&on_device, part.as_slice(), camera, options).expect("drawn");
     let area = frame.transmittance.len();
     let mut encoder = gpu.encoder();
     for (plane, values) in [(0, &upstream.colour), (3, &upstream.transmittance), (4, &upstream.depth)] {

@@ -1,6 +1,6 @@
 //! Bit-identical results: from run to run, after other views, and with several views in one dispatch.
 
-use render::gpu::{GpuRenderer, GpuSplats, UpstreamPlanes};
+use render::gpu::{GpuPart, GpuRenderer, GpuSplats, UpstreamPlanes};
 use render::{Options, Upstream};
 use scene::Camera;
 
@@ -69,7 +69,7 @@ fn several_views_in_one_dispatch_equal_single_views() {
         let [on_device, context] =
             [&splats, &context].map(|splats| GpuSplats::upload(&gpu, splats, 0).expect("splats fit"));
         let mut encoder = gpu.encoder();
-        renderer.forward(&mut encoder, &on_device, Some(&context), &cameras, &options).expect("encoded");
+        renderer.forward(&mut encoder, &on_device, &[GpuPart::beside(&context)], &cameras, &options).expect("encoded");
         let mut first = 0;
         for upstream in &upstreams {
             let planes = [&upstream.colour[..], &upstream.transmittance, &upstream.depth].concat();
@@ -100,7 +100,7 @@ fn several_views_in_one_dispatch_equal_single_views() {
             assert!(column == sum, "{}: gradients of {name} differ", gpu.name());
         }
         let mut encoder = gpu.encoder();
-        let mut forward = |cameras: &[Camera]| renderer.forward(&mut encoder, &on_device, None, cameras, &options);
+        let mut forward = |cameras: &[Camera]| renderer.forward(&mut encoder, &on_device, &[], cameras, &options);
         for number in [0, 17] {
             let error = forward(&vec![cameras[0]; number]).expect_err("too few or too many").to_string();
             assert!(error.contains("1 to 16"), "{error}");

@@ -25,7 +25,7 @@ fn the_memory_cap_is_enforced() {
     let camera = camera_of(250, 187);
     let splats = mixture(&mut Random(9), &camera, Kind::Common, 50);
     let drawn = GpuRenderer::new(gpu.clone()).and_then(|mut renderer| {
-        renderer.draw(&GpuSplats::upload(&gpu, &splats, 0)?, None, &camera, &self::options(false))
+        renderer.draw(&GpuSplats::upload(&gpu, &splats, 0)?, &[], &camera, &self::options(false))
     });
     let error = drawn.expect_err("the pair buffers exceed the cap");
     println!("{error}");
@@ -45,15 +45,15 @@ fn operations_on_a_lost_device_fail() {
         let gpu = Gpu::open().expect("the adapter opened before");
         let mut renderer = GpuRenderer::new(gpu.clone()).expect("a renderer");
         let on_device = GpuSplats::upload(&gpu, &splats, 0).expect("splats fit");
-        renderer.draw(&on_device, None, &camera, &options(false)).expect("drawn");
+        renderer.draw(&on_device, &[], &camera, &options(false)).expect("drawn");
         gpu.device().destroy();
         let error = match operation {
-            0 => renderer.draw(&on_device, None, &camera, &options(false)).map(|_| ()),
+            0 => renderer.draw(&on_device, &[], &camera, &options(false)).map(|_| ()),
             1 => renderer.read_frame(0).map(|_| ()),
             2 => on_device.download().map(|_| ()),
             _ => GpuRenderer::new(gpu.clone()).and_then(|mut fresh| {
                 let on_device = GpuSplats::upload(&gpu, &splats, 0)?;
-                fresh.draw(&on_device, None, &camera, &options(false)).map(|_| ())
+                fresh.draw(&on_device, &[], &camera, &options(false)).map(|_| ())
             }),
         };
         assert!(matches!(error, Err(GpuError::Lost(_))), "operation {operation}: {error:?}");
@@ -71,12 +71,12 @@ fn pair_overflow_is_sticky_until_the_buffers_grow() {
     let few = mixture(&mut Random(9), &camera, Kind::Common, 50);
     let [many, few] = [many, few].map(|splats| GpuSplats::upload(&gpu, &splats, 0).expect("splats fit"));
     let expected =
-        GpuRenderer::new(gpu.clone()).expect("a renderer").draw(&few, None, &camera, &options).expect("drawn");
+        GpuRenderer::new(gpu.clone()).expect("a renderer").draw(&few, &[], &camera, &options).expect("drawn");
 
     let mut renderer = GpuRenderer::new(gpu.clone()).expect("a renderer");
     let forward = |renderer: &mut GpuRenderer, splats: &GpuSplats| {
         let mut encoder = gpu.encoder();
-        renderer.forward(&mut encoder, splats, None, &[camera], &options).expect("encoded");
+        renderer.forward(&mut encoder, splats, &[], &[camera], &options).expect("encoded");
         renderer.backward(&mut encoder, splats, UpstreamPlanes::default()).expect("encoded");
         gpu.submit(encoder).expect("submitted");
         renderer.status().expect("a status")
@@ -94,7 +94,7 @@ fn pair_overflow_is_sticky_until_the_buffers_grow() {
     let status = forward(&mut renderer, &many);
     assert!(status.overflow == 0 && status.pairs == status.max_pairs && status.visible_trainable > 0);
     assert!(!renderer.grow_after_overflow().expect("a status"));
-    assert_eq!(renderer.draw(&few, None, &camera, &options).expect("drawn"), expected);
+    assert_eq!(renderer.draw(&few, &[], &camera, &options).expect("drawn"), expected);
 }
 
 #[test]
@@ -138,7 +138,7 @@ fn errors_of_oversized_requests_state_the_limit() {
     let splats = GpuSplats::upload(&gpu, &Splats::new(0), 0).expect("an empty set");
     let camera = camera_of(200_000, 200_000);
     let error = renderer
-        .draw(&splats, None, &camera, &options(false))
+        .draw(&splats, &[], &camera, &options(false))
         .expect_err("an image larger than any binding")
         .to_string();
     println!("{error}");

@@ -83,7 +83,7 @@ fn atomic_and_ordered_reduction_agree() {
         let on_device = GpuSplats::upload(&gpu, &splats, 0).expect("splats fit");
         let mut renderer = GpuRenderer::new(gpu.clone()).expect("a renderer");
         let options = options(false);
-        let frame = renderer.draw(&on_device, None, &camera, &options).expect("drawn");
+        let frame = renderer.draw(&on_device, &[], &camera, &options).expect("drawn");
         let upstream = noise(&camera, &options);
         let [ordered, atomic] = [Reduction::Ordered, Reduction::Atomic].map(|reduction| {
             let mut encoder = gpu.encoder();

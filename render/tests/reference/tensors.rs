@@ -106,7 +106,7 @@ impl Case {
         Upstream {
             colour: planes(&self.arrays["dL_dimage"].1, 3),
             transmittance: self.arrays["dL_dalpha"].1.iter().map(|&g| -g as f32).collect(),
-            depth: Vec::new(),
+            ..Upstream::default()
         }
     }
 

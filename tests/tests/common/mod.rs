@@ -56,6 +56,7 @@ pub(crate) fn plan_of(levels: u8, tasks: Vec<Task>) -> Plan {
         tasks,
         eval_tasks: Vec::new(),
         detect_tasks: Vec::new(),
+        object_tasks: Vec::new(),
     }
 }
 

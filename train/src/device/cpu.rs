@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use rayon::prelude::*;
 use render::cpu::{Isa, Renderer};
-use render::{Frame, Gradients, Upstream};
+use render::{Frame, Gradients, Part, Upstream};
 use scene::{Pixels, Splats};
 
 use super::step::{StatePart, Step, TrainDevice, ViewSample};
@@ -15,6 +15,7 @@ use crate::exposure::{expose, expose_backward};
 use crate::loss::PhotometricLoss;
 use crate::picture_loss::{PictureLoss, add_picture_loss};
 use crate::pose::GivenPoses;
+use crate::silhouette_loss::silhouette_loss;
 
 /// The renderer, the loss and their buffers.
 pub(crate) struct CpuDevice<'a> {
@@ -55,17 +56,27 @@ impl<'a> CpuDevice<'a> {
 
 impl TrainDevice for CpuDevice<'_> {
     fn step(&mut self, state: &mut State, step: Step) -> Result<(), TrainError> {
-        let Step { samples, options, rates, depth_weight, picture_weight, exposure_rate, pose_rates } = step;
+        let Step {
+            samples,
+            options,
+            rates,
+            depth_weight,
+            silhouette_weight,
+            picture_weight,
+            exposure_rate,
+            pose_rates,
+        } = step;
         let several = samples.len() > 1;
         let before = several.then(|| state.densification.clone());
         let (mut loss, mut errors, mut visible_sum) = (0.0, Vec::new(), 0);
         let (mut by_exposure, mut by_pose) = (Vec::new(), Vec::new());
         for sample in &samples {
-            let ViewSample { view, photo, camera, exposure, .. } = sample;
-            let camera = state.poses.as_ref().map_or(*camera, |poses| poses.apply(*view, camera));
-            let frame = self.renderer.forward(&state.splats, self.context, &camera, &options);
+            let &ViewSample { view, ref photo, ref camera, camera_from_context, exposure, .. } = sample;
+            let camera = state.poses.as_ref().map_or(*camera, |poses| poses.apply(view, camera));
+            let context = self.context.map(|splats| Part { splats, camera_from_part: camera_from_context });
+            let frame = self.renderer.forward(&state.splats, context.as_slice(), &camera, &options);
             pixel_weights(frame, photo, self.context.is_some(), &mut self.weights);
-            let exposure = state.exposures.as_ref().map_or(*exposure, |exposures| exposures.of(*view));
+            let exposure = state.exposures.as_ref().map_or(exposure, |exposures| exposures.of(view));
             let shown = exposure.as_ref().map_or(&frame.colour, |exposure| {
                 expose(exposure, &frame.colour, &mut self.exposed);
                 &self.exposed
@@ -80,6 +91,12 @@ impl TrainDevice for CpuDevice<'_> {
                     self.upstream.transmittance.clear();
                 }
             }
+            match &photo.silhouette {
+                Some(shown) if silhouette_weight > 0.0 => {
+                    value.total += silhouette_loss(frame, shown, &self.weights, silhouette_weight, &mut self.upstream);
+                }
+                _ => self.upstream.trainable_alpha.clear(),
+            }
             if let Some(of_picture) = self.picture_loss.filter(|_| picture_weight > 0.0) {
                 let (weights, gradient) = (&self.weights, &mut self.upstream.colour);
                 value.total += add_picture_loss(of_picture, picture_weight, sample, shown, weights, gradient)?;
@@ -92,10 +109,10 @@ impl TrainDevice for CpuDevice<'_> {
             }
             errors.push(value.l1);
             if let Some(exposure) = &exposure {
-                by_exposure.push((*view, expose_backward(exposure, &frame.colour, &mut self.upstream.colour)));
+                by_exposure.push((view, expose_backward(exposure, &frame.colour, &mut self.upstream.colour)));
             }
             let gradients = self.renderer.backward(&state.splats, &self.upstream);
-            by_pose.push((*view, gradients.pose));
+            by_pose.push((view, gradients.pose));
             if rates.is_some() {
                 state.densification.add(gradients, photo.area() as f32);
             }

@@ -18,7 +18,9 @@ use std::sync::Arc;
 
 use bytemuck::Zeroable;
 use render::cpu::Isa;
-use render::gpu::{Buffer, Columns, Gpu, GpuError, GpuRenderer, GpuSplats, GrowableBuffer, Kernel, UpstreamPlanes};
+use render::gpu::{
+    Buffer, Columns, Gpu, GpuError, GpuPart, GpuRenderer, GpuSplats, GrowableBuffer, Kernel, UpstreamPlanes,
+};
 use scene::{Camera, Splats, column};
 use shaders::train::{
     ADAM, AdamConstants, DENSIFICATION_STATS, LOSS, NO_ROW, OptimiserState, Photo, Photos, REARRANGE,
@@ -167,7 +169,7 @@ impl GpuDevice {
     fn submit(&mut self, step: &Step) -> Result<(), GpuError> {
         let gpu = Arc::clone(&self.gpu);
         // Without a picture loss, which `Backend::open` refuses.
-        let Step { samples, options, rates, depth_weight, picture_weight: _, exposure_rate, pose_rates } = step;
+        let Step { samples, options, rates, depth_weight, exposure_rate, pose_rates, .. } = step;
         let (photos, bytes) = self.photos(samples, options.extras, *depth_weight);
         let area: usize = samples.iter().map(|sample| sample.photo.area()).sum();
         let (of_photos, tiles) = (photos.tiles, 3 * photos.tiles);
@@ -180,8 +182,10 @@ impl GpuDevice {
         self.exposures.prepare(&gpu, &mut encoder, samples, of_photos)?;
         let cameras: Vec<Camera> = samples.iter().map(|sample| sample.camera).collect();
         let rows = self.poses.rows(samples);
-        let (context, displacements) = (self.context.as_ref(), self.poses.displacements(&rows));
-        self.renderer.forward_displaced(&mut encoder, &self.splats, context, &cameras, options, displacements)?;
+        let displacements = self.poses.displacements(&rows);
+        let context = self.context.as_ref().map(GpuPart::beside);
+        let parts = context.as_slice();
+        self.renderer.forward_displaced(&mut encoder, &self.splats, parts, &cameras, options, displacements)?;
         let photos = gpu.uniform(&photos);
         {
             let pass = &mut encoder.begin_compute_pass(&wgpu::ComputePassDescriptor::default());

@@ -7,7 +7,7 @@
 use std::sync::Arc;
 
 use render::Options;
-use scene::{Camera, Exposure, Pixels, Rect};
+use scene::{Camera, Exposure, Pixels, Rect, Rigid};
 
 use crate::checkpoint::State;
 use crate::error::TrainError;
@@ -27,6 +27,8 @@ pub(crate) struct Step {
     pub(crate) rates: Option<LearningRates>,
     /// Weight of the depth loss. Above 0 a sample has target depths and the options ask for the planes that they need.
     pub(crate) depth_weight: f32,
+    /// Weight of the silhouette loss. Above 0 the options ask for the plane that it needs.
+    pub(crate) silhouette_weight: f32,
     /// Weight of the picture loss; 0 leaves it out.
     pub(crate) picture_weight: f32,
     /// Learning rate of exposures, where they are trained.
@@ -48,6 +50,8 @@ pub(crate) struct ViewSample {
     pub(crate) photo: Arc<Pixels>,
     /// Camera of the window, with the given pose.
     pub(crate) camera: Camera,
+    /// As in [`TrainView`](crate::TrainView).
+    pub(crate) camera_from_context: Option<Rigid>,
     /// Exposure of the view where exposures are given and fixed; `None` if they are trained or not used.
     pub(crate) exposure: Option<Exposure>,
 }

@@ -48,7 +48,7 @@ impl WindowSource for Photos {
             plane.as_ref().map(of)
         };
         let (weights, depth) = (first(&photo.weights), first(&photo.depth));
-        Ok(Arc::new(Pixels { width: rect.width, height: rect.height, rgb, mask, weights, depth }))
+        Ok(Arc::new(Pixels { width: rect.width, height: rect.height, rgb, mask, weights, depth, silhouette: None }))
     }
 }
 
@@ -65,7 +65,7 @@ pub fn views() -> Vec<TrainView> {
             let rotation = DQuat::from_mat3(&axes);
             let pinhole = Pinhole { width: WIDTH, height: HEIGHT, fx: 70.0, fy: 70.0, cx: 32.0, cy: 24.0 };
             let camera = Camera { pinhole, camera_from_world: Rigid { rotation, translation: rotation * -centre } };
-            TrainView { view: n, mip: 0, rect: camera.full(), camera }
+            TrainView { view: n, mip: 0, rect: camera.full(), camera, camera_from_context: None }
         })
         .collect()
 }
@@ -99,7 +99,7 @@ pub fn perturbed(splats: &Splats) -> Splats {
 
 pub fn photo(splats: &Splats, view: &TrainView) -> Vec<f32> {
     let options = Options { sh_degree: 1, ..Options::default() };
-    Renderer::default().forward(splats, None, &view.camera, &options).colour.clone()
+    Renderer::default().forward(splats, &[], &view.camera, &options).colour.clone()
 }
 
 pub fn photos(splats: &Splats) -> Photos {
@@ -109,8 +109,7 @@ pub fn photos(splats: &Splats) -> Photos {
         height: HEIGHT,
         rgb: bytes(photo(splats, view)),
         mask: None,
-        weights: None,
-        depth: None,
+        ..Pixels::default()
     };
     Photos(views().iter().map(photo).collect())
 }

@@ -73,7 +73,7 @@ pub(super) fn run(gpu: &Arc<Gpu>, scene: &Scene, from: Stage, output: &Output) -
 
 impl Drawn {
     pub(super) fn on_cpu(renderer: &mut Renderer, scene: &Scene, camera: &Camera, options: &Options) -> Self {
-        let frame = renderer.forward(&scene.splats, None, camera, options).clone();
+        let frame = renderer.forward(&scene.splats, &[], camera, options).clone();
         let upstream = Upstream { colour: noise(camera), ..Upstream::default() };
         let gradients = renderer.backward(&scene.splats, &upstream).clone();
         Self { stages: renderer.forward_intermediates(), frame, moments: renderer.backward_intermediates(), gradients }
@@ -86,7 +86,7 @@ impl Drawn {
         camera: &Camera,
         options: &Options,
     ) -> Result<Self, GpuError> {
-        let frame = renderer.draw(splats, None, camera, options)?;
+        let frame = renderer.draw(splats, &[], camera, options)?;
         let mut encoder = gpu.encoder();
         gpu.write(&mut encoder, renderer.upstream(), 0, &noise(camera));
         renderer.backward(&mut encoder, splats, UpstreamPlanes::default())?;

@@ -35,7 +35,7 @@ pub(super) fn time(args: &KernelsArgs, Scene { splats, options, cameras }: &Scen
             }
         };
         let pass_clock = Stopwatch::start();
-        renderer.forward_timed(splats, None, &cameras[pass % cameras.len()], options, &mut note);
+        renderer.forward_timed(splats, &[], &cameras[pass % cameras.len()], options, &mut note);
         let forward = [pass_clock.cpu_seconds(), pass_clock.wall_seconds()];
         let pass_clock = Stopwatch::start();
         renderer.backward_timed(splats, &upstream, &mut note);

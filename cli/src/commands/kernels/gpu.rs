@@ -176,7 +176,7 @@ impl<'a> Bench<'a> {
         let mut encoder = self.gpu.encoder();
         match direction {
             Direction::Forward => {
-                self.renderer.forward(&mut encoder, &self.splats, None, cameras, &self.scene.options)?;
+                self.renderer.forward(&mut encoder, &self.splats, &[], cameras, &self.scene.options)?;
             }
             Direction::Backward => self.renderer.backward(&mut encoder, &self.splats, UpstreamPlanes::default())?,
         }
@@ -208,7 +208,7 @@ mod tests {
         let camera = front(Size { width: 48, height: 32 });
         let scene = Scene { splats: cloud(100), options: Options::default(), cameras: vec![camera] };
         let mut bench = Bench::new(&gpu, &scene).unwrap();
-        let usual = bench.renderer.draw(&bench.splats, None, &camera, &scene.options).unwrap();
+        let usual = bench.renderer.draw(&bench.splats, &[], &camera, &scene.options).unwrap();
         for has_clock in [gpu.has_timestamps(), false] {
             bench.has_clock = has_clock;
             let pass = bench.pass(&[camera; 3]).unwrap();

@@ -3,7 +3,7 @@
 use ::render::Options;
 use ::render::cpu::Stage;
 use glam::{DQuat, DVec3, Vec3};
-use scene::{Camera, Pinhole, Rigid, Splat, Splats};
+use scene::{Camera, Pinhole, Rigid, Splat, Splats, View};
 use train::random;
 
 use crate::args::{KernelsArgs, Size};
@@ -49,7 +49,7 @@ pub(super) fn scene(args: &KernelsArgs) -> Result<Scene, Failure> {
     };
     let model = model::read(path)?;
     let views = captures::read_cameras(from)?.into_iter();
-    let resized = |(_, camera): (String, Camera)| captures::resized(&camera, args.size.width, args.size.height);
+    let resized = |view: View| captures::resized(&view.camera, args.size.width, args.size.height);
     Ok(Scene { splats: model.splats.clone(), options: model.options(), cameras: views.map(resized).collect() })
 }
 

@@ -28,7 +28,7 @@ fn splats() -> Splats {
 fn drawn(splats: &Splats, camera_from_world: Rigid) -> Vec<f32> {
     let pinhole = Pinhole { width: 64, height: 48, fx: 60.0, fy: 60.0, cx: 32.0, cy: 24.0 };
     let camera = Camera { pinhole, camera_from_world };
-    Renderer::default().forward(splats, None, &camera, &Options::default()).colour.clone()
+    Renderer::default().forward(splats, &[], &camera, &Options::default()).colour.clone()
 }
 
 fn matrix(matrix: DMat4) -> Value {

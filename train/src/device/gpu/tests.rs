@@ -50,7 +50,7 @@ fn sample(masked: bool, key: u64, [width, height]: [u32; 2], translation: DVec3)
     let mask = masked.then(|| (0..area).map(|i| if i % width as usize > 50 { 0 } else { 255 }).collect());
     let pinhole = Pinhole { width, height, fx: 70.0, fy: 72.0, cx: 37.0, cy: 27.0 };
     let camera_from_world = Rigid { rotation: DQuat::IDENTITY, translation };
-    let photo = Arc::new(Pixels { width, height, rgb, mask, weights: None, depth: None });
+    let photo = Arc::new(Pixels { width, height, rgb, mask, ..Pixels::default() });
     let camera = Camera { pinhole, camera_from_world };
     ViewSample { view: 0, mip: 0, rect: camera.full(), photo, camera, exposure: None }
 }
@@ -374,7 +374,7 @@ fn trained_poses_agree_with_the_cpu() {
     let rect = Rect { x: 0, y: 0, width: 75, height: 53 };
     let mut views: Vec<TrainView> = samples_of_views()
         .iter()
-        .map(|sample| TrainView { view: sample.view, mip: 0, rect, camera: sample.camera })
+        .map(|sample| TrainView { view: sample.view, mip: 0, rect, camera: sample.camera, camera_from_context: None })
         .collect();
     let mut aside = views[0];
     aside.view = 4;
