@@ -4,6 +4,7 @@
 //! both formats.
 
 use std::collections::BTreeSet;
+use std::ops::Range;
 
 use scene::frame::{self, Kind};
 use scene::{ArtefactId, BlockId, CodecError, Rect};
@@ -365,6 +366,14 @@ impl Plan {
         }
     }
 
+    /// The tasks of objects whose results a task reads, by index, ascending.
+    pub fn objects(&self, task: PlannedTask) -> Range<u32> {
+        match task {
+            PlannedTask::Evaluate(_) => self.first_object() as u32..self.len() as u32,
+            _ => 0..0,
+        }
+    }
+
     /// The tasks whose results a task reads, by index.
     ///
     /// # Errors
@@ -374,8 +383,8 @@ impl Plan {
             let missing = || CodecError::new(format!("a task needs block {block}, which has no task"));
             self.index(block).ok_or_else(missing)
         };
-        let detections = self.detections(task).into_iter().map(Ok);
-        self.inputs(task).into_iter().map(index).chain(detections).collect()
+        let others = self.detections(task).into_iter().chain(self.objects(task)).map(Ok);
+        self.inputs(task).into_iter().map(index).chain(others).collect()
     }
 
     /// The index of a block's training task.

@@ -1,21 +1,24 @@
 //! Measures some views of an ingested capture, without pictures or sheets.
 
 use dataset::windows::WindowReader;
+use model::ModelObject;
 use render::Options;
 use scene::{BadInput, Splats};
 use train::Backend;
 
+use crate::composition::Composition;
 use crate::figures::{Comparison, ViewFigures};
 use crate::fits::{Fits, Fitter};
 use crate::{EvalError, Renderer};
 
 /// The figures of these views of the reader's capture at full resolution, in order, as [`crate::evaluate`] computes them, without
-/// LPIPS. `goes_on` is called after each view with the number of views done; false ends the measurement early.
+/// LPIPS. Objects that move are drawn where they were. `goes_on` is called after each view with the number of views done; false ends the measurement early.
 ///
 /// # Errors
 /// A view that the capture does not have, a photo that cannot be read, a renderer that fails.
 pub fn figures_of_views(
     splats: &Splats,
+    objects: &[ModelObject],
     options: &Options,
     reader: &WindowReader,
     views: &[u32],
@@ -26,6 +29,7 @@ pub fn figures_of_views(
     let mut renderer = Renderer::new(backend)?;
     let mut fitter = Fitter::new(fits, splats, options.antialiased, views, reader)?;
     let splats = renderer.upload(splats)?;
+    let objects = Composition::new(&renderer, objects.iter())?;
     let mut figures = Vec::with_capacity(views.len());
     for &index in views {
         let view = reader.capture().views.get(index as usize);
@@ -34,7 +38,7 @@ pub fn figures_of_views(
             BadInput::new("the plan", problem, "plan the capture again")
         })?;
         let photo = reader.window(index, 0, view.camera.full())?;
-        let frame = renderer.render(&splats, &view.camera, options)?;
+        let frame = renderer.compose(&splats, &objects.at(view.seconds), &view.camera, options)?;
         let compared = Comparison::new(&view.name, &frame.colour, &photo);
         let mut of_view = compared.figures(None)?;
         let rendering = (&mut renderer, &splats, options);

@@ -99,7 +99,7 @@ fn draw(isa: Isa, splats: &Splats, context: Option<&Splats>, camera: &Camera, op
         colour: random.plane(3 * area),
         transmittance: random.plane(area),
         depth: if options.extras { random.plane(area) } else { Vec::new() },
-        trainable_alpha: if options.extras { random.plane(area) } else { Vec::new() },
+        ..Upstream::default()
     };
     let gradients = renderer.backward(splats, &upstream).clone();
     (frame, gradients)
@@ -325,7 +325,7 @@ fn reused_buffers_do_not_affect_later_views() {
                 colour: random.plane(3 * area),
                 transmittance: random.plane(area),
                 depth: if options.extras { random.plane(area) } else { Vec::new() },
-                trainable_alpha: if options.extras { random.plane(area) } else { Vec::new() },
+                ..Upstream::default()
             };
             let again = used.backward(&splats, &upstream);
             for i in 0..count {

@@ -8,6 +8,7 @@
 //! of which the files are the JSON.
 
 use std::collections::BTreeMap;
+use std::time::UNIX_EPOCH;
 
 use glam::{DQuat, DVec3};
 use serde::Deserialize;
@@ -40,6 +41,8 @@ pub struct Datum {
     pub sensor: String,
     /// Path of the file, relative to the scene.
     pub file: String,
+    /// When it was taken, microseconds since 1970; `None` without a time.
+    pub microseconds: Option<i64>,
     /// Width and height of a photo, 0 for a sweep.
     pub size: (u32, u32),
     /// Pose.
@@ -83,6 +86,16 @@ struct DatumEntry {
 #[derive(Deserialize)]
 struct DatumId {
     name: String,
+    /// RFC 3339.
+    #[serde(default)]
+    timestamp: String,
+}
+
+impl DatumId {
+    fn microseconds(&self) -> Option<i64> {
+        let since = humantime::parse_rfc3339(&self.timestamp).ok()?.duration_since(UNIX_EPOCH).ok()?;
+        since.as_micros().try_into().ok()
+    }
 }
 
 #[derive(Deserialize)]
@@ -163,6 +176,7 @@ pub fn read_scene(bytes: &[u8]) -> Result<Scene, CodecError> {
             list.push(Datum {
                 sensor: datum.id.name.clone(),
                 file: found.filename.clone(),
+                microseconds: datum.id.microseconds(),
                 size: (found.width, found.height),
                 world_from_sensor: found.pose.rigid().ok_or_else(bad_pose)?,
                 annotations: found.annotations.values().cloned().collect(),

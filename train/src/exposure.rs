@@ -244,7 +244,7 @@ mod tests {
         let camera_from_world = Rigid { rotation: glam::DQuat::IDENTITY, translation: glam::DVec3::ZERO };
         let camera = Camera { pinhole, camera_from_world };
         let rect = Rect { x: 0, y: 0, width: 9, height: 9 };
-        of.iter().map(|&view| TrainView { view, mip: 0, rect, camera }).collect()
+        of.iter().map(|&view| TrainView { view, mip: 0, rect, camera, camera_from_context: None }).collect()
     }
 
     #[test]

@@ -423,7 +423,7 @@ mod tests {
             rgb: [values; 3].concat(),
             mask: None,
             weights,
-            depth: None,
+            ..Pixels::default()
         };
         let loss = |x: &[f32], photo: &Pixels| {
             let weights = photo.weights.clone().unwrap_or_default();

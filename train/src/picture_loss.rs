@@ -118,14 +118,22 @@ mod tests {
             rgb: (0..3 * area).map(|i| (255.0 * uniform(7, i as u64)) as u8).collect(),
             mask: Some((0..area).map(|i| if i % 24 < 5 { 0 } else { 255 }).collect()),
             weights: Some((0..area).map(|i| if i.is_multiple_of(3) { 5.0 } else { 1.0 }).collect()),
-            depth: None,
+            ..Pixels::default()
         };
         let pinhole = Pinhole { width: WIDTH, height: HEIGHT, fx: 20.0, fy: 20.0, cx: 12.0, cy: 10.0 };
         let camera_from_world = Rigid { rotation: DQuat::IDENTITY, translation: DVec3::ZERO };
         let camera = Camera { pinhole, camera_from_world };
         let exposure = Exposure([[1.1, 0.1, 0.0, 0.05], [0.0, 0.9, 0.1, 0.0], [0.2, 0.0, 0.8, -0.05]]);
         let photo = Arc::new(photo);
-        ViewSample { view: 0, mip: 0, rect: camera.full(), photo, camera, exposure: Some(exposure) }
+        ViewSample {
+            view: 0,
+            mip: 0,
+            rect: camera.full(),
+            photo,
+            camera,
+            camera_from_context: None,
+            exposure: Some(exposure),
+        }
     }
 
     /// The loss of a step and its gradient along the splats' first colour column.
@@ -161,6 +169,7 @@ mod tests {
             options: Options { extras: true, sh_degree: 0, ..Options::default() },
             rates: Some(rates),
             depth_weight: 0.0,
+            silhouette_weight: 0.0,
             picture_weight,
             exposure_rate: 0.0,
             pose_rates: None,

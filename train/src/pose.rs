@@ -209,7 +209,13 @@ mod tests {
         let view = |view: u32| {
             let rotation = DQuat::from_scaled_axis(random_vector(u64::from(view), 3.0));
             let camera_from_world = Rigid { rotation, translation: random_vector(100 + u64::from(view), 20.0) };
-            TrainView { view: 2 * view, mip: 0, rect, camera: Camera { pinhole, camera_from_world } }
+            TrainView {
+                view: 2 * view,
+                mip: 0,
+                rect,
+                camera: Camera { pinhole, camera_from_world },
+                camera_from_context: None,
+            }
         };
         (0..count).rev().map(view).collect()
     }

@@ -114,6 +114,7 @@ mod tests {
                 mip: (k % 3) as u8,
                 rect: Rect { x: 5, y: 3, width: 30, height: 31 },
                 camera: Camera { pinhole, camera_from_world: turned(f64::from(k)) },
+                camera_from_context: None,
             })
             .collect();
         let mut splats = Splats::new(0);

@@ -3,6 +3,7 @@
 use blocks::{EvalTask, Plan};
 use dataset::windows::WindowReader;
 use eval::{EvalError, Fits, ViewFigures};
+use model::ModelObject;
 use proto::FailureKind;
 use render::Options;
 use scene::Splats;
@@ -17,6 +18,8 @@ pub(crate) struct Evaluation<'a> {
     pub(crate) plan: &'a Plan,
     pub(crate) task: &'a EvalTask,
     pub(crate) model: &'a Splats,
+    /// Those that move.
+    pub(crate) objects: &'a [ModelObject],
     pub(crate) reader: &'a WindowReader,
     pub(crate) backend: &'a Backend,
 }
@@ -32,7 +35,7 @@ pub(crate) fn evaluate(
     stopwatch: &Stopwatch,
     report: &mut (dyn FnMut(Report) -> Flow + Send),
 ) -> Result<Vec<ViewFigures>, ExecuteError> {
-    let Evaluation { plan, task, model, reader, backend } = evaluation;
+    let Evaluation { plan, task, model, objects, reader, backend } = evaluation;
     let options =
         Options { antialiased: plan.settings.antialiased, sh_degree: model.sh_degree(), ..Options::default() };
     let fits = Fits { pose: plan.settings.refine_poses, exposure: plan.settings.exposure };
@@ -53,7 +56,7 @@ pub(crate) fn evaluate(
         overrun = memory.as_mut().filter(|_| (done as u64) < steps).and_then(MemoryBudget::overrun);
         report == Flow::Continue && overrun.is_none()
     };
-    let figures = eval::figures_of_views(model, &options, reader, &task.views, backend, fits, goes_on);
+    let figures = eval::figures_of_views(model, objects, &options, reader, &task.views, backend, fits, goes_on);
     let figures = figures.map_err(failure)?;
     if let Some(resident) = overrun {
         let message = format!("evaluation: the worker takes {} MiB, above its --memory", resident.div_ceil(1 << 20));

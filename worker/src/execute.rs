@@ -274,11 +274,13 @@ impl PlanExecutor {
                     parts.push((block, leaves.keep(&splats, &plan.ground, block)));
                 })
             })?;
+            let objects = self.inputs(job).objects(PlannedTask::Evaluate(task), job.capture, report)?;
             let span = tracing::info_span!("evaluate", views = task.views.len());
             let figures = self.pool.install(|| {
                 span.in_scope(|| {
                     let model = blocks::merge(parts);
-                    let evaluation = Evaluation { plan, task, model: &model, reader: &reader, backend };
+                    let (model, objects) = (&model, &objects[..]);
+                    let evaluation = Evaluation { plan, task, model, objects, reader: &reader, backend };
                     evaluate(&evaluation, memory_budget(options.memory_bytes), stopwatch, report)
                 })
             });

@@ -5,6 +5,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use blocks::{CONCURRENT_FETCHES, Plan, PlannedTask, Task};
 use bytes::Bytes;
 use dataset::byte_lru::ByteLru;
+use model::ModelObject;
 use scene::frame::{self, TrainingInfo};
 use scene::{ArtefactId, BlockId, Capture, Splats, Zones};
 use store::BlockingStore;
@@ -104,6 +105,28 @@ impl Inputs<'_> {
             Ok(())
         })?;
         Ok(Some(Arc::new(dataset::zones::gathered(capture, parts).map_err(ExecuteError::work)?)))
+    }
+
+    /// The objects that move which a task draws.
+    ///
+    /// # Errors
+    /// As [`Inputs::blocks`], or tasks of another capture.
+    pub(crate) fn objects(
+        &self,
+        task: PlannedTask,
+        capture: &Capture,
+        report: &mut Reporter,
+    ) -> Result<Vec<ModelObject>, ExecuteError> {
+        let tasks: Vec<u32> = self.plan.objects(task).collect();
+        let mut objects = Vec::new();
+        self.for_each(&tasks, report, |of, bytes, _| {
+            let Some(PlannedTask::Object(of)) = self.plan.planned(of) else { return Ok(()) };
+            let missing = || ExecuteError::work(format!("the capture has no object {}", of.object));
+            let about = capture.objects.get(of.object as usize).ok_or_else(missing)?.clone();
+            objects.push(ModelObject { about, splats: frame::decode_splats(&bytes).map_err(ExecuteError::work)? });
+            Ok(())
+        })?;
+        Ok(objects)
     }
 
     /// Fetches the results of tasks, some at a time, and hands them to `take` in order.

@@ -16,9 +16,9 @@ use std::path::{Path, PathBuf};
 
 use scene::dgp::{self, BoxAnnotation, Datum, Scene};
 use scene::transforms::Intrinsics;
-use scene::{BadInput, CameraModel, CodecError};
+use scene::{BadInput, CameraModel, CodecError, Rigid};
 
-use super::annotated_boxes::{corners, moving};
+use super::annotated_boxes::{Placed, Tracks, corners, moving};
 use super::files::{self, CaptureRoot, Found};
 use super::parsed::{LabelledBox, OpenOptions, ParsedCapture, ParsedSweep, PosedImage, RawPoints};
 use crate::lidar::PointFormat;
@@ -35,7 +35,7 @@ pub(super) fn find(root: &CaptureRoot) -> Option<PathBuf> {
 pub(super) fn read(root: &CaptureRoot, path: &Path, options: &OpenOptions) -> Result<ParsedCapture, BadInput> {
     let Scene { samples } = parse(path, dgp::read_scene)?;
     let mut lenses: BTreeMap<String, BTreeMap<String, CameraModel>> = BTreeMap::new();
-    let (mut images, mut sweeps, mut boxes) = (Vec::new(), Vec::new(), Vec::new());
+    let (mut images, mut sweeps, mut boxes, mut times) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
     for sample in samples {
         if !lenses.contains_key(&sample.calibration) {
             let name = format!("calibration/{}.json", sample.calibration);
@@ -49,7 +49,7 @@ pub(super) fn read(root: &CaptureRoot, path: &Path, options: &OpenOptions) -> Re
             })?;
             let id = images.len() as u32;
             for found in annotated(root, path, photo)? {
-                boxes.push((id, photo.world_from_sensor, found));
+                boxes.push((id, photo.world_from_sensor, photo.microseconds, found));
             }
             images.push(PosedImage {
                 row: None,
@@ -63,6 +63,7 @@ pub(super) fn read(root: &CaptureRoot, path: &Path, options: &OpenOptions) -> Re
                 boxes: Vec::new(),
                 seconds: None,
             });
+            times.push(photo.microseconds);
         }
         for sweep in sample.sweeps.iter().filter(|_| options.lidar) {
             sweeps.push(ParsedSweep {
@@ -74,16 +75,41 @@ pub(super) fn read(root: &CaptureRoot, path: &Path, options: &OpenOptions) -> Re
             });
         }
     }
-    let places = boxes.iter().map(|(_, pose, found)| (found.instance, pose.apply(found.sensor_from_box.translation)));
+    let places =
+        boxes.iter().map(|(_, pose, _, found)| (found.instance, pose.apply(found.sensor_from_box.translation)));
     let moving = moving(places);
     let (names, mut labels) = (class_names(root)?, BTreeMap::new());
-    for (image, _, found) in &boxes {
-        let class = names.get(&found.class).cloned().unwrap_or_else(|| format!("class {}", found.class));
+    let class_of =
+        |found: &BoxAnnotation| names.get(&found.class).cloned().unwrap_or_else(|| format!("class {}", found.class));
+    let tracks = tracks(&boxes, class_of, |object| moving.contains(object));
+    for (image, time) in images.iter_mut().zip(&times) {
+        image.seconds = time.and_then(|microseconds| tracks.seconds(microseconds));
+    }
+    for (image, _, _, found) in &boxes {
+        let class = class_of(found);
         *labels.entry(class.clone()).or_default() += 1;
         let (moves, corners) = (moving.contains(&found.instance), corners(&found.sensor_from_box, found.size));
         images[*image as usize].boxes.push(LabelledBox { class, moves, corners });
     }
-    Ok(ParsedCapture { labels, sweeps, ..ParsedCapture::new("dgp", images, RawPoints::default()) })
+    let objects = tracks.objects();
+    Ok(ParsedCapture { labels, sweeps, objects, ..ParsedCapture::new("dgp", images, RawPoints::default()) })
+}
+
+/// The paths of annotated objects. Several photos of a time show an object; the first of them tells where it is.
+fn tracks(
+    boxes: &[(u32, Rigid, Option<i64>, BoxAnnotation)],
+    class_of: impl Fn(&BoxAnnotation) -> String,
+    moves: impl Fn(&i64) -> bool,
+) -> Tracks {
+    let mut placed: Vec<(i64, String, Placed)> = (boxes.iter())
+        .filter_map(|(_, world_from_sensor, microseconds, found)| {
+            let world_from_box = world_from_sensor.after(&found.sensor_from_box);
+            let placed = Placed { microseconds: (*microseconds)?, world_from_box, size: found.size };
+            Some((found.instance, class_of(found), placed))
+        })
+        .collect();
+    placed.sort_by_key(|(.., found)| found.microseconds);
+    Tracks::new(placed.iter().map(|(object, class, found)| (*object, class.as_str(), *found)), moves)
 }
 
 /// The names of the classes of boxes, by number.

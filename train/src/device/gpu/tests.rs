@@ -52,7 +52,7 @@ fn sample(masked: bool, key: u64, [width, height]: [u32; 2], translation: DVec3)
     let camera_from_world = Rigid { rotation: DQuat::IDENTITY, translation };
     let photo = Arc::new(Pixels { width, height, rgb, mask, ..Pixels::default() });
     let camera = Camera { pinhole, camera_from_world };
-    ViewSample { view: 0, mip: 0, rect: camera.full(), photo, camera, exposure: None }
+    ViewSample { view: 0, mip: 0, rect: camera.full(), photo, camera, camera_from_context: None, exposure: None }
 }
 
 /// A step with one sample whose size is no multiple of a tile.
@@ -73,6 +73,7 @@ fn step(masked: bool, extras: bool, key: u64) -> Step {
             log_scale_bounds: [-5.0, -1.0],
         }),
         depth_weight: 0.0,
+        silhouette_weight: 0.0,
         picture_weight: 0.0,
         exposure_rate: 0.0,
         pose_rates: None,

@@ -1,0 +1,112 @@
+//! Objects that move: trained beside the static scene, drawn where they are, left out, moved, and refused where their paths are wrong.
+
+mod common;
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::Path;
+
+use common::{done, refused};
+use serde_json::Value;
+
+const SYNTH: [&str; 16] = [
+    "synth",
+    "--area-km2",
+    "0.02",
+    "--views",
+    "240",
+    "--spacing",
+    "2",
+    "--size",
+    "160x96",
+    "--traffic",
+    "medium",
+    "--aerial",
+    "0",
+    "--out",
+    "city",
+    "--quiet",
+];
+const TRAIN: [&str; 11] =
+    ["train", "city", "--steps", "1200", "--budget", "4000", "--levels", "1", "--tolerance-db", "0", "--quiet"];
+
+/// Files of a folder, by name.
+fn files(folder: &Path) -> BTreeMap<String, Vec<u8>> {
+    let entries = fs::read_dir(folder).unwrap().map(|entry| entry.unwrap());
+    entries.map(|entry| (entry.file_name().into_string().unwrap(), fs::read(entry.path()).unwrap())).collect()
+}
+
+/// Whether two folders of pictures differ.
+fn differ(at: &Path, a: &str, b: &str) -> bool {
+    files(&at.join(a)) != files(&at.join(b))
+}
+
+#[test]
+fn what_moves_has_splats_of_its_own() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    done(at, &SYNTH);
+    let train = |out: &str, more: &[&str]| {
+        done(at, &[&TRAIN[..], &["--out", out, "--backend", "cpu"], more].concat());
+        fs::read(at.join(out).join("merged.ply")).unwrap()
+    };
+    // The static scene is what it is without them, and the objects are what they are with any number of workers.
+    let merged = train("model", &["--objects", "--threads", "1"]);
+    let of_objects = files(&at.join("model/objects"));
+    assert!(of_objects.len() > 1 && of_objects.contains_key("paths.json"), "{:?}", of_objects.keys());
+    assert!(train("static", &[]) == merged && !at.join("static/objects").exists());
+    assert!(train("two", &["--objects", "--workers", "2", "--threads", "2"]) == merged);
+    assert_eq!(files(&at.join("two/objects")), of_objects);
+    let name = of_objects.keys().find_map(|name| name.strip_suffix(".ply")).unwrap();
+
+    // Held-out photos: inside its box far better than without it, outside as good.
+    let moving = |model: &str| -> [f64; 2] {
+        let report = done(at, &["eval", model, "city", "--backend", "cpu", "--quiet"]);
+        let objects = report["moving"]["objects"].as_array().unwrap();
+        let of = objects.iter().find(|of| of["id"] == *name).unwrap_or(&Value::Null);
+        [of["psnr"].as_f64().unwrap(), report["psnr"].as_f64().unwrap()]
+    };
+    let [with, without] = [moving("model"), moving("static")];
+    assert!(with[0] > without[0] + 6.0 && with[1] > without[1] - 0.1, "{with:?} {without:?}");
+
+    // Where a photo shows it, the picture has it; at a time when it is elsewhere, it has not.
+    let paths: Value = serde_json::from_slice(&of_objects["paths.json"]).unwrap();
+    let track = paths["tracks"].as_array().unwrap().iter().find(|track| track["id"] == *name).unwrap();
+    let poses = track["poses"].as_array().unwrap();
+    let end = poses[poses.len() - 1][0].as_f64().unwrap();
+    let late = format!("{}", end + 100.0);
+    let render = |out: &str, more: &[&str]| {
+        let words = ["render", "model", "--cameras", "city", "--out", out, "--backend", "cpu", "--quiet"];
+        done(at, &[&words[..], more].concat())
+    };
+    assert!(render("composed", &[])["objects"].as_u64() > Some(0));
+    assert_eq!(render("bare", &["--without", "all"])["objects"], 0);
+    render("late", &["--time", &late]);
+    assert!(differ(at, "composed", "bare") && !differ(at, "late", "bare"));
+    render("without", &["--without", name]);
+    render("moved", &["--move", &format!("{name}=0,0,3,90")]);
+    assert!(differ(at, "without", "composed") && differ(at, "moved", "composed") && differ(at, "moved", "without"));
+    let only = render("only", &["--only", name]);
+    assert_eq!((&only["splats"], &only["objects"]), (&0.into(), &1.into()));
+    refused(at, &["render", "model", "--cameras", "city", "--out", "x", "--without", "none"], "has no object 'none'");
+    refused(at, &["render", "model", "--cameras", "city", "--out", "x", "--move", "7=1,2"], "give ID=X,Y,Z");
+
+    // A pruned model keeps them.
+    done(at, &["prune", "model", "--keep", "0.5", "--out", "pruned", "--quiet"]);
+    assert_eq!(files(&at.join("pruned/objects")), of_objects);
+
+    // What is wrong with a path is said in one line.
+    let tracks = fs::read_to_string(at.join("city/tracks.json")).unwrap();
+    let changed = |from: &str, to: &str| {
+        assert!(tracks.contains(from));
+        fs::write(at.join("city/tracks.json"), tracks.replacen(from, to, 1)).unwrap();
+    };
+    changed("\"low\":[", "\"low\":[9e9,");
+    refused(at, &["inspect", "city"], "tracks.json");
+    let first: Value = serde_json::from_str(&tracks).unwrap();
+    let place = first["tracks"][0]["poses"][1][1].to_string();
+    changed(&place, "[1e5,0.0,0.0]");
+    refused(at, &["inspect", "city"], "jumps");
+    fs::write(at.join("city/tracks.json"), &tracks).unwrap();
+    refused(at, &["plan", "city", "--blocks", "flat", "--objects", "--out", "plan.json"], "--objects");
+}
