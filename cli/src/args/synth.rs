@@ -126,7 +126,7 @@ Files, of every photo NAME; the world is in metres, x east, y north, z up, the c
   reference_lla.json     geographic origin (OpenSfM): 0° N 0° E, in the open sea
   truth/transforms.json  the true cameras
   truth/shots.jsonl      each shot: sensor, time, motion, exposure, shutter, reported and true camera
-  tracks.json            every moving object: class, instance, and its poses at the times of the photos
+  tracks.json            every moving object: class, instance, box and path; the times of the photos
   boxes3d.json           for every photo the visible objects, with boxes in the world and in the picture
   manifest.json          settings, counts, names of classes and materials; written last
 with --truth:
