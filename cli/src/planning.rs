@@ -45,8 +45,16 @@ pub(crate) fn describe(plan: &Plan) -> String {
         0 => String::new(),
         count => format!(" and {count} evaluation task{}", if count == 1 { "" } else { "s" }),
     };
+    let moving = match plan.object_tasks.len() {
+        0 => String::new(),
+        count => format!(
+            " and {count} object{} that move{}",
+            if count == 1 { "" } else { "s" },
+            if count == 1 { "s" } else { "" }
+        ),
+    };
     let mut text = format!(
-        "{:?} plan of {} level{}, {} task{}{evaluation}, root {:.1} m: about {:.0} ({:.0} to {:.0}) CPU seconds and {} MB a task\n",
+        "{:?} plan of {} level{}, {} task{}{evaluation}{moving}, root {:.1} m: about {:.0} ({:.0} to {:.0}) CPU seconds and {} MB a task\n",
         plan.settings.mode,
         plan.levels + 1,
         if plan.levels == 0 { "" } else { "s" },

@@ -176,9 +176,10 @@ pub fn read(bytes: &[u8]) -> Result<Tracks, CodecError> {
         let id = track.id.or_else(|| track.instance.map(|number| number.to_string())).unwrap_or_default();
         let pose = |(seconds, translation, rotation): (f64, [f64; 3], [f64; 4])| {
             let (translation, rotation) = (DVec3::from(translation), DQuat::from_array(rotation));
-            // Files round quaternions; what is not near a rotation is left for the check.
-            let is_near = (rotation.length() - 1.0).abs() < 1e-2;
-            let rotation = if is_near { rotation.normalize() } else { rotation };
+            // Files round quaternions. What is right to the last digits stays as it is, so that a file that is written again is the
+            // same; what is not near a rotation is left for the check.
+            let is_rounded = (1e-12..1e-2).contains(&(rotation.length() - 1.0).abs());
+            let rotation = if is_rounded { rotation.normalize() } else { rotation };
             PathPose { seconds, world_from_object: Rigid { rotation, translation } }
         };
         let path = track.poses.into_iter().map(pose).collect();

@@ -58,7 +58,7 @@ impl ObjectTraining<'_> {
         let object = object.ok_or_else(|| ExecuteError::work(format!("the capture has no object {number}")))?;
         let views = self.views(object)?;
         let context = self.context(results, &views);
-        let silhouettes = Silhouettes { reader: self.reader, capture: self.capture, object: number };
+        let silhouettes = Silhouettes { photos: self.reader, capture: self.capture, object: number };
         let seed = random::bits(plan.settings.seed, 1 << 62 | u64::from(task.object));
         let recipe = Recipe {
             silhouette_weight: SILHOUETTE_WEIGHT,

@@ -7,7 +7,6 @@
 use std::sync::Arc;
 
 use dataset::box_masks::covered;
-use dataset::windows::WindowReader;
 use glam::DVec3;
 use scene::{Camera, Capture, MovingObject, Pixels, Rect, Rigid};
 use train::WindowSource;
@@ -25,7 +24,8 @@ const UNKNOWN: u8 = 128;
 
 /// Windows of one object.
 pub(crate) struct Silhouettes<'a> {
-    pub(crate) reader: &'a WindowReader,
+    /// The photos as the capture has them.
+    pub(crate) photos: &'a dyn WindowSource,
     pub(crate) capture: &'a Capture,
     /// The object's place among the capture's.
     pub(crate) object: usize,
@@ -33,12 +33,12 @@ pub(crate) struct Silhouettes<'a> {
 
 impl WindowSource for Silhouettes<'_> {
     fn window(&self, view: u32, mip: u8, rect: Rect) -> Result<Arc<Pixels>, String> {
-        let pixels = WindowSource::window(self.reader, view, mip, rect)?;
+        let pixels = self.photos.window(view, mip, rect)?;
         Ok(Arc::new(self.marked(&pixels, view, mip, rect)))
     }
 
     fn prefetch(&self, view: u32, mip: u8, rect: Rect) {
-        WindowSource::prefetch(self.reader, view, mip, rect);
+        self.photos.prefetch(view, mip, rect);
     }
 }
 
@@ -99,8 +99,8 @@ fn cover(marks: &mut [bool], width: usize, object: &MovingObject, world_from_obj
     }
 }
 
-/// Places in the box of an object, in its own axes, that photos do not see through, with their colours: at most `count` of about twice as
-/// many tried, in a fixed order. Where photos leave few, all of the box.
+/// Places in the box of an object, in its own axes, that photos do not see through, with the mean colours of the photos: at most `count`, in
+/// a fixed order. Where photos leave few, places of the whole box.
 ///
 /// # Errors
 /// A window that cannot be read.
@@ -152,4 +152,118 @@ pub(crate) fn visual_hull(
         }
     }
     Ok(if kept.len() * 20 >= count { kept } else { rest })
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::DQuat;
+    use scene::{PathPose, Pinhole, View};
+    use train::TrainView;
+
+    use super::*;
+
+    const SIDE: u32 = 64;
+
+    /// Photos of one colour; a pixel is masked where `moving` says so.
+    struct Photos<'a> {
+        capture: &'a Capture,
+        moving: &'a (dyn Fn(usize, f64, f64) -> bool + Sync),
+    }
+
+    impl WindowSource for Photos<'_> {
+        fn window(&self, view: u32, _: u8, rect: Rect) -> Result<Arc<Pixels>, String> {
+            let area = rect.area() as usize;
+            let k = self.capture.views[view as usize].camera.pinhole;
+            let moves = |i: usize| {
+                let (x, y) = ((i % rect.width as usize) as f64 + 0.5, (i / rect.width as usize) as f64 + 0.5);
+                (self.moving)(view as usize, (x - k.cx) / k.fx, (y - k.cy) / k.fy)
+            };
+            let mask = (0..area).map(|i| if moves(i) { 0 } else { 255 }).collect();
+            let rgb = (0..3 * area).map(|i| [200, 100, 50][i / area]).collect();
+            Ok(Arc::new(Pixels { width: rect.width, height: rect.height, rgb, mask: Some(mask), ..Pixels::default() }))
+        }
+    }
+
+    /// A box of 2 m that stands still at this place, z up as in the world.
+    fn still(id: &str, place: DVec3) -> MovingObject {
+        let world_from_object = Rigid { rotation: DQuat::IDENTITY, translation: place };
+        MovingObject {
+            id: id.into(),
+            class: "box".into(),
+            low: DVec3::new(-1.0, -1.0, -1.0),
+            high: DVec3::ONE,
+            path: vec![PathPose { seconds: 0.0, world_from_object }],
+        }
+    }
+
+    /// A camera 10 m from the origin at this angle, that looks at it; z is up.
+    fn camera(angle: f64) -> Camera {
+        let back = DQuat::from_rotation_z(angle) * DQuat::from_rotation_x(-std::f64::consts::FRAC_PI_2);
+        let rotation = back.inverse();
+        let eye = back * DVec3::new(0.0, 0.0, -10.0);
+        let pinhole = Pinhole { width: SIDE, height: SIDE, fx: 160.0, fy: 160.0, cx: 32.0, cy: 32.0 };
+        Camera { pinhole, camera_from_world: Rigid { rotation, translation: -(rotation * eye) } }
+    }
+
+    fn capture(angles: &[f64], objects: Vec<MovingObject>) -> Capture {
+        let view = |(i, angle): (usize, &f64)| View {
+            name: format!("{i}.png"),
+            camera: camera(*angle),
+            mips: Vec::new(),
+            masked: true,
+            depth: None,
+            seconds: Some(0.1),
+        };
+        Capture { views: angles.iter().enumerate().map(view).collect(), objects, ..Capture::default() }
+    }
+
+    #[test]
+    fn a_mask_in_the_box_is_the_silhouette_unless_another_box_is_there() {
+        // The other one is 0.8 m to the right.
+        let capture = capture(&[0.0], vec![still("a", DVec3::ZERO), still("b", DVec3::new(1.6, 0.0, 0.0))]);
+        // All above the middle moves, and left of the box as well.
+        let photos = Photos { capture: &capture, moving: &|_, _, y| y < 0.0 };
+        let rect = capture.views[0].camera.full();
+        let seen = Silhouettes { photos: &photos, capture: &capture, object: 0 }.window(0, 0, rect).unwrap();
+        let at = |x: u32, y: u32| {
+            let i = (y * SIDE + x) as usize;
+            [seen.silhouette.as_ref().unwrap()[i], seen.mask.as_ref().unwrap()[i]]
+        };
+        // The near face covers 14 to 50; the other box begins at 40.
+        assert_eq!([at(20, 25), at(45, 25)], [[THERE, 255], [UNKNOWN, 0]]);
+        assert_eq!([at(5, 25), at(60, 25)], [[UNKNOWN, 0]; 2], "outside of its box something else moves");
+        assert_eq!(at(20, 40), [NOT_THERE, 255], "the static scene");
+        // The ground under the box, and a metre around it: 1 m below the camera's height, 8 to 12 m away.
+        assert_eq!([at(32, 50), at(32, 63)], [[UNKNOWN, 255], [NOT_THERE, 255]]);
+        assert_eq!(seen.rgb, WindowSource::window(&photos, 0, 0, rect).unwrap().rgb);
+    }
+
+    #[test]
+    fn the_hull_is_what_photos_do_not_see_through() {
+        let angles: Vec<f64> = (0..12).map(|i| f64::from(i) * 0.5).collect();
+        let capture = capture(&angles, vec![still("a", DVec3::ZERO)]);
+        let views: Vec<TrainView> = (capture.views.iter().enumerate())
+            .map(|(i, view)| TrainView {
+                view: i as u32,
+                mip: 0,
+                rect: view.camera.full(),
+                camera: view.camera,
+                camera_from_context: Some(view.camera.camera_from_world),
+            })
+            .collect();
+        // A post of 0.4 m radius in the box of 2 m.
+        let hull = |moving: &(dyn Fn(usize, f64, f64) -> bool + Sync)| {
+            let photos = Photos { capture: &capture, moving };
+            visual_hull(&Silhouettes { photos: &photos, capture: &capture, object: 0 }, &views, 400, 7).unwrap()
+        };
+        let post = hull(&|_, x, _| x.abs() < 0.04);
+        assert!(post.len() > 20, "{}", post.len());
+        // Near the ground nothing is known to be free, as there may be a shadow.
+        for (place, colour) in post.iter().filter(|(place, _)| place.z > -0.4) {
+            assert!(place.truncate().length() < 0.55 && *colour == [200, 100, 50], "{place} {colour:?}");
+        }
+        // Where nothing moves, there is no hull; where everything does, the box is full.
+        assert_eq!([hull(&|_, _, _| false).len(), hull(&|_, _, _| true).len()], [400, 400]);
+        assert_eq!(hull(&|_, x, _| x.abs() < 0.04), post);
+    }
 }

@@ -42,6 +42,10 @@ struct Inspected {
     depth_maps: usize,
     /// Number of annotated boxes by class.
     boxes: BTreeMap<String, usize>,
+    /// Objects that move, of which boxes and paths are known.
+    moving: usize,
+    /// Views whose time is known, as --objects needs it.
+    views_with_time: usize,
     /// What `--detector` or `--zones` finds; null without them.
     objects: Option<Objects>,
     left_out: Vec<(String, String)>,
@@ -105,6 +109,8 @@ pub(crate) fn run(args: &InspectArgs, output: &Output) -> Result<(), Failure> {
         lidar_points: source.seeds.len(),
         depth_maps: source.depth_maps(),
         boxes: source.labels,
+        moving: capture.objects.len(),
+        views_with_time: capture.views.iter().filter(|view| view.seconds.is_some()).count(),
         objects: objects(args, output)?,
         left_out: source.left_out,
         extent_metres: extent_metres(capture),
@@ -143,6 +149,11 @@ fn text(found: &Inspected, plan: Option<&Plan>) -> String {
     if !found.boxes.is_empty() {
         let boxes: Vec<String> = found.boxes.iter().map(|(class, count)| format!("{count} {class}")).collect();
         text += &format!("boxes: {}\n", boxes.join(", "));
+    }
+    if found.moving > 0 {
+        let (moving, views) = (found.moving, found.views_with_time);
+        text +=
+            &format!("{moving} objects that move, with paths, for --objects; the times of {views} views are known\n");
     }
     if let Some(objects) = &found.objects {
         text += &objects.text(found.views);

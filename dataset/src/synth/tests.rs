@@ -326,6 +326,27 @@ fn ground_truth_is_consistent_across_files() {
     let moving = manifest["summary"]["moving"].as_u64().unwrap() as usize;
     assert_eq!(tracks["tracks"].as_array().unwrap().len(), moving);
     assert!(moving > 10 && tracks["tracks"][0]["poses"].as_array().unwrap().len() > 1);
+    // Objects are where the boxes of the photos are, at their times.
+    let capture = crate::open::open(root, &OpenOptions::default()).unwrap().capture;
+    capture.check().unwrap();
+    assert_eq!(capture.objects.len(), moving);
+    let mut compared = 0;
+    for image in boxes["images"].as_array().unwrap() {
+        let name = image["image"].as_str().unwrap().trim_start_matches("images/");
+        let Some(view) = capture.views.iter().find(|view| view.name == name) else { continue };
+        assert_eq!(view.seconds, image["seconds"].as_f64());
+        for thing in image["boxes"].as_array().unwrap().iter().filter(|of| of["moves"] == true) {
+            let id = thing["instance"].to_string();
+            let object = capture.objects.iter().find(|object| object.id == id).unwrap();
+            let centre = DVec3::from_array(serde_json::from_value(thing["centre"].clone()).unwrap());
+            let pose = object.pose(view.seconds.unwrap()).unwrap();
+            // Walkers change their shape with their steps.
+            let metres = pose.apply(0.5 * (object.low + object.high)).distance(centre);
+            assert!(metres < if thing["class"] == "person" { 0.5 } else { 0.02 }, "{thing}: {metres} m");
+            compared += 1;
+        }
+    }
+    assert!(compared > 3, "{compared}");
 }
 
 #[test]

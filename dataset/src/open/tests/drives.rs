@@ -3,7 +3,9 @@
 use std::fs;
 use std::path::Path;
 
+use glam::DVec3;
 use image::GrayImage;
+use scene::MovingObject;
 
 use super::*;
 
@@ -76,6 +78,16 @@ fn a_dgp_scene_opens_with_its_lidar_and_boxes() {
     assert_eq!((source.format, capture.views.len(), source.sweeps.len()), ("dgp", 9, 3));
     assert!(source.labels.get("Car").is_some_and(|&cars| cars > 100), "{:?}", source.labels);
     assert!(capture.views.iter().any(|view| view.masked), "some cars move");
+    // Three photos a second, on the clock of the objects' paths.
+    let mut seconds: Vec<f64> = capture.views.iter().map(|view| view.seconds.unwrap()).collect();
+    seconds.sort_by(f64::total_cmp);
+    assert!(seconds.chunks(3).zip(0..).all(|(of, second)| of.iter().all(|at| (at - f64::from(second)).abs() < 1e-3)));
+    let moved = |object: &MovingObject| {
+        let places: Vec<DVec3> = object.path.iter().map(|pose| pose.world_from_object.translation).collect();
+        places.iter().any(|place| place.distance(places[0]) > 0.4)
+    };
+    assert!(capture.objects.len() > 5 && capture.objects.iter().filter(|of| of.path.len() > 1).all(moved));
+    capture.check().unwrap();
     // Every view sees a part of the sweep that was taken with it, at plausible depths.
     for sweep in &source.sweeps {
         let returns = sweep.read().unwrap();

@@ -133,6 +133,15 @@ fn a_scene_has_its_photos_sweeps_and_annotated_boxes() {
         assert!(middle.distance(DVec3::new(0.0, 0.5, expected)) < 1e-9, "{middle}");
         assert!((corners[1].z - corners[0].z).abs() - 4.0 < 1e-9 && (corners[0] - corners[4]).length() - 1.5 < 1e-9);
     }
+    // It has a path, on the clock of the photos.
+    let [object] = &source.capture.objects[..] else { panic!("{:?}", source.capture.objects) };
+    for (view, expected) in views.iter().zip([29.0, 15.0, 22.0]) {
+        let pose = object.pose(view.seconds.unwrap()).unwrap();
+        let middle = view.camera.camera_from_world.after(&pose).translation;
+        assert!(middle.distance(DVec3::new(0.0, 0.5, expected)) < 1e-6, "{middle}");
+    }
+    assert_eq!((object.class.as_str(), object.high - object.low), ("vehicle.car", DVec3::new(4.0, 2.0, 1.5)));
+    source.capture.check().unwrap();
     // An attribute says that the other one moves; a box behind the camera is in no photo.
     change(folder.path(), "sample_annotation", |rows| {
         rows[2]["attribute_tokens"] = json!(["m"]);

@@ -186,6 +186,11 @@ fn a_segment_has_its_photos_sweeps_and_annotated_boxes() {
         }
     }
 
+    let [object] = &source.capture.objects[..] else { panic!("{:?}", source.capture.objects) };
+    let pose = object.pose(views[0].seconds.unwrap()).unwrap();
+    let middle = views[0].camera.camera_from_world.after(&pose).translation;
+    assert!(middle.distance(DVec3::new(0.0, 0.5, 27.0)) < 1e-4, "{middle}");
+
     let store = store::Store::open("memory://").unwrap().blocking();
     let options = IngestOptions { downscale: 1, threads: 2 };
     let ingested = ingest::ingest(&source, &store, &options, &|_, _| ()).unwrap();
