@@ -21,7 +21,7 @@ use std::mem;
 use glam::Vec3;
 use scene::Splats;
 
-use self::judges::{Evaluator, Quality, apart, judges_of, still_shown};
+use self::judges::{Evaluator, Objects, Quality, ViewCount, apart, judges_of};
 pub use self::judges::{ObjectJudge, ObjectTolerance};
 use self::search::Search;
 use crate::error::TrainError;
@@ -36,7 +36,7 @@ use crate::view::TrainView;
 const MEASURED_VIEWS: ViewCount = ViewCount { min: 8, max: 32, per_step: 0.5 };
 /// Views on which the PSNR of a cut is measured before recovery.
 const PROBE_VIEWS: ViewCount = ViewCount { min: 4, max: 8, per_step: 0.125 };
-/// Views from which importance is computed.
+/// Views from which importance is computed, and those on which objects are judged.
 const IMPORTANCE_VIEWS: ViewCount = ViewCount { min: 24, max: 128, per_step: 1.0 };
 /// Pruning ends when a round removes a smaller share of the splats.
 const MIN_CUT: f64 = 0.01;
@@ -78,21 +78,6 @@ impl Pruning {
         let (warm_up, rounds) = (1, 5);
         let recovery_share = SHARE / (warm_up + rounds + 1) as f32;
         Self { tolerance_db, order: Order::Energy, warm_up, rounds, recovery_share, drop_db: 0.5 }
-    }
-}
-
-/// The number of views of an evaluation. It grows with the recovery steps, so that evaluating takes no longer than the
-/// recovery between two evaluations.
-#[derive(Clone, Copy)]
-struct ViewCount {
-    min: usize,
-    max: usize,
-    per_step: f32,
-}
-
-impl ViewCount {
-    fn for_steps(&self, steps: u32) -> usize {
-        ((steps as f32 * self.per_step) as usize).clamp(self.min, self.max)
     }
 }
 
@@ -315,8 +300,7 @@ struct Pruner<'a> {
     probe: Evaluator,
     /// Some of all views.
     reported: Evaluator,
-    /// With the objects that the unpruned splats show.
-    objects: Option<(ObjectTolerance<'a>, Vec<bool>)>,
+    objects: Option<Objects<'a>>,
 }
 
 impl<'a> Pruner<'a> {
@@ -341,22 +325,20 @@ impl<'a> Pruner<'a> {
 
     /// From now on, few of the objects that these splats show may be lost.
     fn judge_objects(&mut self, objects: Option<ObjectTolerance<'a>>, splats: &Splats) -> Result<(), TrainError> {
-        if let Some(objects) = objects {
-            self.objects = Some((objects, self.measured.shown(&self.all, splats, objects.judge)?));
-        }
+        let Some(objects) = objects else { return Ok(()) };
+        let [judging, _] = apart(self.job.views);
+        let count = IMPORTANCE_VIEWS.for_steps(self.job.steps);
+        self.objects = Some(Objects::new(objects, &EvaluationViews { views: &judging, ..self.all }, count, splats)?);
         Ok(())
     }
 
     fn shows_objects(&self, splats: &Splats) -> Result<bool, TrainError> {
-        let Some((objects, before)) = &self.objects else { return Ok(true) };
-        Ok(objects.allows(before, &self.measured.shown(&self.all, splats, objects.judge)?))
+        self.objects.as_ref().map_or(Ok(true), |objects| objects.are_shown(&self.all, splats))
     }
 
     /// See [`Pruned::objects`].
     fn shown_objects(&self, splats: &Splats) -> Result<Option<[usize; 2]>, TrainError> {
-        let Some((objects, before)) = &self.objects else { return Ok(None) };
-        let after = self.measured.shown(&self.all, splats, objects.judge)?;
-        Ok(Some([still_shown(before, before), still_shown(before, &after)]))
+        self.objects.as_ref().map(|objects| objects.counts(&self.all, splats)).transpose()
     }
 
     /// On some of all views, dB.

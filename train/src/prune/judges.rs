@@ -25,6 +25,21 @@ pub(super) fn judges_of(views: usize) -> usize {
     if views < JUDGE_EVERY { views } else { (views + JUDGE_EVERY / 2 - 1) / JUDGE_EVERY }
 }
 
+/// The number of views of an evaluation. It grows with the recovery steps, so that evaluating takes no longer than the
+/// recovery between two evaluations.
+#[derive(Clone, Copy)]
+pub(super) struct ViewCount {
+    pub(super) min: usize,
+    pub(super) max: usize,
+    pub(super) per_step: f32,
+}
+
+impl ViewCount {
+    pub(super) fn for_steps(&self, steps: u32) -> usize {
+        ((steps as f32 * self.per_step) as usize).clamp(self.min, self.max)
+    }
+}
+
 /// Says which objects renders show. It comes from outside, as this crate knows no detectors.
 pub trait ObjectJudge: Sync {
     /// For each object on the photo of a view, whether the picture shows it: three planes of the photo's size, red first, with
@@ -40,22 +55,9 @@ pub trait ObjectJudge: Sync {
 pub struct ObjectTolerance<'a> {
     /// Says which objects renders show.
     pub judge: &'a dyn ObjectJudge,
-    /// Share of the objects that the unpruned splats show on the judging views which may be lost, 0 to 1.
+    /// Share of the objects that the unpruned splats show on the judging views which may be lost, 0 to 1. New ones make up for
+    /// none.
     pub share: f64,
-}
-
-impl ObjectTolerance<'_> {
-    /// Whether few enough of the objects that were shown are lost. New ones make up for none.
-    pub(super) fn allows(&self, before: &[bool], after: &[bool]) -> bool {
-        let shown = before.iter().filter(|shown| **shown).count();
-        let lost = shown - still_shown(before, after);
-        lost as f64 <= self.share * shown as f64
-    }
-}
-
-/// Number of the objects that were shown and still are.
-pub(super) fn still_shown(before: &[bool], after: &[bool]) -> usize {
-    before.iter().zip(after).filter(|(before, after)| **before && **after).count()
 }
 
 /// PSNR over all pixels and over those of zones, dB; without zones both are the same.
@@ -98,25 +100,58 @@ impl Evaluator {
     pub(super) fn quality(&self, all: &EvaluationViews, splats: &Splats) -> Result<Quality, TrainError> {
         EvaluationViews { views: &self.views, ..*all }.psnr(splats, &self.weights).map(Quality)
     }
+}
 
-    /// Which objects the splats show, view by view.
-    pub(super) fn shown(
-        &self,
-        all: &EvaluationViews,
-        splats: &Splats,
-        judge: &dyn ObjectJudge,
-    ) -> Result<Vec<bool>, TrainError> {
-        let (mut shown, mut failed) = (Vec::new(), None);
-        EvaluationViews { views: &self.views, ..*all }.pictures(splats, |view, photo, picture| {
-            if failed.is_none() {
-                match judge.shown(view, photo, picture) {
-                    Ok(of_view) => shown.extend(of_view),
-                    Err(line) => failed = Some(TrainError::Objects(line)),
-                }
-            }
-        })?;
-        failed.map_or(Ok(shown), Err)
+/// The objects that the unpruned splats show on some views.
+pub(super) struct Objects<'a> {
+    tolerance: ObjectTolerance<'a>,
+    /// Those that show objects.
+    views: Vec<TrainView>,
+    /// Of each view, which objects on its photo are shown.
+    before: Vec<Vec<bool>>,
+}
+
+impl<'a> Objects<'a> {
+    /// On at most `count` of the views.
+    pub(super) fn new(
+        tolerance: ObjectTolerance<'a>,
+        judging: &EvaluationViews,
+        count: usize,
+        unpruned: &Splats,
+    ) -> Result<Self, TrainError> {
+        let views = judging.some(count);
+        let before = shown(&EvaluationViews { views: &views, ..*judging }, unpruned, tolerance.judge)?;
+        let with_objects = views.into_iter().zip(before).filter(|(_, shown)| shown.contains(&true));
+        let (views, before) = with_objects.unzip();
+        Ok(Self { tolerance, views, before })
     }
+
+    /// Number of the objects, and of those that these splats show too.
+    pub(super) fn counts(&self, all: &EvaluationViews, splats: &Splats) -> Result<[usize; 2], TrainError> {
+        let after = shown(&EvaluationViews { views: &self.views, ..*all }, splats, self.tolerance.judge)?;
+        let pairs = self.before.iter().flatten().zip(after.iter().flatten()).filter(|(before, _)| **before);
+        Ok([pairs.clone().count(), pairs.filter(|(_, after)| **after).count()])
+    }
+
+    /// Whether these splats lose few enough.
+    pub(super) fn are_shown(&self, all: &EvaluationViews, splats: &Splats) -> Result<bool, TrainError> {
+        let [before, after] = self.counts(all, splats)?;
+        Ok((before - after) as f64 <= self.tolerance.share * before as f64)
+    }
+}
+
+/// Which objects splats show, for each view.
+fn shown(on: &EvaluationViews, splats: &Splats, judge: &dyn ObjectJudge) -> Result<Vec<Vec<bool>>, TrainError> {
+    let mut of_views = Ok(Vec::new());
+    on.pictures(splats, |view, photo, picture| {
+        if let Ok(known) = &mut of_views {
+            match judge.shown(view, photo, picture) {
+                Ok(of_view) => known.push(of_view),
+                Err(line) => of_views = Err(TrainError::Objects(line)),
+            }
+        }
+    })?;
+    of_views
 }
 
 #[cfg(test)]
@@ -148,20 +183,5 @@ mod tests {
             assert_eq!(all, (0..count).collect::<Vec<_>>());
             assert!(!judging.is_empty() && 2 * judging.len() < healing.len(), "{judging:?} of {count}");
         }
-    }
-
-    #[test]
-    fn new_objects_make_up_for_no_lost_ones() {
-        struct None;
-        impl ObjectJudge for None {
-            fn shown(&self, _: u32, _: &Pixels, _: &[f32]) -> Result<Vec<bool>, String> {
-                Ok(Vec::new())
-            }
-        }
-        let of = |share| ObjectTolerance { judge: &None, share };
-        let (before, after) = ([true, true, false, true, true], [true, false, true, true, true]);
-        assert_eq!(still_shown(&before, &after), 3);
-        assert!(!of(0.0).allows(&before, &after) && !of(0.24).allows(&before, &after));
-        assert!(of(0.25).allows(&before, &after) && of(0.0).allows(&before, &before) && of(0.0).allows(&[], &[]));
     }
 }
