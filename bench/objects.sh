@@ -15,7 +15,7 @@ model=out/objects/model
 if ! grep -qs '"complete": *true' "$street/manifest.json"; then
     "$plat" --quiet synth --area-km2 0.02 --views 640 --spacing 2 --aerial 0.1 --traffic medium --size 640x360 --out "$street"
 fi
-"$plat" --quiet train "$street" --out "$model" --fresh --blocks whole --steps 6000 --budget 40000 --threads 1 --tolerance-db 0
+"$plat" --quiet train "$street" --out "$model" --fresh --blocks whole --steps 6000 --budget 40000 --threads 1 --backend cpu --tolerance-db 0
 "$plat" --quiet bench prune "$model" "$street" --scene objects --tolerance-db 0 --keep 0.5,0.25,0.1 --results "$results" \
     --detector "$detectors/yolox_nano_416.onnx" --judge "$detectors/yolox_nano_416.onnx" --judge "$detectors/fastestdet_352.onnx"
 "$plat" --quiet bench chart --results "$results"

@@ -88,6 +88,41 @@ fn write_tiny(at: &Path) -> Vec<u8> {
 }
 
 #[test]
+fn pruning_keeps_what_a_detector_finds_on_renders() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    city(at, 16, 96, 64);
+    write_tiny(at);
+    done(at, &[&TRAIN[..], &["--tolerance-db", "0", "--out", "model"]].concat());
+    let prune = |out: &str, more: &[&str]| {
+        let words = ["prune", "model", "--capture", "city", "--detector", "tiny.onnx", "--tolerance-db", "6"];
+        done(at, &[&words[..], &["--out", out], more].concat())
+    };
+    let free = prune("free", &[]);
+    assert!(free["objects"].is_null() && free["tolerance_detections"].is_null(), "{free}");
+    let any = prune("any", &["--tolerance-detections", "1"]);
+    let none = prune("none", &["--tolerance-detections", "0"]);
+    println!("{free}\n{any}\n{none}");
+    let objects = |said: &Value| [0, 1].map(|i| said["objects"][i].as_u64().unwrap());
+    let [before, kept] = objects(&none);
+    assert!(before > 0 && kept == before, "{none}");
+    assert!(objects(&any)[0] == before && any["splats"] == free["splats"], "a tolerance of all changes the result");
+    assert!(none["splats"].as_u64() >= any["splats"].as_u64());
+
+    let words = ["prune", "model", "--capture", "city", "--out", "o"];
+    let refused_with = |more: &[&str], says: &str| refused(at, &[&words[..], more].concat(), says);
+    refused_with(&["--tolerance-detections", "0"], "--detector");
+    let detector = ["--detector", "tiny.onnx", "--tolerance-detections"];
+    for share in ["-0.1", "1.5", "nan", "few"] {
+        refused_with(
+            &[&detector[..2], &[&format!("--tolerance-detections={share}")]].concat(),
+            "--tolerance-detections",
+        );
+    }
+    refused_with(&[&detector[..], &["0", "--keep", "0.5"]].concat(), "--keep");
+}
+
+#[test]
 fn a_detectors_loss_changes_training_reproducibly() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();

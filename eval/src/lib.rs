@@ -35,6 +35,7 @@ mod photos;
 mod pruning;
 mod renderer;
 mod sheet;
+mod shown_objects;
 mod summary;
 mod surface;
 mod zone_pictures;

@@ -4,11 +4,13 @@ use blocks::Part;
 use dataset::windows::WindowReader;
 use glam::Vec3;
 use model::{Model, read_tree};
+use perceive::Detector;
 use scene::{BadInput, Exposures, Splats, column};
 use train::importance::{EvaluationViews, Order, OwnershipWeights};
-use train::prune::{self, PruneProgress, Pruned, Pruning};
+use train::prune::{self, ObjectTolerance, PruneProgress, Pruned, Pruning};
 use train::{Backend, Flow, Job, Recipe, TrainError, TrainView};
 
+use crate::shown_objects::ShownObjects;
 use crate::{EvalError, Observer, Photos};
 
 /// Bytes of decoded photos that are kept.
@@ -95,7 +97,8 @@ impl<'a> Pruner<'a> {
         EvaluationViews { views, context: None, antialiased, exposures, source: &self.reader }
     }
 
-    /// Prunes to a share of the splats, or without one within the tolerance.
+    /// Prunes to a share of the splats, or without one within the tolerance, and that on what a detector finds: the share of the
+    /// objects that the model shows which may be lost.
     ///
     /// # Errors
     /// As [`held_in_psnr`](Self::held_in_psnr).
@@ -103,6 +106,7 @@ impl<'a> Pruner<'a> {
         &self,
         pruning: &Pruning,
         share: Option<f64>,
+        detections: Option<(&Detector, f64)>,
         observer: &dyn Observer,
     ) -> Result<(Splats, Pruned), EvalError> {
         let model = self.model;
@@ -139,7 +143,11 @@ impl<'a> Pruner<'a> {
         };
         let pruned = match share {
             Some(share) => prune::to_share(job, pruning, share, &mut report),
-            None => prune::within_tolerance(job, pruning, &mut report),
+            None => {
+                let judge = detections.map(|(detector, share)| (ShownObjects::new(detector), share));
+                let objects = judge.as_ref().map(|(judge, share)| ObjectTolerance { judge, share: *share });
+                prune::within_tolerance(job, pruning, objects.as_ref(), &mut report)
+            }
         };
         pruned.map_err(no_views)
     }

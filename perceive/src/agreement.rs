@@ -80,42 +80,60 @@ enum Group {
     Class(usize),
 }
 
+fn group(of: &Detection, classes: &[String]) -> Group {
+    let name = classes.get(of.class).map_or("", String::as_str);
+    match of.class {
+        _ if VEHICLES.contains(&name) => Group::Vehicles,
+        _ if PEOPLE.contains(&name) => Group::People,
+        class => Group::Class(class),
+    }
+}
+
 /// Compares detections on a photo and on its render; `classes` are the names of the detector's classes. In order of
 /// their scores, detections on the render take that on the photo which they overlap most and no other has taken.
 pub fn agreement(photo: &[Detection], render: &[Detection], classes: &[String]) -> Agreement {
-    let group = |of: &Detection| {
-        let name = classes.get(of.class).map_or("", String::as_str);
-        match of.class {
-            _ if VEHICLES.contains(&name) => Group::Vehicles,
-            _ if PEOPLE.contains(&name) => Group::People,
-            class => Group::Class(class),
-        }
-    };
-    let mut taken = vec![false; photo.len()];
-    let mut by_score: Vec<&Detection> = render.iter().collect();
-    by_score.sort_by(|a, b| b.score.total_cmp(&a.score));
     let (mut agreement, mut overlaps) = (Agreement::default(), 0.0);
     let mut add = |of: &Detection, counts: Counts| {
         agreement.all += counts;
-        match group(of) {
+        match group(of, classes) {
             Group::Vehicles => agreement.vehicles += counts,
             Group::People => agreement.people += counts,
             Group::Class(_) => {}
         }
     };
     photo.iter().for_each(|of| add(of, Counts { photos: 1, ..Counts::default() }));
-    for of in by_score {
-        let free = (0..photo.len()).filter(|&i| !taken[i] && group(&photo[i]) == group(of));
-        let matches = free.map(|i| (i, iou(photo[i].corners, of.corners))).filter(|(_, overlap)| *overlap >= MATCHES);
-        let best = matches.reduce(|best, next| if next.1 > best.1 { next } else { best });
-        let (kept, extra) = if best.is_some() { (1, 0) } else { (0, 1) };
-        if let Some((i, overlap)) = best {
-            taken[i] = true;
-            overlaps += f64::from(overlap);
-        }
+    for (of, takes) in matched(photo, render, classes) {
+        let (kept, extra) = if takes.is_some() { (1, 0) } else { (0, 1) };
+        overlaps += takes.map_or(0.0, |(_, overlap)| f64::from(overlap));
         add(of, Counts { photos: 0, renders: 1, kept, extra });
     }
     Agreement { overlaps, ..agreement }
+}
+
+/// Which detections on the photo are kept on its render, matched as [`agreement`] does.
+pub fn kept(photo: &[Detection], render: &[Detection], classes: &[String]) -> Vec<bool> {
+    let mut kept = vec![false; photo.len()];
+    matched(photo, render, classes).into_iter().filter_map(|(_, takes)| takes).for_each(|(i, _)| kept[i] = true);
+    kept
+}
+
+/// Detections on the render in order of their scores, each with the one on the photo that it takes, and their overlap.
+fn matched<'a>(
+    photo: &[Detection],
+    render: &'a [Detection],
+    classes: &[String],
+) -> Vec<(&'a Detection, Option<(usize, f32)>)> {
+    let mut taken = vec![false; photo.len()];
+    let mut by_score: Vec<&Detection> = render.iter().collect();
+    by_score.sort_by(|a, b| b.score.total_cmp(&a.score));
+    let take = |of: &'a Detection| {
+        let free = (0..photo.len()).filter(|&i| !taken[i] && group(&photo[i], classes) == group(of, classes));
+        let matches = free.map(|i| (i, iou(photo[i].corners, of.corners))).filter(|(_, overlap)| *overlap >= MATCHES);
+        let best = matches.reduce(|best, next| if next.1 > best.1 { next } else { best });
+        best.iter().for_each(|(i, _)| taken[*i] = true);
+        (of, best)
+    };
+    by_score.into_iter().map(take).collect()
 }
 
 #[cfg(test)]
@@ -133,7 +151,11 @@ mod tests {
     }
 
     fn compared(photo: &[Detection], render: &[Detection]) -> Agreement {
-        agreement(photo, render, &coco::NAMES.map(str::to_owned))
+        let classes = coco::NAMES.map(str::to_owned);
+        let agreement = agreement(photo, render, &classes);
+        let kept = kept(photo, render, &classes);
+        assert_eq!((kept.len(), kept.iter().filter(|kept| **kept).count()), (photo.len(), agreement.all.kept as usize));
+        agreement
     }
 
     fn counts(photos: u64, renders: u64, kept: u64) -> Counts {

@@ -21,7 +21,7 @@ pub mod precision;
 #[cfg(test)]
 mod testing;
 
-pub use agreement::{Agreement, Counts, agreement};
+pub use agreement::{Agreement, Counts, agreement, kept};
 pub use boxes::{Detection, iou};
 pub use card::Card;
 pub use detector::{Cost, Detector};

@@ -18,6 +18,9 @@ pub enum TrainError {
     /// A loss from outside could not be computed.
     #[error("{0}")]
     PictureLoss(String),
+    /// Objects on a render could not be judged.
+    #[error("{0}")]
+    Objects(String),
     /// All splats were removed after this number of steps.
     #[error("every splat was removed after {0} steps: the views and the points do not agree, or poses are wrong")]
     Empty(u32),

@@ -94,6 +94,11 @@ pub struct EvaluationViews<'a> {
 
 /// The comparison of a rendered view with its photo.
 struct Comparison<'a> {
+    /// The view's number.
+    view: u32,
+    photo: &'a Pixels,
+    /// Three planes, exposed.
+    picture: &'a [f32],
     /// Pixel weights; empty where all are 1.
     weights: &'a [f32],
     /// Weighted mean squared error over pixels and channels.
@@ -156,6 +161,14 @@ impl<'a> EvaluationViews<'a> {
         Ok([all, if sums[1].1 > 0.0 { zones } else { all }])
     }
 
+    /// Shows the photo and the render of each view, with its number: three planes, exposed.
+    ///
+    /// # Errors
+    /// A window that cannot be read.
+    pub fn pictures(&self, splats: &Splats, mut visit: impl FnMut(u32, &Pixels, &[f32])) -> Result<(), TrainError> {
+        self.compare(splats, None, |_, compared| visit(compared.view, compared.photo, compared.picture))
+    }
+
     /// Root of the weighted mean squared error over all views, 0 to 1; `None` where the weights sum to less than 64
     /// pixels.
     ///
@@ -207,7 +220,7 @@ impl<'a> EvaluationViews<'a> {
         mut visit: impl FnMut(&mut Renderer, Comparison),
     ) -> Result<(), TrainError> {
         let mut renderer = Renderer::default();
-        let (mut weights, mut exposed) = (Vec::new(), Vec::new());
+        let (mut weights, mut picture) = (Vec::new(), Vec::new());
         let windows = self.views.iter().filter_map(|view| view.at(0).map(|(mip, rect, _)| (view.view, mip, rect)));
         for ((n, view), photo) in self.views.iter().enumerate().zip(source::each(self.source, windows)) {
             let (_, _, camera) = view.at(0).expect("at(0) is always Some");
@@ -228,12 +241,12 @@ impl<'a> EvaluationViews<'a> {
             let area = photo.area();
             let weight = |i: usize| if weights.is_empty() { 1.0 } else { f64::from(weights[i % area]) };
             let exposure = self.exposures.and_then(|exposures| exposures.of(view.view));
-            let shown = exposure.map_or(&frame.colour, |exposure| {
-                expose(exposure, &frame.colour, &mut exposed);
-                &exposed
-            });
+            match exposure {
+                Some(exposure) => expose(exposure, &frame.colour, &mut picture),
+                None => picture.clone_from(&frame.colour),
+            }
             // Clamped to the range of a display.
-            let pairs = shown.iter().map(|colour| colour.clamp(0.0, 1.0)).zip(&photo.rgb);
+            let pairs = picture.iter().map(|colour| colour.clamp(0.0, 1.0)).zip(&photo.rgb);
             let squares = pairs.map(|(colour, photo)| f64::from(colour - f32::from(*photo) / 255.0).powi(2));
             let pixels = if weights.is_empty() { area as f64 } else { weights.iter().map(|w| f64::from(*w)).sum() };
             let (error, parts) = match &photo.weights {
@@ -245,7 +258,11 @@ impl<'a> EvaluationViews<'a> {
             };
             let mse = error / (3.0 * pixels).max(1e-9);
             let square_gain = exposure.map_or(1.0, |exposure| f64::from(square_gain(exposure)));
-            visit(&mut renderer, Comparison { weights: &weights, mse, pixels, parts, square_gain });
+            let (view, photo, picture) = (view.view, &*photo, &picture);
+            visit(
+                &mut renderer,
+                Comparison { view, photo, picture, weights: &weights, mse, pixels, parts, square_gain },
+            );
         }
         Ok(())
     }

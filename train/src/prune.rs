@@ -1,17 +1,19 @@
-//! Prunes splats within a PSNR tolerance: the fewest splats whose PSNR on the training views stays above a floor.
+//! Prunes splats within a PSNR tolerance: the fewest splats whose PSNR on views that judge stays above a floor.
 //!
 //! ```text
 //! recovery without a cut → floor
 //! repeat: importance → cut to `drop_db` below the floor (bisection) → recovery: train without densification
-//!         PSNR at the floor or above: keep the cut; else revert it and halve `drop_db`
-//! at the end: cut to the floor itself → recovery
+//!         PSNR at the floor or above, objects shown: keep the cut; else revert it and halve `drop_db`
+//! at the end: cut to the floor itself → recovery on all views
 //! ```
-//! The floor is the PSNR after a recovery without pruning, minus the tolerance. A model that was not trained to
-//! convergence improves by recovery alone. Spending that gain on pruning cost held-out views two to three times the
-//! tolerance. Where photos have zones, the PSNR of their pixels has a floor of its own, as objects are few of all pixels.
-//! Recovery regains most of what a cut costs at first, so each cut goes deeper than the tolerance. No result
-//! is below the floor.
+//! Every fourth view judges, and only the last recovery trains on it. What recoveries train on loses less than what they do
+//! not: judged by the same views, held-out ones lost two to three times the tolerance. The floor is the PSNR after a
+//! recovery without pruning, minus the tolerance: training saw the judging views, so they lose by that recovery alone, and
+//! a model that was not trained to convergence improves by it. Where photos have zones, the PSNR of their pixels has a
+//! floor of its own, as objects are few of all pixels. Recovery regains most of what a cut costs at first, so each cut
+//! goes deeper than the tolerance. No cut that is kept is below the floor.
 
+mod judges;
 mod search;
 
 use std::mem;
@@ -19,9 +21,11 @@ use std::mem;
 use glam::Vec3;
 use scene::Splats;
 
+use self::judges::{Evaluator, Objects, Quality, ViewCount, apart, judges_of};
+pub use self::judges::{ObjectJudge, ObjectTolerance};
 use self::search::Search;
 use crate::error::TrainError;
-use crate::importance::{EvaluationViews, Order, OwnershipWeights};
+use crate::importance::{EvaluationViews, Order};
 use crate::job::{Flow, Job};
 use crate::random;
 use crate::recipe::Recipe;
@@ -32,7 +36,7 @@ use crate::view::TrainView;
 const MEASURED_VIEWS: ViewCount = ViewCount { min: 8, max: 32, per_step: 0.5 };
 /// Views on which the PSNR of a cut is measured before recovery.
 const PROBE_VIEWS: ViewCount = ViewCount { min: 4, max: 8, per_step: 0.125 };
-/// Views from which importance is computed.
+/// Views from which importance is computed, and those on which objects are judged.
 const IMPORTANCE_VIEWS: ViewCount = ViewCount { min: 24, max: 128, per_step: 1.0 };
 /// Pruning ends when a round removes a smaller share of the splats.
 const MIN_CUT: f64 = 0.01;
@@ -52,7 +56,7 @@ pub fn steps_before(steps: u32) -> u32 {
 /// Parameters of pruning.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Pruning {
-    /// Allowed loss of PSNR on the job's training views, over all pixels and over those of zones alike, dB.
+    /// Allowed loss of PSNR on the views that judge, over all pixels and over those of zones alike, dB.
     pub tolerance_db: f64,
     /// Importance measure that orders the splats.
     pub order: Order,
@@ -77,21 +81,6 @@ impl Pruning {
     }
 }
 
-/// The number of views of an evaluation. It grows with the recovery steps, so that evaluating takes no longer than the
-/// recovery between two evaluations.
-#[derive(Clone, Copy)]
-struct ViewCount {
-    min: usize,
-    max: usize,
-    per_step: f32,
-}
-
-impl ViewCount {
-    fn for_steps(&self, steps: u32) -> usize {
-        ((steps as f32 * self.per_step) as usize).clamp(self.min, self.max)
-    }
-}
-
 /// The outcome of pruning.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Pruned {
@@ -99,6 +88,9 @@ pub struct Pruned {
     pub splats: [usize; 2],
     /// PSNR on the job's views, before and after, dB.
     pub psnr: [f64; 2],
+    /// Number of the objects that the unpruned splats show on the judging views, and of those that are still shown; `None` if
+    /// nobody judges objects.
+    pub objects: Option<[usize; 2]>,
     /// Number of rounds whose result was kept, without the last.
     pub rounds: u32,
     /// Training steps of all recoveries, including those of rounds that were left out.
@@ -123,10 +115,11 @@ impl Pruning {
         const TRIED: usize = 4;
         let (rounds, recovery) = (self.fitted(steps).rounds as usize, self.round_steps(steps));
         let of = |count: ViewCount| count.for_steps(recovery).min(views);
-        let [measured, probe, importance] = [of(MEASURED_VIEWS), of(PROBE_VIEWS), of(IMPORTANCE_VIEWS)];
+        let judging = |count: ViewCount| count.for_steps(recovery).min(judges_of(views));
+        let [measured, probe, importance] = [judging(MEASURED_VIEWS), judging(PROBE_VIEWS), of(IMPORTANCE_VIEWS)];
         let round = importance + (TRIED + 1) * probe + measured;
-        let last = importance + (TRIED + 1) * measured + 2 * measured;
-        probe + (2 + self.warm_up as usize) * measured + rounds * round + last
+        let last = importance + (TRIED + 1) * measured + measured;
+        probe + (1 + self.warm_up as usize) * measured + rounds * round + last + 3 * of(MEASURED_VIEWS)
     }
 
     /// The same recovery in fewer rounds, where rounds would have less than [`MIN_ROUND_STEPS`] steps.
@@ -163,30 +156,43 @@ pub type Report<'a> = &'a mut dyn FnMut(PruneProgress) -> Flow;
 
 /// Prunes the splats that a job has trained, which are its `initial`. Only counted splats are removed; all take part in
 /// recovery. The job has the steps and recipe that it was trained with; recovery starts from the recipe's last learning
-/// rates. Exposures are fixed or absent.
+/// rates. Exposures are fixed or absent. `objects` adds a tolerance on objects.
 ///
 /// # Errors
 /// See [`TrainError`].
-pub fn within_tolerance(trained: Job, pruning: &Pruning, report: Report) -> Result<(Splats, Pruned), TrainError> {
-    let (pruner, mut best) = Pruner::new(trained, pruning)?;
+pub fn within_tolerance(
+    trained: Job,
+    pruning: &Pruning,
+    objects: Option<&ObjectTolerance>,
+    report: Report,
+) -> Result<(Splats, Pruned), TrainError> {
+    let (mut pruner, mut best) = Pruner::new(trained, pruning)?;
+    pruner.judge_objects(objects.copied(), &best)?;
     let pruning = pruner.pruning;
-    let before = pruner.quality(&best)?;
+    let before = pruner.reported_psnr(&best)?;
     let owned = pruner.owned(&best);
-    // The gain of recovery alone raises the floor, so that cuts cannot spend it.
+    let mut reached = pruner.quality(&best)?;
+    let mut floor = reached;
+    let (mut drop_db, mut kept_rounds, mut recoveries, mut stopped) = (pruning.drop_db, 0, 0, false);
     for round in 0..pruning.warm_up {
         let Some(recovered) = pruner.recover(best.clone(), round, report)? else {
-            let psnr = [before.psnr(), pruner.quality(&best)?.psnr()];
-            let outcome = Pruned { splats: [owned; 2], psnr, rounds: 0, steps: round * pruner.job.steps };
-            return Ok((best, outcome));
+            stopped = true;
+            break;
         };
-        best = recovered;
+        recoveries += 1;
+        floor = pruner.quality(&recovered)?;
+        // An object at the limit of what is seen may be lost without a cut.
+        if pruner.shows_objects(&recovered)? {
+            (best, reached) = (recovered, floor);
+        }
     }
-    let mut reached = pruner.quality(&best)?;
-    let floor = reached.or_better(before).less(pruning.tolerance_db);
-    let (mut drop_db, mut kept_rounds, mut stopped) = (pruning.drop_db, 0, false);
-    let mut recoveries = pruning.warm_up;
-    for round in 0..pruning.rounds {
-        let cut = pruner.cut(&best, floor.less(drop_db).below(reached), &pruner.probe)?;
+    let floor = floor.less(pruning.tolerance_db);
+    let rounds = if stopped { 0 } else { pruning.rounds };
+    // Share of the loss within the PSNR tolerance that cuts use: less where objects are lost sooner.
+    let mut depth = 1.0;
+    for round in 0..rounds {
+        let loss_db = floor.less(drop_db).below(reached).map(|loss| depth * loss);
+        let cut = pruner.cut(&best, loss_db, &pruner.probe)?;
         if ((best.len() - cut.len()) as f64) < MIN_CUT * pruner.owned(&best) as f64 {
             break;
         }
@@ -196,39 +202,45 @@ pub fn within_tolerance(trained: Job, pruning: &Pruning, report: Report) -> Resu
         };
         recoveries += 1;
         let quality = pruner.quality(&recovered)?;
-        if quality.reaches(floor) {
+        if !quality.reaches(floor) {
+            drop_db *= 0.5;
+        } else if pruner.shows_objects(&recovered)? {
             (best, reached, kept_rounds) = (recovered, quality, kept_rounds + 1);
         } else {
-            drop_db *= 0.5;
+            depth *= 0.5;
         }
     }
     if !stopped {
-        best = pruner.cut(&best, floor.below(reached), &pruner.measured)?;
-        // Recovery after the last cut is for the held-out views, which lose more than the training views.
+        let cut = pruner.cut(&best, floor.below(reached).map(|loss| depth * loss), &pruner.measured)?;
+        if pruner.shows_objects(&cut)? {
+            best = cut;
+        }
         if let Some(recovered) = pruner.recover(best.clone(), pruning.warm_up + pruning.rounds, report)? {
             recoveries += 1;
-            if pruner.quality(&recovered)?.reaches(floor) {
+            if pruner.quality(&recovered)?.reaches(floor) && pruner.shows_objects(&recovered)? {
                 best = recovered;
             }
         }
     }
     let outcome = Pruned {
         splats: [owned, pruner.owned(&best)],
-        psnr: [before.psnr(), pruner.quality(&best)?.psnr()],
+        psnr: [before, pruner.reported_psnr(&best)?],
+        objects: pruner.shown_objects(&best)?,
         rounds: kept_rounds,
         steps: recoveries * pruner.job.steps,
     };
     Ok((best, outcome))
 }
 
-/// Keeps this share of the counted splats, in rounds that each remove the same share of the rest and recover.
-/// Otherwise as [`within_tolerance`].
+/// Keeps this share of the counted splats, in rounds that each remove the same share of the rest and recover. Nothing is
+/// judged, so all views heal. Otherwise as [`within_tolerance`].
 ///
 /// # Errors
 /// See [`TrainError`].
 pub fn to_share(trained: Job, pruning: &Pruning, share: f64, report: Report) -> Result<(Splats, Pruned), TrainError> {
-    let (pruner, mut splats) = Pruner::new(trained, &pruning.without_warm_up())?;
-    let (before, psnr) = (pruner.owned(&splats), pruner.quality(&splats)?.psnr());
+    let (mut pruner, mut splats) = Pruner::new(trained, &pruning.without_warm_up())?;
+    pruner.healing = pruner.job.views.to_vec();
+    let (before, psnr) = (pruner.owned(&splats), pruner.reported_psnr(&splats)?);
     let (rounds, mut recoveries, mut stopped) = (pruner.pruning.parts(), 0, false);
     for round in 0..rounds {
         // Where it was stopped, one cut is left.
@@ -247,7 +259,8 @@ pub fn to_share(trained: Job, pruning: &Pruning, share: f64, report: Report) -> 
     }
     let outcome = Pruned {
         splats: [before, pruner.owned(&splats)],
-        psnr: [psnr, pruner.quality(&splats)?.psnr()],
+        psnr: [psnr, pruner.reported_psnr(&splats)?],
+        objects: None,
         rounds: recoveries,
         steps: recoveries * pruner.job.steps,
     };
@@ -281,58 +294,13 @@ struct Pruner<'a> {
     recipe: Recipe,
     pruning: Pruning,
     all: EvaluationViews<'a>,
+    /// Views that recoveries train on, but for the last.
+    healing: Vec<TrainView>,
     measured: Evaluator,
     probe: Evaluator,
-}
-
-/// PSNR over all pixels and over those of zones, dB; without zones both are the same.
-#[derive(Clone, Copy)]
-struct Quality([f64; 2]);
-
-impl Quality {
-    /// Over all pixels.
-    fn psnr(self) -> f64 {
-        self.0[0]
-    }
-
-    fn with(self, other: Self, f: impl Fn(f64, f64) -> f64) -> Self {
-        Self([0, 1].map(|part| f(self.0[part], other.0[part])))
-    }
-
-    fn or_better(self, other: Self) -> Self {
-        self.with(other, f64::max)
-    }
-
-    fn less(self, db: f64) -> Self {
-        Self(self.0.map(|psnr| psnr - db))
-    }
-
-    /// How far this lies below the other, dB.
-    fn below(self, other: Self) -> [f64; 2] {
-        other.with(self, |high, low| high - low).0
-    }
-
-    fn reaches(self, floor: Self) -> bool {
-        self.0.iter().zip(floor.0).all(|(psnr, floor)| *psnr >= floor)
-    }
-}
-
-/// Views to measure PSNR on, with pixel weights from the unpruned splats.
-struct Evaluator {
-    views: Vec<TrainView>,
-    weights: OwnershipWeights,
-}
-
-impl Evaluator {
-    fn new(all: &EvaluationViews, count: usize, splats: &Splats) -> Result<Self, TrainError> {
-        let views = all.some(count);
-        let weights = EvaluationViews { views: &views, ..*all }.ownership_weights(splats)?;
-        Ok(Self { views, weights })
-    }
-
-    fn quality(&self, all: &EvaluationViews, splats: &Splats) -> Result<Quality, TrainError> {
-        EvaluationViews { views: &self.views, ..*all }.psnr(splats, &self.weights).map(Quality)
-    }
+    /// Some of all views.
+    reported: Evaluator,
+    objects: Option<Objects<'a>>,
 }
 
 impl<'a> Pruner<'a> {
@@ -346,9 +314,36 @@ impl<'a> Pruner<'a> {
         (job.trains_exposures, job.trains_poses) = (false, false);
         let Job { views, context, antialiased, exposures, source, .. } = job;
         let all = EvaluationViews { views, context, antialiased, exposures, source };
-        let measured = Evaluator::new(&all, MEASURED_VIEWS.for_steps(job.steps), &splats)?;
-        let probe = Evaluator::new(&all, PROBE_VIEWS.for_steps(job.steps), &splats)?;
-        Ok((Self { recipe: recovery_recipe(job.recipe), pruning, all, measured, probe, job }, splats))
+        let [judging, healing] = apart(views);
+        let judging = EvaluationViews { views: &judging, ..all };
+        let measured = Evaluator::new(&judging, MEASURED_VIEWS.for_steps(job.steps), &splats)?;
+        let probe = Evaluator::new(&judging, PROBE_VIEWS.for_steps(job.steps), &splats)?;
+        let reported = Evaluator::new(&all, MEASURED_VIEWS.for_steps(job.steps), &splats)?;
+        let recipe = recovery_recipe(job.recipe);
+        Ok((Self { job, recipe, pruning, all, healing, measured, probe, reported, objects: None }, splats))
+    }
+
+    /// From now on, few of the objects that these splats show may be lost.
+    fn judge_objects(&mut self, objects: Option<ObjectTolerance<'a>>, splats: &Splats) -> Result<(), TrainError> {
+        let Some(objects) = objects else { return Ok(()) };
+        let [judging, _] = apart(self.job.views);
+        let count = IMPORTANCE_VIEWS.for_steps(self.job.steps);
+        self.objects = Some(Objects::new(objects, &EvaluationViews { views: &judging, ..self.all }, count, splats)?);
+        Ok(())
+    }
+
+    fn shows_objects(&self, splats: &Splats) -> Result<bool, TrainError> {
+        self.objects.as_ref().map_or(Ok(true), |objects| objects.are_shown(&self.all, splats))
+    }
+
+    /// See [`Pruned::objects`].
+    fn shown_objects(&self, splats: &Splats) -> Result<Option<[usize; 2]>, TrainError> {
+        self.objects.as_ref().map(|objects| objects.counts(&self.all, splats)).transpose()
+    }
+
+    /// On some of all views, dB.
+    fn reported_psnr(&self, splats: &Splats) -> Result<f64, TrainError> {
+        self.reported.quality(&self.all, splats).map(Quality::psnr)
     }
 
     fn owned(&self, splats: &Splats) -> usize {
@@ -390,9 +385,11 @@ impl<'a> Pruner<'a> {
     /// Trains without densification; `None` if the report stopped it.
     fn recover(&self, cut: Splats, round: u32, report: Report) -> Result<Option<Splats>, TrainError> {
         let steps = self.job.steps;
+        let is_last = round + 1 == self.pruning.parts();
         let job = Job {
             budget: cut.len(),
             initial: cut,
+            views: if is_last { self.job.views } else { &self.healing },
             seed: random::bits(self.job.seed, u64::from(round) + 1),
             recipe: &self.recipe,
             ..self.job

@@ -1,14 +1,14 @@
 //! Prunes a scene of a few hundred splats, with photos rendered from the ground ground_truth.
 
-use std::sync::Arc;
+use std::sync::{Arc, Mutex};
 
 use glam::{DMat3, DQuat, DVec3, Vec3};
 use render::cpu::Renderer;
 use render::{Options, Part};
 use scene::{Camera, Pinhole, Pixels, Rect, Rigid, Splat, Splats, column};
 use train::importance::Order;
-use train::prune::{Pruned, Pruning, keep, to_share, within_tolerance};
-use train::{Backend, Flow, Job, Recipe, TrainError, TrainView, WindowSource, metrics, random};
+use train::prune::{ObjectJudge, ObjectTolerance, Pruned, Pruning, keep, to_share, within_tolerance};
+use train::{Backend, Flow, Job, PictureLoss, Recipe, TrainError, TrainView, WindowSource, metrics, random};
 
 const WIDTH: u32 = 64;
 const HEIGHT: u32 = 48;
@@ -125,7 +125,7 @@ fn with_job<R>(
 
 fn prune(initial: &Splats, photos: &Photos, counts: Predicate, tolerance_db: f64) -> (Splats, Pruned) {
     with_job(initial, None, photos, counts, |job| {
-        within_tolerance(job, &Pruning::within(tolerance_db), &mut |_| Flow::Continue).expect("pruning succeeds")
+        within_tolerance(job, &Pruning::within(tolerance_db), None, &mut |_| Flow::Continue).expect("pruning succeeds")
     })
 }
 
@@ -185,7 +185,7 @@ fn holes_in_front_of_the_context_count_as_error() {
     green.append(&cloud(9, 20, 0.01).with_sh_degree(0));
     let photos = photos(&green);
     let (pruned, outcome) = with_job(&green, Some(&red), &photos, &|_| true, |job| {
-        within_tolerance(job, &Pruning::within(0.1), &mut |_| Flow::Continue).unwrap()
+        within_tolerance(job, &Pruning::within(0.1), None, &mut |_| Flow::Continue).unwrap()
     });
     let worst = |splats: &Splats| {
         let red_at = |view| render(splats, Some(&red), view)[..AREA].iter().filter(|v| **v > 0.6).count();
@@ -268,16 +268,114 @@ fn stopping_returns_the_last_kept_splats_and_errors_are_reported() {
     let model = with_faint_splats(&ground_truth);
     let pruning = Pruning::within(0.1);
     let (stopped, outcome) = with_job(&model, None, &photos, &|_| true, |job| {
-        within_tolerance(job, &pruning, &mut |now| if now.step == 3 { Flow::Stop } else { Flow::Continue }).unwrap()
+        within_tolerance(job, &pruning, None, &mut |now| if now.step == 3 { Flow::Stop } else { Flow::Continue })
+            .unwrap()
     });
     assert!(stopped == model && outcome.rounds == 0, "the first round was not finished");
     let failed = with_job(&model, None, &photos, &|_| true, |job| {
-        within_tolerance(Job { views: &[], ..job }, &pruning, &mut |_| Flow::Continue).unwrap_err()
+        within_tolerance(Job { views: &[], ..job }, &pruning, None, &mut |_| Flow::Continue).unwrap_err()
     });
     assert_eq!(failed, TrainError::NoViews);
     let none = Photos(Vec::new());
     let failed = with_job(&model, None, &none, &|_| true, |job| {
-        within_tolerance(job, &Pruning { order: Order::Surface, ..pruning }, &mut |_| Flow::Continue).unwrap_err()
+        within_tolerance(job, &Pruning { order: Order::Surface, ..pruning }, None, &mut |_| Flow::Continue).unwrap_err()
     });
     assert!(matches!(failed, TrainError::Source(line) if line.contains("missing")));
+}
+
+/// Notes the views that steps train on.
+#[derive(Default)]
+struct Trained(Mutex<Vec<u32>>);
+
+impl PictureLoss for Trained {
+    fn evaluate(&self, view: u32, _: u8, _: Rect, _: &Pixels, _: &[f32]) -> Result<Option<(f64, Vec<f32>)>, String> {
+        self.0.lock().unwrap().push(view);
+        Ok(None)
+    }
+}
+
+#[test]
+fn only_the_last_recovery_trains_on_views_that_judge() {
+    let ground_truth = cloud(13, 60, 0.8);
+    let photos = photos(&ground_truth);
+    let trained = Trained::default();
+    let recipe = Recipe { picture_weight: 1.0, picture_every: 1, ..Recipe::refinement(1.0) };
+    let mut before_the_last = 0;
+    let pruning = Pruning::within(0.1);
+    with_job(&with_faint_splats(&ground_truth), None, &photos, &|_| true, |job| {
+        let job = Job { recipe: &recipe, picture_loss: Some(&trained), ..job };
+        within_tolerance(job, &pruning, None, &mut |now| {
+            if now.step <= now.steps - now.recovery.steps {
+                before_the_last = trained.0.lock().unwrap().len();
+            }
+            Flow::Continue
+        })
+        .unwrap()
+    });
+    let trained = trained.0.into_inner().unwrap();
+    let judges = |of: &[u32]| of.iter().filter(|view| **view % 4 == 2).count();
+    let (first, last) = trained.split_at(before_the_last);
+    assert!(first.len() >= 2 * 80 && last.len() >= 80, "{} {}", first.len(), last.len());
+    assert_eq!(judges(first), 0);
+    assert!(judges(last) > 0, "{last:?}");
+    assert!((0..10).filter(|view| view % 4 != 2).all(|view| first.contains(&view)), "all others heal");
+}
+
+/// An object in each quarter of every photo, shown while the quarter is close to the photo.
+struct Quarters {
+    /// Largest mean absolute difference of a quarter, 0 to 1.
+    limit: f32,
+}
+
+impl ObjectJudge for Quarters {
+    fn shown(&self, view: u32, photo: &Pixels, picture: &[f32]) -> Result<Vec<bool>, String> {
+        assert!(view % 4 == 2, "view {view} does not judge");
+        let differs = |i: usize| (picture[i] - f32::from(photo.rgb[i]) / 255.0).abs();
+        let of = |quarter: usize| (0..AREA).filter(move |i| i * 4 / AREA == quarter);
+        Ok((0..4).map(|quarter| of(quarter).map(differs).sum::<f32>() * 4.0 / AREA as f32 <= self.limit).collect())
+    }
+}
+
+#[test]
+fn few_of_the_objects_may_be_lost() {
+    /// So much that the objects hold pruning back.
+    const TOLERANCE_DB: f64 = 15.0;
+    let ground_truth = cloud(14, 100, 0.8);
+    let photos = photos(&ground_truth);
+    let model = with_faint_splats(&ground_truth);
+    let judge = Quarters { limit: 0.04 };
+    let prune = |share: Option<f64>| {
+        let objects = share.map(|share| ObjectTolerance { judge: &judge, share });
+        with_job(&model, None, &photos, &|_| true, |job| {
+            within_tolerance(job, &Pruning::within(TOLERANCE_DB), objects.as_ref(), &mut |_| Flow::Continue).unwrap()
+        })
+    };
+    let [(free, unjudged), (some, half), (few, none), (all, any)] = [None, Some(0.5), Some(0.0), Some(1.0)].map(prune);
+    println!(
+        "{} splats: {} {} {} {}; {half:?} {none:?} {any:?}",
+        model.len(),
+        free.len(),
+        some.len(),
+        few.len(),
+        all.len()
+    );
+    assert!(free == all && unjudged.objects.is_none(), "a tolerance of all objects changes nothing");
+    let [before, after] = none.objects.unwrap();
+    assert!(before >= 4 && after == before, "{none:?}");
+    let [_, after] = half.objects.unwrap();
+    assert!(2 * after >= before, "{half:?}");
+    assert!(2 * any.objects.unwrap()[1] < before, "{any:?}");
+    assert!(free.len() < some.len() && some.len() < few.len() && few.len() < model.len());
+
+    struct Fails;
+    impl ObjectJudge for Fails {
+        fn shown(&self, _: u32, _: &Pixels, _: &[f32]) -> Result<Vec<bool>, String> {
+            Err("no network".into())
+        }
+    }
+    let objects = ObjectTolerance { judge: &Fails, share: 0.0 };
+    let failed = with_job(&model, None, &photos, &|_| true, |job| {
+        within_tolerance(job, &Pruning::within(0.1), Some(&objects), &mut |_| Flow::Continue).unwrap_err()
+    });
+    assert_eq!(failed, TrainError::Objects("no network".into()));
 }

@@ -238,7 +238,7 @@ impl Block<'_> {
         limit: Option<&TaskTimeLimit>,
         progress: &mut Progress,
     ) -> Result<Splats, ExecuteError> {
-        let pruned = prune::within_tolerance(job, pruning, &mut |mut now| {
+        let pruned = prune::within_tolerance(job, pruning, None, &mut |mut now| {
             self.context.shared.metrics.steps.inc();
             progress.is_late = limit.is_some_and(TaskTimeLimit::is_over);
             // The last step is reported at the end, with the splats that pruning chose.
@@ -284,7 +284,9 @@ impl Block<'_> {
     /// The failure class of a training error.
     fn failure(&self, error: TrainError) -> ExecuteError {
         let kind = match error {
-            TrainError::NoViews | TrainError::Empty(_) | TrainError::PictureLoss(_) => FailureKind::Input,
+            TrainError::NoViews | TrainError::Empty(_) | TrainError::PictureLoss(_) | TrainError::Objects(_) => {
+                FailureKind::Input
+            }
             TrainError::Device(_) => FailureKind::Work,
             TrainError::OutOfMemory(_) => FailureKind::OutOfMemory,
             // Windows carry checksums: an unreadable one is unreachable or damaged, which the input does not explain.

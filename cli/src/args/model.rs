@@ -5,7 +5,9 @@ use std::path::PathBuf;
 use clap::{Args, ValueEnum};
 use eval::Levels;
 
-use super::values::{Backend, ObjectMove, Size, clock_seconds, decibels, levels, metres, share};
+use super::values::{
+    Backend, ObjectMove, Size, clock_seconds, decibels, levels, metres, share, share_from_zero,
+};
 use super::zones::ZoneOptions;
 
 #[derive(Debug, Clone, Default, Args)]
@@ -162,9 +164,13 @@ pub(crate) struct PruneArgs {
     /// Keep this share of the splats, in 0..1
     #[arg(long, value_name = "F", value_parser = share, conflicts_with = "tolerance_db")]
     pub(crate) keep: Option<f64>,
-    /// Lose at most this much PSNR on the views that are not held out, dB; 0.1 if --keep is not given either [needs --capture]
+    /// Lose at most this much PSNR, dB, on every fourth of the views that are not held out; only the last recovery trains on these; 0.1 if --keep is not given either [needs --capture]
     #[arg(long, value_name = "X", value_parser = decibels)]
     pub(crate) tolerance_db: Option<f64>,
+    /// Lose at most this share of the objects that --detector finds both on photos and on the model's renders of the views that
+    /// judge, 0..1; by default any. For small shares, and on few photos, it ends pruning early
+    #[arg(long, value_name = "F", value_parser = share_from_zero, requires = "zone_detector", conflicts_with = "keep")]
+    pub(crate) tolerance_detections: Option<f64>,
     /// Capture whose photos splats are ranked and recovered by; without it only --keep, ranked by opacity and size
     #[arg(long)]
     pub(crate) capture: Option<PathBuf>,

@@ -144,6 +144,11 @@ pub(super) fn share(text: &str) -> Result<f64, String> {
     value.ok_or_else(|| "give a share above 0 and at most 1, such as 0.5".into())
 }
 
+pub(super) fn share_from_zero(text: &str) -> Result<f64, String> {
+    let value = text.parse().ok().filter(|share: &f64| (0.0..=1.0).contains(share));
+    value.ok_or_else(|| "give a share from 0 to 1, such as 0.05".into())
+}
+
 pub(super) fn seconds(text: &str) -> Result<f64, String> {
     let value = text.parse().ok().filter(|seconds: &f64| *seconds >= 0.0 && seconds.is_finite());
     value.ok_or_else(|| "give seconds from 0, such as 60".into())

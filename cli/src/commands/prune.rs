@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::sync::Arc;
 
-use eval::{PhotoOptions, Photos, Pruner};
+use eval::{PhotoOptions, Photos, Pruner, load_detector};
 use model::{Model, check_out, rewrite};
 use scene::{BadInput, Splats};
 use serde::Serialize;
@@ -29,6 +29,10 @@ struct Report<'a> {
     order: &'static str,
     keep: Option<f64>,
     tolerance_db: Option<f64>,
+    tolerance_detections: Option<f64>,
+    /// Objects that a detector finds on the renders of the views that judge, of those on their photos: before, and how many of
+    /// these after.
+    objects: Option<[usize; 2]>,
     splats_before: usize,
     /// On the views that it was pruned by: before and after, dB.
     held_in_psnr: Option<[f64; 2]>,
@@ -60,7 +64,12 @@ pub(crate) fn run(args: &PruneArgs, output: &Output) -> Result<(), Failure> {
     let observer = OutputObserver::new(output);
     let pruner = Pruner::new(&model, &photos, &observer)?;
     let pruning = Pruning::within(tolerance_db.unwrap_or(TOLERANCE_DB));
-    let (splats, pruned) = pruner.prune(&pruning, args.keep, &observer)?;
+    let detector = match (&args.tolerance_detections, &args.photos.zones.finder.zone_detector) {
+        (Some(share), Some(path)) => Some((load_detector(path)?, *share)),
+        _ => None,
+    };
+    let detections = detector.as_ref().map(|(detector, share)| (detector, *share));
+    let (splats, pruned) = pruner.prune(&pruning, args.keep, detections, &observer)?;
     let held_out = pruner.held_out_psnr(&model.splats)?.zip(pruner.held_out_psnr(&splats)?);
     let held_out = held_out.map(|(before, after)| [before, after]);
     let record = Record {
@@ -122,6 +131,8 @@ fn finish(
         order: order.name(),
         keep: args.keep,
         tolerance_db: args.keep.is_none().then(|| args.tolerance_db.unwrap_or(TOLERANCE_DB)),
+        tolerance_detections: args.tolerance_detections,
+        objects: measured.and_then(|(pruned, _)| pruned.objects),
         splats_before: before,
         held_in_psnr: measured.map(|(pruned, _)| pruned.psnr),
         held_out_psnr: measured.and_then(|(_, held_out)| held_out),
@@ -133,6 +144,9 @@ fn finish(
         if let Some([before, after]) = psnr {
             text += &format!("{after:.2} dB on {name}, {:+.2} dB\n", after - before);
         }
+    }
+    if let Some([before, after]) = report.objects {
+        text += &format!("{after} of the {before} objects found on renders of the views that judge are still found\n");
     }
     output.result(&report, &(text + &args.out.display().to_string()))
 }

@@ -142,7 +142,7 @@ pub(crate) fn run(args: &BenchPruneArgs, output: &Output) -> Result<(), Failure>
         };
         for keep in args.keep.iter().copied().map(Some).chain(tolerance) {
             let clock = Stopwatch::start();
-            let (splats, pruned) = pruner.prune(&pruning, keep, &observer)?;
+            let (splats, pruned) = pruner.prune(&pruning, keep, None, &observer)?;
             let cpu_seconds = clock.cpu_seconds();
             let after = judges.measured(pruner, &splats)?;
             add(Prune {
