@@ -32,7 +32,7 @@ use crate::undistortion::Undistorter;
 use crate::{box_masks, mip_tiles, mips, photo};
 
 /// An ingested capture in the store.
-pub const CAPTURE: Kind = Kind(*b"capt", 2);
+pub const CAPTURE: Kind = Kind(*b"capt", 3);
 /// The ingest record of a photo.
 const RECORD: Kind = Kind(*b"memo", 1);
 /// Part of the hash of a photo. Raise it with each change of decoding, undistortion, downscaling, mips or their format.

@@ -9,7 +9,7 @@ use scene::{Capture, Exposures, Poses};
 use scene::frame::{self, Kind, SPLATS, SPLATS_WITH_ATTRIBUTES, SPLATS_WITH_POSES};
 
 /// The same as `dataset::ingest::CAPTURE`.
-const CAPTURE: Kind = Kind(*b"capt", 2);
+const CAPTURE: Kind = Kind(*b"capt", 3);
 
 fuzz_target!(|bytes: &[u8]| {
     let _ = frame::decode::<frame::SplatsHeader>(SPLATS, bytes);
