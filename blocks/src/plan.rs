@@ -14,7 +14,7 @@ use crate::lod::{Cut, training_order};
 use crate::task::{DetectTask, EvalTask, Task, ViewUse, tasks_of_views};
 
 /// The format version of [`Plan`] that this program reads and writes.
-pub const VERSION: u32 = 11;
+pub const VERSION: u32 = 12;
 /// The frame kind of a plan.
 pub const PLAN: Kind = Kind(*b"plan", VERSION);
 /// The maximum depth of a plan: 65,536 blocks a side.
@@ -79,7 +79,9 @@ pub struct PlanSettings {
     pub antialiased: bool,
     /// Whether the root trains an exposure per view, which all other blocks reuse unchanged.
     pub exposure: bool,
-    /// Memory limit of one task, bytes.
+    /// Whether blocks that start from points have a backdrop: splats on a sphere around the scene, for sky and distance.
+    pub backdrop: bool,
+    /// Memory limit of one task, bytes. Automatic levels are as many as it takes to keep to it, if the capture supports them.
     pub memory_limit_bytes: u64,
     /// Each splat carries the block that trained it, as the attribute [`scene::BLOCK_ATTRIBUTE`].
     pub label_blocks: bool,
@@ -112,6 +114,7 @@ impl Default for PlanSettings {
             sh_degree: 3,
             antialiased: false,
             exposure: false,
+            backdrop: true,
             memory_limit_bytes: 4 << 30,
             label_blocks: false,
             depth_weight: 0.0,

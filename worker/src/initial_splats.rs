@@ -59,15 +59,19 @@ impl Block<'_> {
         Ok(InitialSplats { trained, context })
     }
 
-    /// Splats at the capture's points, and a backdrop around them.
+    /// Splats at the capture's points, and a backdrop around them if the plan has one.
     fn splats_from_points(&self, views: &[TrainView], recipe: &Recipe) -> Result<Splats, ExecuteError> {
         let (plan, task) = (self.plan, self.task);
         let sh_degree = plan.settings.sh_degree;
         let all = plan.settings.mode != Mode::Flat;
         let keep = |p: glam::DVec3| all || views.iter().any(|view| projects_into(view, p));
         let (centre, radius) = self.backdrop_sphere(views);
-        let backdrop = train::init::backdrop(views, self.reader, sh_degree, centre, radius);
-        let backdrop = backdrop.map_err(ExecuteError::work)?;
+        let backdrop = if plan.settings.backdrop {
+            let made = train::init::backdrop(views, self.reader, sh_degree, centre, radius);
+            made.map_err(ExecuteError::work)?
+        } else {
+            Splats::new(sh_degree)
+        };
         let points = &self.capture.points;
         let rows: Vec<usize> = (0..points.len()).filter(|&i| keep(points.positions[i])).collect();
         // A capture may have more points than the budget has splats.
