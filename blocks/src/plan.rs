@@ -80,7 +80,9 @@ pub struct PlanSettings {
     pub antialiased: bool,
     /// Whether the root trains an exposure per view, which all other blocks reuse unchanged.
     pub exposure: bool,
-    /// Memory limit of one task, bytes.
+    /// Whether blocks that start from points have a backdrop: splats on a sphere around the scene, for sky and distance.
+    pub backdrop: bool,
+    /// Memory limit of one task, bytes. Automatic levels are as many as it takes to keep to it, if the capture supports them.
     pub memory_limit_bytes: u64,
     /// Each splat carries the block that trained it, as the attribute [`scene::BLOCK_ATTRIBUTE`].
     pub label_blocks: bool,
@@ -115,6 +117,7 @@ impl Default for PlanSettings {
             sh_degree: 3,
             antialiased: false,
             exposure: false,
+            backdrop: true,
             memory_limit_bytes: 4 << 30,
             label_blocks: false,
             depth_weight: 0.0,

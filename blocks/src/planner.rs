@@ -43,7 +43,8 @@ pub fn plan_at_most(
 }
 
 /// Plans the training of a capture on a backend. Held-out views ([`Split`]) are never trained on. Zones, detector and
-/// detection tasks are for the caller to add. Equal inputs give equal plans.
+/// detection tasks are for the caller to add. Equal inputs give equal plans. Where levels are automatic, there are as many as it takes
+/// for each block to keep to the memory limit, if the capture supports them.
 ///
 /// # Errors
 /// [`PlanError`]: a setting out of range, or a capture that cannot be trained on.
@@ -52,6 +53,26 @@ pub fn plan(
     capture_id: ArtefactId,
     settings: &PlanSettings,
     backend: &str,
+) -> Result<Plan, PlanError> {
+    let mut best = divided(capture, capture_id, settings, backend, settings.levels)?;
+    let is_too_large = |plan: &Plan| plan.tasks.iter().any(|task| task.memory_bytes > settings.memory_limit_bytes);
+    while (settings.mode, settings.levels) == (Mode::Tree, None) && is_too_large(&best) && best.levels < MAX_LEVELS {
+        let deeper = divided(capture, capture_id, settings, backend, Some(best.levels + 1))?;
+        if deeper.levels <= best.levels {
+            break;
+        }
+        best = deeper;
+    }
+    Ok(best)
+}
+
+/// The plan with these levels.
+fn divided(
+    capture: &Capture,
+    capture_id: ArtefactId,
+    settings: &PlanSettings,
+    backend: &str,
+    levels: Option<u8>,
 ) -> Result<Plan, PlanError> {
     check(settings)?;
     let finite = capture.points.positions.iter().filter(|p| p.is_finite()).count();
@@ -83,13 +104,14 @@ pub fn plan(
     }
 
     let layout = Layout { capture, observations: &observations, ground: &ground, split: &split };
-    let levels = match (settings.mode, settings.levels) {
+    let automatic = levels.is_none();
+    let levels = match (settings.mode, levels) {
         (Mode::Whole, _) => 0,
         (_, Some(levels)) => levels,
         (_, None) => layout.choose_levels(finest_metres, settings.budget),
     };
     let (base, mut tasks) = layout.lay_out(settings.mode, levels, finest_metres)?;
-    if settings.mode == Mode::Tree && settings.levels.is_none() {
+    if settings.mode == Mode::Tree && automatic {
         layout.split_crowded(base, finest_metres, &mut tasks);
     }
     let levels = tasks.iter().map(|task| task.block.level).max().unwrap_or(base);

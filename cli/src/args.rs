@@ -29,7 +29,7 @@ pub(crate) use cluster::{
     TaskName, TelemetryArgs, WorkerArgs,
 };
 pub(crate) use model::{EvalArgs, ExportArgs, Format, ImportArgs, PruneArgs, PruneCapture, RenderArgs};
-pub(crate) use plan::{Blocks, DepthKind, PlanOptions, RESIDUAL};
+pub(crate) use plan::{BLOCK_MEMORY_MIB, Blocks, DepthKind, PlanOptions, RESIDUAL};
 pub(crate) use sweep::Named;
 pub(crate) use synth::{Rig, SynthArgs};
 pub(crate) use values::{Auto, Backend, Size};

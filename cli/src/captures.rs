@@ -6,7 +6,7 @@ use std::path::{Component, Path, PathBuf};
 use dataset::depth_maps::DepthMapOptions;
 use dataset::ingest::{IngestOptions, Ingested, downscaled, ingest};
 use dataset::mips::MIN_MIP_SIDE;
-use dataset::open::{OpenOptions, Source};
+use dataset::open::{OpenOptions, Photo, Source};
 use dataset::zones::{CocoFile, LabelMaps, OwnLabels, ZoneSource};
 use eval::{PhotoOptions, Photos, load_identified_detector};
 use model::Model;
@@ -41,7 +41,11 @@ pub(crate) fn open_to_plan(path: &Path, options: &PlanOptions, output: &Output) 
         let advice = "give the weight of the depths' loss, such as --depth-weight 0.1";
         return Err(BadInput::new(name, "has no effect without --depth-weight", advice));
     }
-    let source = open_with(path, &OpenOptions { lidar: !options.no_lidar, depths, ..OpenOptions::default() }, output)?;
+    let open = OpenOptions { lidar: !options.no_lidar, depths, ..OpenOptions::default() };
+    let mut source = open_with(path, &open, output)?;
+    if options.no_masks {
+        source.photos.iter_mut().for_each(Photo::unmask);
+    }
     match given.filter(|_| source.depth_maps() == 0) {
         Some(name) => {
             Err(BadInput::new(name, "is given for depth maps, and the capture has none", "give their --depths"))

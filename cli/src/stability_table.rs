@@ -42,7 +42,10 @@ struct Means {
 pub(crate) fn row(case: &Case, lines: &[Stability]) -> Row {
     let of = |on: bool| -> Vec<&Stability> { lines.iter().filter(|line| line.on == on).collect() };
     let refused = lines.iter().find_map(|line| line.refused.clone());
-    let means = |on: bool| (!of(on).is_empty() && refused.is_none()).then(|| means(&of(on)));
+    let means = |on: bool| {
+        let lines = of(on);
+        (!lines.is_empty() && lines.iter().all(|line| line.refused.is_none())).then(|| means(&lines))
+    };
     let (off, on) = (means(false), means(true));
     let verdict = off.zip(on).map(|(off, on)| verdict(case, &off, &on));
     Row {
@@ -120,7 +123,11 @@ pub(crate) fn table(rows: &[Row]) -> String {
         let all = pair(&|of| of.psnr, &decibels);
         let better = row.verdict.clone().unwrap_or_else(|| "remains".to_owned());
         let capture = if row.capture == GENERATED { String::new() } else { format!(" ({})", row.capture) };
-        let about = if row.refused.is_some() { format!("{}: refused", row.about) } else { row.about.to_owned() };
+        let about = match (&row.refused, &row.on) {
+            (None, _) => row.about.to_owned(),
+            (Some(_), None) => format!("{}: refused", row.about),
+            (Some(_), Some(_)) => format!("{}: refused without", row.about),
+        };
         let cells = [
             format!("{}{capture}", row.case),
             about,

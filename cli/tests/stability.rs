@@ -33,16 +33,22 @@ fn cases_are_run_without_and_with_their_counter_measure() {
         let usual = ["bench", "stability", "--out", "o", "--results", "results", "--seed", "3", "--synth", SYNTH];
         [&usual[..], &["--train", TRAIN, "--detector", "tiny.onnx"], more].concat()
     };
-    let cases = ["--case", "nan-poses,exposure-drift,motion-blur", "--pictures", "p", "--document", "table.md"];
+    let cases =
+        ["--case", "nan-poses,exposure-drift,motion-blur,memory-cap", "--pictures", "p", "--document", "table.md"];
     let said = done(at, &run(&cases));
-    let [poses, exposure, blur] = &said["rows"].as_array().unwrap()[..] else { panic!("{said}") };
+    let [poses, exposure, blur, memory] = &said["rows"].as_array().unwrap()[..] else { panic!("{said}") };
     assert!(poses["refused"].as_str().unwrap().contains("transforms.json") && poses["on"].is_null(), "{poses}");
     assert!(exposure["off"]["fitted_psnr"].is_f64() && exposure["on"]["fitted_psnr"].is_f64(), "{exposure}");
     assert!(exposure["verdict"].is_string() && exposure["on"]["zone_psnr"].is_f64(), "{exposure}");
     assert!(blur["counter"].is_null() && blur["verdict"].is_null() && blur["on"].is_null(), "{blur}");
     assert!(blur["off"]["psnr"].is_f64(), "{blur}");
+    assert!(
+        memory["refused"].as_str().unwrap().contains("the limit is 160 MiB") && memory["off"].is_null(),
+        "{memory}"
+    );
+    assert!(memory["on"]["psnr"].is_f64() && memory["verdict"] == "yes", "{memory}");
     let written = lines(at, "stability.jsonl");
-    assert_eq!((said["lines"].as_array().unwrap().len(), written.len()), (4, 1 + 2 + 1));
+    assert_eq!((said["lines"].as_array().unwrap().len(), written.len()), (6, 1 + 2 + 1 + 2));
     assert!(written.iter().all(|line| line["kind"] == "stability"));
     let options = written[2]["options"][1].as_str().unwrap();
     assert!(options.ends_with("--exposure") && written[2]["on"] == true && written[2]["seed"] == 3, "{options}");
@@ -52,11 +58,15 @@ fn cases_are_run_without_and_with_their_counter_measure() {
 
     // What was measured is not measured again; a capture of one's own is.
     done(at, &run(&cases));
-    assert_eq!(lines(at, "stability.jsonl").len(), 4);
-    let said = done(at, &run(&["--case", "seams", "seams=o/captures/exposure-drift-clean"]));
-    let [row] = &said["rows"].as_array().unwrap()[..] else { panic!("{said}") };
-    assert!(row["capture"] == "exposure-drift-clean" && row["off"]["seam_db"].is_f64(), "{row}");
     assert_eq!(lines(at, "stability.jsonl").len(), 6);
+    let given = ["--train-given", "--steps 20 --budget 600 --threads 1"];
+    let said = done(at, &run(&[&["--case", "seams", "seams=o/captures/exposure-drift-clean"], &given[..]].concat()));
+    let [made, row] = &said["rows"].as_array().unwrap()[..] else { panic!("{said}") };
+    assert!(made["capture"] == "generated" && made["off"]["seam_db"].is_f64(), "{made}");
+    assert!(row["capture"] == "exposure-drift-clean" && row["off"]["seam_db"].is_f64(), "{row}");
+    let written = lines(at, "stability.jsonl");
+    assert_eq!(written.len(), 10);
+    assert!(written[8]["options"][1].as_str().unwrap().starts_with(given[1]), "{}", written[8]);
 
     refused(at, &run(&["--quiet", "--case", "hail"]), "pose-noise");
     refused(at, &run(&["--quiet", "--case", "pose-noise", "pose-noise=o"]), "needs a generated capture");

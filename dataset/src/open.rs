@@ -72,6 +72,12 @@ impl Photo {
         self.boxes.iter().filter(|of| of.moves).map(|of| of.corners).collect()
     }
 
+    /// Uses all of its pixels: forgets its mask, and that labelled objects move.
+    pub fn unmask(&mut self) {
+        self.mask = None;
+        self.boxes.iter_mut().for_each(|of| of.moves = false);
+    }
+
     /// Its file, and its row if it is in a table, for messages.
     pub(crate) fn shown(&self) -> String {
         let file = files::show(&self.path);

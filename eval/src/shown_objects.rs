@@ -83,7 +83,7 @@ mod tests {
         let photo = image::open(photo).unwrap().to_rgb8();
         let (width, height) = photo.dimensions();
         let rgb: Vec<u8> = (0..3).flat_map(|channel| photo.pixels().map(move |pixel| pixel.0[channel])).collect();
-        let photo = Pixels { width, height, rgb, mask: None, weights: None, depth: None };
+        let photo = Pixels { width, height, rgb, ..Pixels::default() };
         let judge = ShownObjects::new(&detector);
         let itself: Vec<f32> = photo.rgb.iter().map(|&byte| f32::from(byte) / 255.0).collect();
         let shown = judge.shown(0, &photo, &itself).unwrap();

@@ -84,7 +84,7 @@ pub struct View {
     pub seconds: Option<f64>,
 }
 
-/// Structure-from-motion points and their tracks.
+/// Structure-from-motion points and their tracks, and points from lidar after them.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct SparsePoints {
     /// World positions, metres.
@@ -96,6 +96,8 @@ pub struct SparsePoints {
     pub track_start: Vec<u32>,
     /// Indices of views, for all tracks.
     pub seen_by: Vec<u32>,
+    /// How many points, the last ones, were measured by lidar. The others were triangulated from photos.
+    pub measured: u32,
 }
 
 impl SparsePoints {
@@ -109,6 +111,11 @@ impl SparsePoints {
         self.positions.is_empty()
     }
 
+    /// The number of points that were triangulated from photos, which come first.
+    pub fn triangulated(&self) -> usize {
+        self.len().saturating_sub(self.measured as usize)
+    }
+
     /// The views in which point `i` was observed; `None` if the capture has no tracks.
     pub fn track(&self, i: usize) -> Option<&[u32]> {
         let (from, to) = (*self.track_start.get(i)?, *self.track_start.get(i + 1)?);
@@ -116,8 +123,10 @@ impl SparsePoints {
     }
 
     /// Appends points. They keep their tracks only if the present points have tracks, or there are none: readers take
-    /// points without a track beside points with one as seen by no view.
+    /// points without a track beside points with one as seen by no view. Points from lidar before triangulated ones count
+    /// as triangulated.
     pub fn append(&mut self, other: Self) {
+        self.measured = if other.triangulated() == 0 { self.measured + other.measured } else { other.measured };
         let is_tracked = (self.is_empty() || !self.track_start.is_empty()) && !other.track_start.is_empty();
         if is_tracked {
             let start = self.seen_by.len() as u32;
@@ -140,6 +149,7 @@ impl SparsePoints {
         for i in (0..self.len()).filter(|&i| keep(i)) {
             kept.positions.push(self.positions[i]);
             kept.colours.push(self.colours[i]);
+            kept.measured += u32::from(i >= self.triangulated());
             if let Some(track) = self.track(i) {
                 kept.seen_by.extend_from_slice(track);
                 kept.track_start.push(kept.seen_by.len() as u32);
@@ -185,9 +195,12 @@ impl Capture {
             }
         }
         objects::check_all(&self.objects)?;
-        let SparsePoints { positions, colours, track_start, seen_by } = &self.points;
+        let SparsePoints { positions, colours, track_start, seen_by, measured } = &self.points;
         if colours.len() != positions.len() || !positions.iter().all(|p| p.is_finite()) {
             return Err(CodecError::new("sparse points are not finite, or their colours do not match their number"));
+        }
+        if *measured as usize > positions.len() {
+            return Err(CodecError::new("more points are from lidar than there are"));
         }
         let tracks = match track_start.as_slice() {
             [] => seen_by.is_empty(),
@@ -224,10 +237,11 @@ pub(crate) mod tests {
             colours: vec![[1, 2, 3]; 2],
             track_start: vec![0, 1, 1],
             seen_by: vec![0],
+            measured: 2,
         };
         let good = Capture { views: vec![view(4, 3)], points, ..Capture::default() };
         assert_eq!([good.check(), Capture::default().check()], [Ok(()), Ok(())]);
-        let changes: [fn(&mut Capture); 12] = [
+        let changes: [fn(&mut Capture); 13] = [
             |c| c.views[0].camera.pinhole.width = 0,
             |c| c.views[0].camera.pinhole.fx = 0.0,
             |c| c.views[0].camera.pinhole.cy = f64::NAN,
@@ -240,12 +254,32 @@ pub(crate) mod tests {
             |c| c.points.track_start = vec![0, 1],
             |c| c.points.track_start.clear(),
             |c| c.points.seen_by[0] = 1,
+            |c| c.points.measured = 3,
         ];
         for (i, change) in changes.into_iter().enumerate() {
             let mut bad = good.clone();
             change(&mut bad);
             assert!(bad.check().is_err(), "change {i}");
         }
+    }
+
+    #[test]
+    fn points_from_lidar_stay_the_last() {
+        let points = |count: usize, measured| SparsePoints {
+            positions: vec![DVec3::ZERO; count],
+            colours: vec![[0; 3]; count],
+            measured,
+            ..SparsePoints::default()
+        };
+        let mut all = points(3, 0);
+        all.append(points(2, 2));
+        all.append(points(1, 1));
+        assert_eq!((all.len(), all.triangulated()), (6, 3));
+        let kept = all.filter(|i| i % 2 == 1);
+        assert_eq!((kept.len(), kept.triangulated()), (3, 1));
+        all.append(points(4, 0));
+        assert_eq!(all.triangulated(), 10);
+        assert_eq!(points(2, 5).triangulated(), 0);
     }
 
     #[test]

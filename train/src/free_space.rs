@@ -215,6 +215,7 @@ mod tests {
             track_start: (0..=positions.len() as u32).map(|i| 2 * i).collect(),
             seen_by: [0, 1].repeat(positions.len()),
             positions,
+            measured: 0,
         };
         // A point behind the cameras, so that the grid reaches there.
         let mut capture = Capture { views: vec![view(0), view(1)], points, ..Capture::default() };

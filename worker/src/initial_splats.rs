@@ -59,25 +59,28 @@ impl Block<'_> {
         Ok(InitialSplats { trained, context })
     }
 
-    /// Splats at the capture's sparse points, and a backdrop around them.
+    /// Splats at the capture's points, and a backdrop around them if the plan has one.
     fn splats_from_points(&self, views: &[TrainView], recipe: &Recipe) -> Result<Splats, ExecuteError> {
         let (plan, task) = (self.plan, self.task);
         let sh_degree = plan.settings.sh_degree;
         let all = plan.settings.mode != Mode::Flat;
         let keep = |p: glam::DVec3| all || views.iter().any(|view| projects_into(view, p));
         let (centre, radius) = self.backdrop_sphere(views);
-        let backdrop = train::init::backdrop(views, self.reader, sh_degree, centre, radius);
-        let backdrop = backdrop.map_err(ExecuteError::work)?;
+        let backdrop = if plan.settings.backdrop {
+            let made = train::init::backdrop(views, self.reader, sh_degree, centre, radius);
+            made.map_err(ExecuteError::work)?
+        } else {
+            Splats::new(sh_degree)
+        };
         let points = &self.capture.points;
         let rows: Vec<usize> = (0..points.len()).filter(|&i| keep(points.positions[i])).collect();
-        let places: Vec<glam::DVec3> = rows.iter().map(|&i| points.positions[i]).collect();
         // A capture may have more points than the budget has splats.
         let budget = blocks::initial_splats(plan, task) as usize;
         let max = budget.saturating_sub(backdrop.len()).max(budget / 2).max(1);
-        let chosen = train::init::subsample(&places, max);
+        let chosen = chosen(points, &rows, max);
         let points = SparsePoints {
-            positions: chosen.iter().map(|&i| places[i]).collect(),
-            colours: chosen.iter().map(|&i| points.colours[rows[i]]).collect(),
+            positions: chosen.iter().map(|&i| points.positions[i]).collect(),
+            colours: chosen.iter().map(|&i| points.colours[i]).collect(),
             ..SparsePoints::default()
         };
         let sizes = self.size_bounds_metres(views);
@@ -85,6 +88,18 @@ impl Block<'_> {
         splats.append(&backdrop);
         Ok(splats)
     }
+}
+
+/// At most `max` of the points `rows`. Triangulated ones lie where photos have detail, so those of lidar get the splats that they leave.
+fn chosen(points: &SparsePoints, rows: &[usize], max: usize) -> Vec<usize> {
+    let (triangulated, measured) = rows.split_at(rows.partition_point(|&i| i < points.triangulated()));
+    let thinned = |rows: &[usize], max: usize| -> Vec<usize> {
+        let places: Vec<glam::DVec3> = rows.iter().map(|&i| points.positions[i]).collect();
+        train::init::subsample(&places, max).into_iter().map(|k| rows[k]).collect()
+    };
+    let mut chosen = thinned(triangulated, max);
+    chosen.extend(thinned(measured, max - chosen.len()));
+    chosen
 }
 
 /// Whether a point projects into the window.

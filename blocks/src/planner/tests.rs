@@ -137,6 +137,26 @@ fn automatic_levels_divide_only_what_no_block_can_hold() {
 }
 
 #[test]
+fn automatic_levels_keep_blocks_within_the_memory_limit() {
+    let capture = aerial(12, 300.0, 20_000);
+    let with = |memory_limit_bytes: u64, levels: Option<u8>| {
+        let settings = PlanSettings { budget: 300_000, memory_limit_bytes, ..settings(Mode::Tree, levels) };
+        plan(&capture, ArtefactId::of(b"capture"), &settings, "cpu").unwrap()
+    };
+    let largest = |plan: &Plan| plan.tasks.iter().map(|task| task.memory_bytes).max().unwrap();
+    let is_refused = |plan: &Plan| lint(plan, &capture).iter().any(|finding| finding.message.contains("the limit is"));
+    let one = with(4 << 30, None);
+    assert_eq!((one.levels, is_refused(&one)), (0, false));
+    let limit = largest(&one) * 2 / 3;
+    let fits = with(limit, None);
+    assert!(fits.levels > 0 && largest(&fits) <= limit && !is_refused(&fits), "{} of {limit}", largest(&fits));
+    assert_eq!(fits.settings.levels, None);
+    // Levels that were asked for are kept, and a limit that no division keeps to ends the search; both are refused.
+    let asked = with(limit, Some(0));
+    assert!(asked.levels == 0 && is_refused(&asked) && is_refused(&with(1 << 20, None)));
+}
+
+#[test]
 fn splats_that_the_steps_cannot_train_are_left_out() {
     let capture = aerial(12, 300.0, 20_000);
     let with = |steps: u32, levels: Option<u8>| {

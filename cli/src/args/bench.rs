@@ -83,7 +83,7 @@ pub(crate) struct StabilityArgs {
     /// Cases to run; all by default
     #[arg(long = "case", value_name = "CASE,...", value_parser = stability_cases::named, value_delimiter = ',', default_values_t = CASES)]
     pub(crate) cases: Vec<Case>,
-    /// Captures to use instead of generated ones, each with the case that it is for
+    /// Captures to use beside generated ones, each with the case that it is for
     #[arg(value_name = "CASE=PATH", value_parser = |text: &str| Ok::<_, String>(Named::from(PathBuf::from(text))))]
     pub(crate) captures: Vec<Named>,
     /// Folder for captures and models; captures that are there are used again
@@ -105,6 +105,14 @@ pub(crate) struct StabilityArgs {
         default_value = "--steps 2000 --budget 20000 --levels 1 --threads 1"
     )]
     pub(crate) train: String,
+    /// Options of plat train for captures that are given, instead of --train; those of a case replace them
+    #[arg(
+        long,
+        value_name = "OPTIONS",
+        allow_hyphen_values = true,
+        default_value = "--steps 1500 --budget 8000 --blocks whole --downscale 4 --threads 1"
+    )]
+    pub(crate) train_given: String,
     /// Seeds of the trainings
     #[arg(long = "seed", value_name = "S,...", value_delimiter = ',', default_value = "0,1,2")]
     pub(crate) seeds: Vec<u64>,

@@ -5,9 +5,7 @@ use std::path::PathBuf;
 use clap::{Args, ValueEnum};
 use eval::Levels;
 
-use super::values::{
-    Backend, ObjectMove, Size, clock_seconds, decibels, levels, metres, share, share_from_zero,
-};
+use super::values::{Backend, ObjectMove, Size, clock_seconds, decibels, levels, metres, share, share_from_zero};
 use super::zones::ZoneOptions;
 
 #[derive(Debug, Clone, Default, Args)]

@@ -34,6 +34,8 @@ pub(crate) enum DepthKind {
     Inverse,
 }
 
+/// Default of `--block-memory`, MiB.
+pub(crate) const BLOCK_MEMORY_MIB: u64 = 4096;
 /// Default of `--residual`.
 pub(crate) const RESIDUAL: f64 = 0.4;
 
@@ -44,7 +46,7 @@ pub(crate) struct PlanOptions {
     /// How the scene is divided
     #[arg(long, value_enum, default_value = "tree")]
     pub(crate) blocks: Blocks,
-    /// Levels below the root; auto divides only what no block can hold, as deep as extent, resolution, views and points allow
+    /// Levels below the root; auto divides only what no block can hold (see --block-memory), as deep as extent, resolution, views and points allow
     #[arg(long, value_name = "N|auto", default_value_t)]
     pub(crate) levels: Auto<u8>,
     /// Optimiser steps, counted in full images of the whole scene, so that every division costs about the same; auto takes 60
@@ -99,6 +101,16 @@ pub(crate) struct PlanOptions {
     /// Leave out the capture's lidar: its sweeps give neither target depths nor initial points
     #[arg(long)]
     pub(crate) no_lidar: bool,
+    /// Use the pixels that the capture's mask files exclude, and those of labelled objects that move, as all others
+    #[arg(long)]
+    pub(crate) no_masks: bool,
+    /// Start without the sphere of splats around the scene that stands for the sky and everything far away. For captures that show
+    /// neither
+    #[arg(long)]
+    pub(crate) no_backdrop: bool,
+    /// Most memory of a block, as estimated. --levels auto divides the scene until no block needs more; what still does is refused
+    #[arg(long, value_name = "MIB", default_value_t = BLOCK_MEMORY_MIB, value_parser = clap::value_parser!(u64).range(16..=1 << 24))]
+    pub(crate) block_memory: u64,
     /// Folder of depth maps, named like the photos: NAME.npy (floats) or NAME.png (16-bit grey), 0 for no depth. By default those
     /// that transforms.json names, or the capture's folder `depths`. Used with --depth-weight
     #[arg(long, value_name = "DIR", conflicts_with = "no_depths")]
@@ -158,6 +170,8 @@ impl PlanOptions {
             objects: self.objects,
             label_blocks: self.label_blocks,
             depth_weight: self.depth_weight,
+            backdrop: !self.no_backdrop,
+            memory_limit_bytes: self.block_memory << 20,
             evaluate: self.evaluate,
             test_stretches: self.test_stretches,
             ..PlanSettings::default()

@@ -11,7 +11,7 @@ use store::Store;
 use worker::one_block::{Evaluation, OneBlockTraining};
 
 use crate::ablation_variants::{DEFAULT, Variant};
-use crate::args::{AblateArgs, Auto, Blocks, DepthKind, PlanOptions, RESIDUAL};
+use crate::args::{AblateArgs, Auto, BLOCK_MEMORY_MIB, Blocks, DepthKind, PlanOptions, RESIDUAL};
 use crate::backend;
 use crate::captures::{self, ingest_photos};
 use crate::commands::train::CACHE_BYTES;
@@ -140,6 +140,9 @@ fn plan_options(args: &AblateArgs, seed: u64) -> PlanOptions {
         label_blocks: false,
         depth_weight: 0.0,
         no_lidar: true,
+        no_masks: false,
+        no_backdrop: false,
+        block_memory: BLOCK_MEMORY_MIB,
         depths: None,
         depth_kind: DepthKind::Metric,
         depth_unit: None,

@@ -13,7 +13,9 @@ use scene::Capture;
 use serde::Serialize;
 use store::Store;
 
-use crate::args::{AlignedOptions, Auto, Backend, Blocks, DemoArgs, DepthKind, PlanOptions, TrainArgs, ZoneOptions};
+use crate::args::{
+    AlignedOptions, Auto, BLOCK_MEMORY_MIB, Backend, Blocks, DemoArgs, DepthKind, PlanOptions, TrainArgs, ZoneOptions,
+};
 use crate::commands::eval::{Further, measure_trained};
 use crate::commands::train::{Report, train};
 use crate::dashboard::Dashboard;
@@ -144,6 +146,9 @@ pub(crate) fn settings(args: &DemoArgs) -> (Settings, TrainArgs) {
             label_blocks: false,
             depth_weight: 0.0,
             no_lidar: true,
+            no_masks: false,
+            no_backdrop: false,
+            block_memory: BLOCK_MEMORY_MIB,
             depths: None,
             depth_kind: DepthKind::Metric,
             depth_unit: None,

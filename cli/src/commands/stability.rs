@@ -43,10 +43,11 @@ struct Matrix<'a> {
 struct Stage<'a> {
     case: &'a Case,
     capture_name: String,
-    /// Captures to train on without and with the counter-measure.
-    trained_on: [PathBuf; 2],
+    trained_on: PathBuf,
     measured_on: PathBuf,
+    /// Options of `plat synth` and `plat train` without those of the counter-measure.
     synth: String,
+    train: &'a str,
 }
 
 pub(crate) fn run(args: &StabilityArgs, output: &Output) -> Result<(), Failure> {
@@ -67,15 +68,14 @@ pub(crate) fn run(args: &StabilityArgs, output: &Output) -> Result<(), Failure> 
     }
     let mut lines: Vec<Stability> = Vec::new();
     let mut rows = Vec::new();
-    for case in &args.cases {
-        let of_case = lines.len();
-        let stage = stage(case, args, output)?;
+    for stage in stages(args, output)? {
+        let (case, of_case) = (stage.case, lines.len());
         for &seed in &args.seeds {
             for on in [false, true] {
                 if on && case.counter.name().is_none() || !on && case.counter == Counter::Refusal {
                     continue;
                 }
-                let line = Stability { seed, ..blank_line(&stage, on, args) };
+                let line = Stability { seed, ..blank_line(&stage, on) };
                 let line = match existing.iter().rfind(|of| is_same_run(of, &line)) {
                     Some(known) => known.clone(),
                     None => {
@@ -104,23 +104,31 @@ pub(crate) fn run(args: &StabilityArgs, output: &Output) -> Result<(), Failure> 
     output.result(&matrix, &format!("{table}\nlines in {}", file.display()))
 }
 
-/// Makes the captures of a case, unless they are there.
-fn stage<'a>(case: &'a Case, args: &StabilityArgs, output: &Output) -> Result<Stage<'a>, Failure> {
-    if let Some(of) = args.captures.iter().find(|of| of.name.as_deref() == Some(case.name)) {
-        let made = |what: &str| BadInput::new(case.name, format!("needs {what}"), "leave its capture out");
-        if case.photos == MeasuredOn::Clean || !matches!(case.counter, Counter::Options(_)) {
-            return Err(made("a generated capture: it is measured without its fault").into());
+/// The cases in order, each on its generated capture and on those that are given for it.
+fn stages<'a>(args: &'a StabilityArgs, output: &Output) -> Result<Vec<Stage<'a>>, Failure> {
+    let mut stages = Vec::new();
+    for case in &args.cases {
+        stages.push(generated(case, args, output)?);
+        for of in args.captures.iter().filter(|of| of.name.as_deref() == Some(case.name)) {
+            if !case.takes_captures() {
+                let problem = "needs a generated capture: it is measured without its fault";
+                return Err(BadInput::new(case.name, problem, "leave its capture out").into());
+            }
+            stages.push(Stage {
+                case,
+                capture_name: captures::name_of(&of.path),
+                trained_on: of.path.clone(),
+                measured_on: of.path.clone(),
+                synth: String::new(),
+                train: &args.train_given,
+            });
         }
-        let path = of.path.clone();
-        let capture_name = captures::name_of(&path);
-        return Ok(Stage {
-            case,
-            capture_name,
-            trained_on: [path.clone(), path.clone()],
-            measured_on: path,
-            synth: String::new(),
-        });
     }
+    Ok(stages)
+}
+
+/// Makes the captures of a case, unless they are there.
+fn generated<'a>(case: &'a Case, args: &'a StabilityArgs, output: &Output) -> Result<Stage<'a>, Failure> {
     let folder = |kind: &str| args.out.join("captures").join(format!("{}-{kind}", case.name));
     let make = |to: &Path, options: &str| -> Result<(), Failure> {
         if !is_complete(to) {
@@ -131,20 +139,15 @@ fn stage<'a>(case: &'a Case, args: &StabilityArgs, output: &Output) -> Result<St
     let synth = format!("{} {}", args.synth, case.synth);
     let own = folder("own");
     make(&own, &synth)?;
-    let needs_clean = case.photos == MeasuredOn::Clean || matches!(case.counter, Counter::Capture(_));
-    let clean = if needs_clean {
-        let clean = folder("clean");
-        make(&clean, &without_faults(&synth))?;
-        clean
-    } else {
-        own.clone()
-    };
+    let mut measured_on = own.clone();
+    if case.photos == MeasuredOn::Clean {
+        measured_on = folder("clean");
+        make(&measured_on, &without_faults(&synth))?;
+    }
     if case.counter == Counter::Refusal {
         spoil(&own)?;
     }
-    let better = if matches!(case.counter, Counter::Capture(_)) { clean.clone() } else { own.clone() };
-    let measured_on = if case.photos == MeasuredOn::Clean { clean } else { own.clone() };
-    Ok(Stage { case, capture_name: GENERATED.to_owned(), trained_on: [own, better], measured_on, synth })
+    Ok(Stage { case, capture_name: GENERATED.to_owned(), trained_on: own, measured_on, synth, train: &args.train })
 }
 
 /// Whether all of a generated capture is there.
@@ -190,9 +193,14 @@ fn model_folder(stage: &Stage, on: bool, seed: u64, args: &StabilityArgs) -> Pat
 /// Trains and measures a model.
 fn measured(stage: &Stage, line: Stability, args: &StabilityArgs, output: &Output) -> Result<Stability, Failure> {
     let out = model_folder(stage, line.on, line.seed, args);
-    let capture = &stage.trained_on[usize::from(line.on)];
+    let capture = &stage.trained_on;
+    let may_refuse = match stage.case.counter {
+        Counter::Refusal => true,
+        Counter::Enables(_) => !line.on,
+        Counter::Missing | Counter::Options(_) => false,
+    };
     let trained = match train::train(&train_args(capture, &out, line.seed, &line.options[1])?, output) {
-        Err(Failure::Input(refused)) if stage.case.counter == Counter::Refusal => {
+        Err(Failure::Input(refused)) if may_refuse => {
             // The line is kept, and the folder is this machine's.
             let folder = capture.canonicalize().unwrap_or_else(|_| capture.clone());
             let refused = refused.replace(&format!("{}/", folder.display()), "");
@@ -245,13 +253,8 @@ fn draw(stage: &Stage, seed: u64, args: &StabilityArgs, output: &Output) -> Resu
     Ok(write_png(&path, &side_by_side(&photos, &models.iter().collect::<Vec<_>>(), ROWS)?)?)
 }
 
-fn blank_line(stage: &Stage, on: bool, args: &StabilityArgs) -> Stability {
-    let train = format!("{} {}", args.train, stage.case.train[usize::from(on)]);
-    let synth = if on && matches!(stage.case.counter, Counter::Capture(_)) {
-        without_faults(&stage.synth)
-    } else {
-        stage.synth.clone()
-    };
+fn blank_line(stage: &Stage, on: bool) -> Stability {
+    let train = format!("{} {}", stage.train, stage.case.train[usize::from(on)]);
     Stability {
         commit: commit().to_owned(),
         machine: ::bench::machine(),
@@ -260,7 +263,7 @@ fn blank_line(stage: &Stage, on: bool, args: &StabilityArgs) -> Stability {
         on,
         counter: stage.case.counter.name().map(str::to_owned),
         seed: 0,
-        options: [synth, train].map(|options| options.trim().to_owned()),
+        options: [stage.synth.trim(), train.trim()].map(str::to_owned),
         refused: None,
         psnr: None,
         street_psnr: None,

@@ -102,6 +102,7 @@ pub(crate) fn seeds(sweeps: &[Sweep], cameras: &[Camera], sparse_points: usize) 
         seeds.points.seen_by.extend_from_slice(track);
         seeds.points.track_start.push(seeds.points.seen_by.len() as u32);
     }
+    seeds.points.measured = seeds.points.len() as u32;
     Ok(seeds)
 }
 

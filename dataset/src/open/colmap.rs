@@ -57,7 +57,7 @@ pub(super) fn read(root: &CaptureRoot, folder: &str, options: &OpenOptions) -> R
         return Err(BadInput::new(format!("{root}: {folder}"), "has no images", "give a model with registered images"));
     }
     let ColmapPoints { positions, colours, track_start, track_images, .. } = points;
-    let points = RawPoints(SparsePoints { positions, colours, track_start, seen_by: track_images });
+    let points = RawPoints(SparsePoints { positions, colours, track_start, seen_by: track_images, measured: 0 });
     Ok(ParsedCapture::new("colmap", images, points))
 }
 

@@ -158,6 +158,7 @@ fn windows_carry_the_depths_of_the_points_that_their_view_observed() {
         colours: vec![[0; 3]; 4],
         track_start: vec![0, 2, 4, 5, 6],
         seen_by: vec![0, 1, 1, 0, 1, 0],
+        measured: 0,
     };
     let capture = Capture { views: vec![view(0.0), view(0.5)], points, ..Capture::default() };
     capture.check().unwrap();
