@@ -165,7 +165,9 @@ mod tests {
         let pinhole = Pinhole { width: 4, height: 4, fx: 4.0, fy: 4.0, cx: 2.0, cy: 2.0 };
         let camera =
             Camera { pinhole, camera_from_world: Rigid { rotation: DQuat::IDENTITY, translation: DVec3::ZERO } };
-        (0..count).map(|view| TrainView { view, mip: 0, rect: camera.full(), camera }).collect()
+        (0..count)
+            .map(|view| TrainView { view, mip: 0, rect: camera.full(), camera, camera_from_context: None })
+            .collect()
     }
 
     #[test]
