@@ -1,19 +1,13 @@
 //! Objects that move, placed where they are at a time.
 
 use model::ModelObject;
-use scene::{MovingObject, Rigid};
+use scene::MovingObject;
 
 use crate::EvalError;
-use crate::renderer::{Renderer, Uploaded};
+use crate::renderer::{Placed, Renderer, Uploaded};
 
 /// Objects where their renderer reads them.
 pub struct Composition<'a>(Vec<(&'a MovingObject, Uploaded<'a>)>);
-
-/// An object at a time.
-pub struct Placed<'a> {
-    pub(crate) splats: &'a Uploaded<'a>,
-    pub(crate) world_from_object: Rigid,
-}
 
 impl<'a> Composition<'a> {
     /// Prepares objects for any number of views.

@@ -3,13 +3,10 @@
 #[cfg(feature = "gpu")]
 use render::gpu::GpuSplats;
 use render::{Frame, Options, Part, cpu};
-#[cfg(feature = "gpu")]
-use scene::Rigid;
-use scene::{Camera, Splats};
+use scene::{Camera, Rigid, Splats};
 use train::Backend;
 
 use crate::EvalError;
-use crate::composition::Placed;
 
 /// What a caller of [`Renderer`] did wrong.
 #[cfg(feature = "gpu")]
@@ -26,6 +23,12 @@ enum Inner {
 
 /// Splats where their renderer reads them: in place on the CPU, a copy in device memory on a GPU.
 pub struct Uploaded<'a>(Place<'a>);
+
+/// An object at a time: its splats, and where it is.
+pub struct Placed<'a> {
+    pub(crate) splats: &'a Uploaded<'a>,
+    pub(crate) world_from_object: Rigid,
+}
 
 enum Place<'a> {
     Cpu(&'a Splats),
