@@ -72,7 +72,7 @@ mod tests {
 
     #[test]
     fn a_photo_shows_its_objects_and_grey_shows_none() {
-        const PHOTO: &str = "images_street/kitti_object/image_2/000001.png";
+        const PHOTO: &str = "images_street/kitti_object/image_2/000000.png";
         let data = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/data");
         let (detector, photo) = (data.join("detectors/yolox_nano_416.onnx"), data.join(PHOTO));
         if !detector.is_file() || !photo.is_file() {
