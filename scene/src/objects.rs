@@ -18,8 +18,6 @@ use crate::error::CodecError;
 
 /// An object keeps its first and its last pose for this long before and after, seconds. nuScenes annotates every half second.
 const ALONE_SECONDS: f64 = 0.3;
-/// Between poses that are farther apart in time the object's place is unknown, seconds.
-const GAP_SECONDS: f64 = 1.6;
 /// An object that moves faster between two poses jumps, metres per second: 540 km/h.
 const MAX_SPEED: f64 = 150.0;
 /// Positions of a box that was annotated by hand or by a tracker jitter, metres.
@@ -56,14 +54,14 @@ pub struct MovingObject {
 }
 
 impl MovingObject {
-    /// Where it is at a time: straight and by slerp between two poses, and for a third of a second at its first and last; `None`
-    /// where that is unknown.
+    /// Where it is at a time: straight and by slerp between two poses, and for a third of a second before its first and after its
+    /// last; `None` where that is unknown.
     pub fn pose(&self, seconds: f64) -> Option<Rigid> {
         let after = self.path.partition_point(|pose| pose.seconds < seconds);
         let near =
             |pose: &PathPose| ((pose.seconds - seconds).abs() <= ALONE_SECONDS).then_some(pose.world_from_object);
         match (after.checked_sub(1).and_then(|i| self.path.get(i)), self.path.get(after)) {
-            (Some(a), Some(b)) if b.seconds - a.seconds <= GAP_SECONDS => {
+            (Some(a), Some(b)) => {
                 let share = (seconds - a.seconds) / (b.seconds - a.seconds).max(f64::MIN_POSITIVE);
                 let (from, to) = (a.world_from_object, b.world_from_object);
                 let rotation = from.rotation.slerp(to.rotation, share).normalize();
@@ -233,12 +231,12 @@ mod tests {
     }
 
     #[test]
-    fn a_path_is_followed_between_its_poses_and_unknown_in_its_gaps() {
+    fn a_path_is_followed_between_its_poses_and_ends_with_them() {
         let car = car();
         let x = |seconds: f64| car.pose(seconds).map(|pose| pose.translation.x);
         assert_eq!([x(1.0), x(1.25), x(2.0), x(5.25)], [Some(0.0), Some(2.5), Some(10.0), Some(30.5)]);
-        assert_eq!([x(0.8), x(2.2), x(4.8), x(5.7)], [Some(0.0), Some(10.0), Some(30.0), Some(31.0)]);
-        assert_eq!([x(0.5), x(3.5), x(6.0), x(f64::NAN)], [None; 4]);
+        assert_eq!([x(0.8), x(3.5), x(5.7)], [Some(0.0), Some(20.0), Some(31.0)]);
+        assert_eq!([x(0.5), x(6.0), x(f64::NAN)], [None; 3]);
         let turned = car.pose(1.5).unwrap().rotation * DVec3::X;
         assert!((turned.y.atan2(turned.x) - 0.1).abs() < 1e-9);
     }

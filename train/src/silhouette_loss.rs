@@ -7,8 +7,8 @@
 
 use render::{Frame, Upstream};
 
-/// Opacities nearer to 0 or 1 than this have no steeper gradient. A splat is not drawn under 1/255.
-const CLAMP: f32 = 0.01;
+/// Nearer to the wrong opacity than this the loss goes on straight, so that its slope is bounded. A splat is not drawn under 1/255.
+const STRAIGHT: f32 = 0.01;
 
 /// Returns `factor` times the mean loss over the pixels whose silhouette is known (`shown`, one plane: 255 = there, 0 = not, 128 =
 /// unknown), weighted by `weights` where they are 0 only (one plane, or empty for all ones), and writes its gradient to the plane
@@ -38,8 +38,9 @@ pub(crate) fn silhouette_loss(
         let is_there = shown[i] > 128;
         let opacity = frame.trainable_alpha[i];
         let right = if is_there { opacity } else { 1.0 - opacity };
-        loss -= f64::from(right.max(CLAMP).ln());
-        let slope = scale / right.max(CLAMP);
+        let bounded = right.max(STRAIGHT);
+        loss -= f64::from(bounded.ln() + (right - bounded) / bounded);
+        let slope = scale / bounded;
         plane[i] = if is_there { -slope } else { slope };
     }
     f64::from(factor) * loss / count as f64

@@ -81,23 +81,30 @@ impl Tracks {
         (!self.tracks.is_empty()).then_some(since as f64 * 1e-6)
     }
 
-    /// The objects that move, by name. A box that turns or grows between two annotations is drawn at its largest.
+    /// The objects that move, by name, each as large as its largest box. One whose place is unknown for a while is another one
+    /// afterwards.
     pub(super) fn objects(&self) -> Vec<MovingObject> {
-        let object = |track: &Track| {
+        let part = |track: &Track, number: usize, boxes: &[Placed]| {
             let half = 0.5 * track.boxes.iter().fold(DVec3::ZERO, |size, found| size.max(found.size));
             let mut path: Vec<PathPose> = Vec::new();
-            for found in &track.boxes {
+            for found in boxes {
                 let seconds = self.seconds(found.microseconds).unwrap_or(0.0);
                 if path.last().is_none_or(|last| seconds > last.seconds) {
                     path.push(PathPose { seconds, world_from_object: found.world_from_box });
                 }
             }
-            MovingObject { id: track.name.clone(), class: track.class.clone(), low: -half, high: half, path }
+            let id = if number == 0 { track.name.clone() } else { format!("{}-{}", track.name, number + 1) };
+            MovingObject { id, class: track.class.clone(), low: -half, high: half, path }
+        };
+        let object = |track: &Track| {
+            let known = |a: &Placed, b: &Placed| b.microseconds.abs_diff(a.microseconds) <= GAP_MICROSECONDS;
+            let parts = track.boxes.chunk_by(known).enumerate();
+            parts.map(|(number, boxes)| part(track, number, boxes)).collect::<Vec<_>>()
         };
         // Annotations of one that jumps are wrong; its pixels are left out all the same.
         let sane = |of: &MovingObject| of.check().is_ok();
         let mut objects: Vec<MovingObject> =
-            self.tracks.iter().filter(|of| of.moves).map(object).filter(sane).collect();
+            self.tracks.iter().filter(|of| of.moves).flat_map(object).filter(sane).collect();
         objects.sort_by(|a, b| a.id.cmp(&b.id));
         objects
     }

@@ -86,6 +86,8 @@ pub(crate) fn swelling() -> Vec<Seed> {
     let matrix = format!(r#"[{{"token": "", "sensor_token": "", "camera_intrinsic": [{}]"#, "[0,0,0],".repeat(200_000));
     corpus.plain("a matrix of many rows", matrix, &nuscenes_codecs()[5]);
     let text = "1 ".repeat(1_000_000);
+    let text = format!(r#"{{"tracks": [{{"class": "", "poses": [{}]"#, "[0,[0,0,0],[0,0,0,0]],".repeat(100_000));
+    corpus.plain("poses without end in tracks.json", text, &tracks_codec());
     corpus.plain("a long line of oxts", text.as_str(), &kitti_raw_codecs()[2]);
     let text = format!("P_rect_00: {text}");
     corpus.plain("a long line in calib_cam_to_cam.txt", text.as_str(), &kitti_raw_codecs()[0]);
@@ -225,6 +227,7 @@ impl Corpus {
         let file = Transforms { frames: frames.take(6).collect(), ply_file_path: None };
         self.plain("transforms.json", transforms::write(&file), &transforms_codec());
         self.plain("reconstruction.json", RECONSTRUCTION, &opensfm_codec());
+        self.plain("tracks.json", TRACKS, &tracks_codec());
         let [perspective, cam_to_pose, cam_to_velo, poses, scan] = kitti_codecs();
         self.plain("perspective.txt", PERSPECTIVE, &perspective);
         self.plain("calib_cam_to_pose.txt", CAM_TO_POSE, &cam_to_pose);
@@ -379,6 +382,12 @@ fn plain_glb() -> Vec<u8> {
 pub(crate) const CLOUD: &str = "ply\nformat ascii 1.0\ncomment a cloud\nelement vertex 3\nproperty float x\nproperty double y\n\
     property float z\nproperty uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n\
     0 0 -3 1 2 3\n1 0.5 -3 4 5 6\n-1 1e-3 -4 7 8 9\n";
+/// Two objects that move and the times of photos.
+const TRACKS: &str = r#"{"tracks": [{"id": "van", "class": "car", "low": [-2, -1, 0], "high": [2, 1, 1.5],
+    "poses": [[0, [1, 2, 3], [0, 0, 0, 1]], [0.5, [2, 2, 3], [0, 0, 0.1, 0.995]], [3, [4, 2, 3], [0, 0, 0.2, 0.98]]]},
+    {"instance": 7, "class": "person", "low": [0, 0, 0], "high": [1, 1, 2], "poses": [[1.5, [0, 0, 0], [1, 0, 0, 0]]]}],
+    "seconds": {"a.png": 0.25, "b/c.jpg": 1.5}}"#;
+
 const RECONSTRUCTION: &str = r#"[{"cameras": {
     "v2 a": {"projection_type": "perspective", "width": 4000, "height": 3000, "focal": 0.85, "k1": -0.1, "k2": 0.01},
     "v2 b": {"projection_type": "brown", "width": 3000, "height": 4000, "focal_x": 0.8, "focal_y": 0.81, "c_x": 0.01,

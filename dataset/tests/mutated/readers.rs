@@ -16,7 +16,9 @@ use scene::frame::{self, Kind};
 use scene::parquet::Table;
 use scene::transforms::{Frame, Intrinsics, Transforms};
 use scene::{CameraModel, Capture, CodecError, Exposures, Rect, Rigid};
-use scene::{colmap, kitti_raw, kitti360, npy, nuscenes, opensfm, ply, rad, sog, splat_glb, spz, transforms, waymo};
+use scene::{
+    colmap, kitti_raw, kitti360, npy, nuscenes, objects, opensfm, ply, rad, sog, splat_glb, spz, transforms, waymo,
+};
 use store::Store;
 
 use crate::corpus::{CLOUD, PHOTO_SIZE, encoded};
@@ -95,6 +97,14 @@ pub(crate) fn transforms_codec() -> Read {
             frame.camera_from_world.is_sane() && width > 0 && height > 0
         };
         file.frames.iter().all(sane) && transforms::read(&transforms::write(&file)).is_ok()
+    })
+}
+
+pub(crate) fn tracks_codec() -> Read {
+    codec("tracks", objects::read, |tracks| {
+        let at =
+            |seconds: f64| tracks.objects.iter().filter_map(|object| object.pose(seconds)).all(|pose| pose.is_sane());
+        [-1e300, 0.25, 1.5, f64::INFINITY].into_iter().all(at) && objects::read(&objects::write(&tracks)).is_ok()
     })
 }
 
