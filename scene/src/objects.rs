@@ -269,7 +269,8 @@ mod tests {
 
     #[test]
     fn wrong_objects_are_refused_by_name() {
-        let changes: [(fn(&mut MovingObject), &str); 12] = [
+        type Change = (fn(&mut MovingObject), &'static str);
+        let changes: [Change; 12] = [
             (|o| o.id = "../x".into(), "name"),
             (|o| o.id.clear(), "name"),
             (|o| o.class.clear(), "class"),

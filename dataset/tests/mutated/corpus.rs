@@ -86,8 +86,8 @@ pub(crate) fn swelling() -> Vec<Seed> {
     let matrix = format!(r#"[{{"token": "", "sensor_token": "", "camera_intrinsic": [{}]"#, "[0,0,0],".repeat(200_000));
     corpus.plain("a matrix of many rows", matrix, &nuscenes_codecs()[5]);
     let text = "1 ".repeat(1_000_000);
-    let text = format!(r#"{{"tracks": [{{"class": "", "poses": [{}]"#, "[0,[0,0,0],[0,0,0,0]],".repeat(100_000));
-    corpus.plain("poses without end in tracks.json", text, &tracks_codec());
+    let poses = format!(r#"{{"tracks": [{{"class": "", "poses": [{}]"#, "[0,[0,0,0],[0,0,0,0]],".repeat(100_000));
+    corpus.plain("poses without end in tracks.json", poses, &tracks_codec());
     corpus.plain("a long line of oxts", text.as_str(), &kitti_raw_codecs()[2]);
     let text = format!("P_rect_00: {text}");
     corpus.plain("a long line in calib_cam_to_cam.txt", text.as_str(), &kitti_raw_codecs()[0]);
