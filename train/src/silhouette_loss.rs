@@ -51,7 +51,7 @@ mod tests {
     use glam::{DQuat, DVec3, Vec3};
     use render::cpu::Renderer;
     use render::{Options, Part};
-    use scene::{Camera, Pinhole, Rigid, Splat, Splats, column};
+    use scene::{Camera, Pinhole, Rigid, Splat, Splats};
 
     use super::*;
     use crate::random::uniform;
@@ -76,36 +76,32 @@ mod tests {
     }
 
     #[test]
-    fn gradient_through_the_renderer_agrees_with_finite_differences() {
-        // Frozen splats partly before the trained ones, in axes of their own.
+    fn gradient_agrees_with_finite_differences() {
+        // Frozen splats partly before the trained ones, in axes of their own. From the opacity on the renderer's own tests go on.
         let (own, other) = (splats(3, 3.0), splats(4, 2.5));
         let turned = Rigid { rotation: DQuat::from_rotation_z(0.4), translation: DVec3::new(0.3, -0.1, 0.2) };
         let parts = [Part { splats: &other, camera_from_part: Some(turned) }];
         let area = (WIDTH * HEIGHT) as usize;
         let shown: Vec<u8> = (0..area).map(|i| [0, 255, 128][i % 7 % 3]).collect();
         let weights: Vec<f32> = (0..area).map(|i| if i % 5 == 0 { 0.0 } else { 0.3 }).collect();
-        let mut renderer = Renderer::default();
+        let frame = render(&mut Renderer::default(), &own, &parts).clone();
+        let value = |frame: &Frame, upstream: &mut Upstream| silhouette_loss(frame, &shown, &weights, 2.0, upstream);
         let mut upstream = Upstream::default();
-        let value = |renderer: &mut Renderer, splats: &Splats, upstream: &mut Upstream| {
-            silhouette_loss(render(renderer, splats, &parts), &shown, &weights, 2.0, upstream)
-        };
-        assert!(value(&mut renderer, &own, &mut upstream) > 0.1);
-        assert!((0..area).all(|i| (upstream.trainable_alpha[i] == 0.0) == (shown[i] == 128 || weights[i] == 0.0)));
-        let columns = renderer.backward(&own, &upstream).columns.clone();
-        let (mut largest, mut off) = (0.0f64, 0.0f64);
-        for column in [column::MEAN, column::MEAN + 2, column::LOG_SCALE, column::OPACITY] {
-            for row in 0..own.len() {
-                let moved = |by: f32| {
-                    let mut moved = own.clone();
-                    moved.columns_mut()[column][row] += by;
-                    value(&mut Renderer::default(), &moved, &mut Upstream::default())
-                };
-                let expected = (moved(2e-3) - moved(-2e-3)) / 4e-3;
-                largest = largest.max(expected.abs());
-                off = off.max((expected - f64::from(columns[column][row])).abs());
-            }
+        assert!(value(&frame, &mut upstream) > 0.1);
+        let (mut steep, mut compared) = (0, 0);
+        for i in 0..area {
+            let gradient = f64::from(upstream.trainable_alpha[i]);
+            assert_eq!(gradient == 0.0, shown[i] == 128 || weights[i] == 0.0);
+            let moved = |by: f32| {
+                let mut moved = frame.clone();
+                moved.trainable_alpha[i] += by;
+                value(&moved, &mut Upstream::default())
+            };
+            let expected = (moved(1e-3) - moved(-1e-3)) / 2e-3;
+            assert!((expected - gradient).abs() <= 0.05 * gradient.abs() + 1e-6, "{gradient} {expected}");
+            (steep, compared) = (steep + usize::from(gradient < -0.1), compared + usize::from(gradient != 0.0));
         }
-        assert!(largest > 0.01 && off < 0.03 * largest, "{off} of {largest}");
+        assert!(steep > 10 && compared > 200, "{steep} of {compared}");
     }
 
     #[test]
