@@ -83,6 +83,10 @@ pub fn lint(plan: &Plan, capture: &Capture) -> Vec<Finding> {
     let evaluating = ("evaluating the merged model", "lower --budget, or leave --evaluate and use plat eval");
     check_memory(plan, plan.eval_tasks.iter().map(|task| task.memory_bytes), evaluating, &mut findings);
     let detecting = ("looking for objects", "give a smaller --detector");
+    if plan.settings.objects && plan.object_tasks.is_empty() {
+        let message = "no object that moves is shown by three photos with 12 pixels a side".to_owned();
+        findings.warning(None, message);
+    }
     let objects = ("training an object that moves", "leave --objects");
     check_memory(plan, plan.object_tasks.iter().map(|task| task.memory_bytes), objects, &mut findings);
     if let Some(task) = plan.object_tasks.last().filter(|task| task.object as usize >= capture.objects.len()) {

@@ -143,7 +143,7 @@ mod tests {
     fn capture() -> Capture {
         let mut capture = aerial(8, 300.0, 8000);
         for (view, number) in capture.views.iter_mut().zip(0..) {
-            view.seconds = Some(f64::from(8 * (number % 8)));
+            (view.seconds, view.masked) = (Some(f64::from(8 * (number % 8))), true);
         }
         let pose = |seconds: f64| PathPose {
             seconds,
@@ -202,15 +202,34 @@ mod tests {
     }
 
     #[test]
-    fn objects_without_photos_or_times_are_not_planned() {
+    fn a_capture_that_does_not_show_objects_is_refused_or_says_so() {
         let settings = PlanSettings { objects: true, mode: Mode::Whole, ..PlanSettings::default() };
-        let mut capture = capture();
-        assert_eq!(planned(&capture, &settings).object_tasks.len(), 1);
-        capture.views.iter_mut().for_each(|view| view.seconds = None);
-        assert!(planned(&capture, &settings).object_tasks.is_empty());
-        let flat = PlanSettings { mode: Mode::Flat, ..settings };
-        let error = plan(&capture, ArtefactId::of(b"capture"), &flat, "cpu").unwrap_err().to_string();
-        assert!(error.contains("--objects"), "{error}");
+        let good = capture();
+        assert_eq!(planned(&good, &settings).object_tasks.len(), 1);
+        let changes: [(fn(&mut Capture), &str); 3] = [
+            (|capture| capture.objects.clear(), "knows no objects"),
+            (|capture| capture.views.iter_mut().for_each(|view| view.seconds = None), "when photos were taken"),
+            (|capture| capture.views.iter_mut().for_each(|view| view.masked = false), "no photo has a mask"),
+        ];
+        let refused = |capture: &Capture, settings: &PlanSettings, problem: &str| {
+            let error = plan(capture, ArtefactId::of(b"capture"), settings, "cpu").unwrap_err().to_string();
+            assert!(error.contains("--objects") && error.contains(problem), "{error}");
+        };
+        for (change, problem) in changes {
+            let mut bad = good.clone();
+            change(&mut bad);
+            refused(&bad, &settings, problem);
+        }
+        refused(&good, &PlanSettings { mode: Mode::Flat, ..settings.clone() }, "flat blocks");
+        // Objects that no photo shows well.
+        let mut small = good.clone();
+        small.objects.remove(0);
+        let plan = plan(&small, ArtefactId::of(b"capture"), &settings, "cpu").unwrap();
+        let said = lint(&plan, &small);
+        assert!(
+            plan.object_tasks.is_empty() && said.iter().any(|finding| finding.message.contains("no object")),
+            "{said:?}"
+        );
     }
 
     #[test]

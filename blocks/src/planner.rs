@@ -75,6 +75,9 @@ fn divided(
     levels: Option<u8>,
 ) -> Result<Plan, PlanError> {
     check(settings)?;
+    if settings.objects {
+        check_objects(capture)?;
+    }
     let finite = capture.points.positions.iter().filter(|p| p.is_finite()).count();
     let ground = Ground::of(capture);
     let split = Split::new(capture, &ground, settings.test_every, settings.test_stretches);
@@ -141,6 +144,25 @@ fn divided(
         detect_tasks: Vec::new(),
         object_tasks,
     })
+}
+
+/// What training objects that move needs of a capture.
+fn check_objects(capture: &Capture) -> Result<(), PlanError> {
+    let bad = |problem: &str, advice| Err(PlanError::Setting { setting: "--objects", problem: problem.into(), advice });
+    if capture.objects.is_empty() {
+        return bad(
+            "the capture knows no objects with boxes and paths",
+            "omit it, or put a tracks.json beside the photos",
+        );
+    }
+    if capture.views.iter().all(|view| view.seconds.is_none()) {
+        return bad("it is not known when photos were taken", "omit it, or add \"seconds\" to tracks.json");
+    }
+    // A mask says which pixels of a box are the object's.
+    if !capture.views.iter().any(|view| view.masked) {
+        return bad("no photo has a mask, which shows what moves", "omit it, or add masks that leave out what moves");
+    }
+    Ok(())
 }
 
 fn check(settings: &PlanSettings) -> Result<(), PlanError> {

@@ -27,7 +27,7 @@ pub(crate) fn collect(
     if plan.eval_tasks.is_empty() {
         return Ok(None);
     }
-    let figures = views_of(results.get(plan.tasks.len()..).unwrap_or_default(), store)?;
+    let figures = views_of(results.get(plan.tasks.len()..plan.first_detection()).unwrap_or_default(), store)?;
     let (kinds, split) = (view_kinds(capture), Split::of(plan, capture));
     let measured = plan.eval_tasks.iter().flat_map(|task| &task.views).copied().zip(figures);
     type Measured = (Vec<u32>, Vec<ViewFigures>);
@@ -46,9 +46,10 @@ pub(crate) fn collect(
     Ok(Some(evaluated))
 }
 
-/// Adds to the failure of an evaluation that the model was written.
-pub(crate) fn model_is_kept(failure: Failure, out: &Path) -> Failure {
-    let kept = |line: String| format!("{line}; the model is complete in {}, and plat eval measures it", out.display());
+/// Adds to the failure of a task after those of blocks that the model was written.
+pub(crate) fn model_is_kept(failure: Failure, plan: &Plan, out: &Path) -> Failure {
+    let what = if plan.object_tasks.is_empty() { "model" } else { "model without what moves" };
+    let kept = |line: String| format!("{line}; the {what} is complete in {}, and plat eval measures it", out.display());
     match failure {
         Failure::Input(line) => Failure::Input(kept(line)),
         Failure::Work(line) => Failure::Work(kept(line)),

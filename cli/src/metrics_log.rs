@@ -174,12 +174,14 @@ impl MetricsLog {
                 self.spend(task, Spent { attempt, step, ..Spent::default() });
                 let measured = done(&self.tasks[self.planned.len()..first_detection]);
                 self.progress.at("evaluating", measured, self.measured_views, "");
-            } else if self.spend(task, Spent { attempt, step, cpu_seconds, wall_seconds }) && !self.is_training() {
-                match task < first_object {
-                    true => {
-                        self.progress.at("objects", done(&self.tasks[first_detection..first_object]), looked_at, "")
+            } else if self.spend(task, Spent { attempt, step, cpu_seconds, wall_seconds }) {
+                if task >= first_object {
+                    // Objects begin when the blocks around their paths are done; the bar is theirs when all blocks are.
+                    if self.done == self.planned.len() {
+                        self.progress.at("moving objects", done(&self.tasks[first_object..]), trained, "");
                     }
-                    false => self.progress.at("moving objects", done(&self.tasks[first_object..]), trained, ""),
+                } else if !self.is_training() {
+                    self.progress.at("objects", done(&self.tasks[first_detection..first_object]), looked_at, "");
                 }
             }
             return;

@@ -88,6 +88,15 @@ impl Output {
     }
 }
 
+/// What follows the number of blocks in the text of a model that also has objects which move.
+pub(crate) fn beside(objects: usize) -> String {
+    match objects {
+        0 => String::new(),
+        1 => " and an object that moves".into(),
+        count => format!(" and {count} objects that move"),
+    }
+}
+
 /// The redrawn last lines of the terminal.
 #[derive(Debug)]
 pub(crate) struct Screen {

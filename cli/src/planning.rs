@@ -9,7 +9,7 @@ use worker::speed::relative_speed;
 use crate::args::PlanOptions;
 use crate::captures;
 use crate::failure::Failure;
-use crate::output::Output;
+use crate::output::{Output, beside};
 
 /// Plans an opened capture for the CPU; returns the capture at the size that it was planned for.
 pub(crate) fn plan_of(source: &Source, options: &PlanOptions) -> Result<(Capture, Plan), Failure> {
@@ -45,14 +45,7 @@ pub(crate) fn describe(plan: &Plan) -> String {
         0 => String::new(),
         count => format!(" and {count} evaluation task{}", if count == 1 { "" } else { "s" }),
     };
-    let moving = match plan.object_tasks.len() {
-        0 => String::new(),
-        count => format!(
-            " and {count} object{} that move{}",
-            if count == 1 { "" } else { "s" },
-            if count == 1 { "s" } else { "" }
-        ),
-    };
+    let moving = beside(plan.object_tasks.len());
     let mut text = format!(
         "{:?} plan of {} level{}, {} task{}{evaluation}{moving}, root {:.1} m: about {:.0} ({:.0} to {:.0}) CPU seconds and {} MB a task\n",
         plan.settings.mode,

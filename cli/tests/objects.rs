@@ -53,7 +53,12 @@ fn what_moves_has_splats_of_its_own() {
         fs::read(at.join(out).join("merged.ply")).unwrap()
     };
     // The static scene is what it is without them, and the objects are what they are with any number of workers.
-    let merged = train("model", &["--objects", "--threads", "1"]);
+    let merged = train("model", &["--objects", "--threads", "1", "--evaluate"]);
+    // Evaluation tasks draw them: the figures are those of plat eval.
+    let in_job: Value = serde_json::from_slice(&fs::read(at.join("model/eval/report.json")).unwrap()).unwrap();
+    let planned: Value = serde_json::from_slice(&fs::read(at.join("model/report.json")).unwrap()).unwrap();
+    let after = done(at, &["eval", "model", "city", "--backend", "cpu", "--quiet"]);
+    assert!(in_job["psnr"] == after["psnr"] && planned["objects"].as_u64() > Some(0), "{in_job} {planned}");
     let of_objects = files(&at.join("model/objects"));
     assert!(of_objects.len() > 1 && of_objects.contains_key("paths.json"), "{:?}", of_objects.keys());
     assert!(train("static", &[]) == merged && !at.join("static/objects").exists());
@@ -90,6 +95,8 @@ fn what_moves_has_splats_of_its_own() {
     assert!(differ(at, "without", "composed") && differ(at, "moved", "composed") && differ(at, "moved", "without"));
     let only = render("only", &["--only", name]);
     assert_eq!((&only["splats"], &only["objects"]), (&0.into(), &1.into()));
+    refused(at, &["render", "static", "--cameras", "city", "--out", "x", "--time", "1"], "has no objects that move");
+    refused(at, &["plan", "city", "--objects", "--no-masks", "--out", "plan.json"], "no photo has a mask");
     refused(at, &["render", "model", "--cameras", "city", "--out", "x", "--without", "none"], "has no object 'none'");
     refused(at, &["render", "model", "--cameras", "city", "--out", "x", "--move", "7=1,2"], "give ID=X,Y,Z");
 

@@ -50,6 +50,8 @@ pub struct Written {
     pub splats: u64,
     /// Bytes of `merged.ply`.
     pub bytes: u64,
+    /// Objects that move.
+    pub objects: usize,
 }
 
 /// Writes the results of all tasks of a plan for this capture, in the plan's order, under `out`. Holds one block in memory at a time, as a model
@@ -99,7 +101,8 @@ pub fn write(
     }
     merged.commit()?;
 
-    save_objects(out, &objects_of(plan, results, store, capture)?, plan.settings.antialiased)?;
+    let objects = objects_of(plan, results, store, capture)?;
+    save_objects(out, &objects, plan.settings.antialiased)?;
     if let Some(id) = exposures {
         save(&folder.join(EXPOSURES_FILE), &store.get(id)?)?;
     }
@@ -125,7 +128,7 @@ pub fn write(
         blocks,
     };
     save_json(&folder.join(MANIFEST_FILE), &manifest)?;
-    Ok(Written { splats: count as u64, bytes })
+    Ok(Written { splats: count as u64, bytes, objects: objects.len() })
 }
 
 /// The objects that move, of a plan that trains some. Where a job was cut short before them, there are none.

@@ -101,6 +101,10 @@ pub(crate) fn run(args: &RenderArgs, output: &Output) -> Result<(), Failure> {
 /// The objects to draw, where they are to be.
 fn placed(objects: &[ModelObject], args: &RenderArgs) -> Result<Vec<ModelObject>, Failure> {
     const ALL: &str = "all";
+    if objects.is_empty() && args.time.is_some() {
+        let problem = format!("has no effect, as {} has no objects that move", args.model.display());
+        return Err(BadInput::new("--time", problem, "omit it, or train the model with --objects").into());
+    }
     let moved = args.moves.iter().map(|of| &of.id);
     for id in args.without.iter().filter(|id| *id != ALL).chain(&args.only).chain(moved) {
         if objects.iter().all(|object| object.about.id != *id) {

@@ -23,7 +23,7 @@ use crate::eval_results;
 use crate::failure::{Failure, make_folder};
 use crate::live_status::{LiveStatus, TaskNames};
 use crate::objects::{Objects, note_found};
-use crate::output::Output;
+use crate::output::{Output, beside};
 use crate::planning::{check_plan, plan_of};
 use crate::remote::{Remote, result_of};
 use crate::run_record::Record;
@@ -142,7 +142,7 @@ impl Finished<'_> {
         let downscale = args.plan.downscale;
         let written = model::write(out, plan, &results, store, capture, downscale)?;
         if let Some(failure) = failed {
-            return Err(eval_results::model_is_kept(failure, out));
+            return Err(eval_results::model_is_kept(failure, plan, out));
         }
         (submitted.splats, submitted.bytes) = (Some(written.splats), Some(written.bytes));
         let (scene, backend) = (captures::name_of(&args.capture), plan.backend.clone());
@@ -151,7 +151,8 @@ impl Finished<'_> {
         submitted.psnr = evaluated.and_then(|evaluated| evaluated.record.psnr);
         let psnr = submitted.psnr.map_or(String::new(), |psnr| format!(", {psnr:.2} dB held out"));
         let (splats, blocks, file) = (written.splats, plan.tasks.len(), out.join("merged.ply"));
-        Ok(format!("{splats} splats in {blocks} blocks{psnr}\n{}", file.display()))
+        let objects = beside(written.objects);
+        Ok(format!("{splats} splats in {blocks} blocks{objects}{psnr}\n{}", file.display()))
     }
 }
 

@@ -32,7 +32,7 @@ use crate::eval_results;
 use crate::failure::{Failure, make_folder};
 use crate::metrics_log::{MetricsLog, Totals};
 use crate::objects::{Objects, note_found};
-use crate::output::Output;
+use crate::output::{Output, beside};
 use crate::planning::{check_plan, plan_of};
 use crate::run_record::Record;
 use crate::{backend, captures, clock, config};
@@ -58,6 +58,8 @@ pub(crate) struct Report {
     pub(crate) plan: ArtefactId,
     pub(crate) capture: ArtefactId,
     pub(crate) tasks: usize,
+    /// Objects that move, with splats of their own.
+    pub(crate) objects: usize,
     pub(crate) levels: u8,
     pub(crate) antialiased: bool,
     pub(crate) ingest_cpu_seconds: f64,
@@ -79,12 +81,13 @@ pub(crate) struct Report {
 
 pub(crate) fn run(args: &TrainArgs, output: &Output) -> Result<(), Failure> {
     let trained = train(args, output)?;
-    let Report { record, tasks, .. } = &trained.report;
+    let Report { record, tasks, objects, .. } = &trained.report;
     let psnr = record.psnr.map_or(String::new(), |psnr| format!(", {psnr:.2} dB held out"));
     let text = format!(
-        "{} splats in {tasks} block{}{psnr}, {:.1} CPU seconds, {:.1} seconds\n{}",
+        "{} splats in {tasks} block{}{}{psnr}, {:.1} CPU seconds, {:.1} seconds\n{}",
         record.splats,
         if *tasks == 1 { "" } else { "s" },
+        beside(*objects),
         record.cpu_seconds.unwrap_or_default(),
         record.wall_seconds.unwrap_or_default(),
         args.out.join("merged.ply").display(),
@@ -172,6 +175,7 @@ pub(crate) fn train(args: &TrainArgs, output: &Output) -> Result<Trained, Failur
         plan: plan_id,
         capture: capture_id,
         tasks: plan.tasks.len(),
+        objects: written.objects,
         levels: plan.levels,
         antialiased: plan.settings.antialiased,
         ingest_cpu_seconds,
@@ -184,7 +188,7 @@ pub(crate) fn train(args: &TrainArgs, output: &Output) -> Result<Trained, Failur
     };
     save_json(&args.out.join("report.json"), &report)?;
     if let Some(failure) = failed {
-        return Err(eval_results::model_is_kept(failure, &args.out));
+        return Err(eval_results::model_is_kept(failure, &plan, &args.out));
     }
     Ok(Trained { capture, report, curve: totals.curve, dashboard })
 }
