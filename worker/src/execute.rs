@@ -162,14 +162,7 @@ impl PlanExecutor {
             self.report_cached(order, plan, &reader, (&results, &splats), stopwatch, report);
             return Ok(artefact);
         }
-        let exposures = match given.exposures {
-            Some(id) => Some(Exposures::from_frame(&store.get(id)?).map_err(ExecuteError::work)?),
-            None => None,
-        };
-        let poses = match given.poses {
-            Some(id) => Some(Poses::from_frame(&store.get(id)?).map_err(ExecuteError::work)?),
-            None => None,
-        };
+        let (exposures, poses) = self.of_views(given)?;
         let aligned = AlignedLoss::of(plan, store)?;
         drop(fetching);
         let (given_exposures, given_poses, given_residual) = (exposures.as_ref(), poses.as_ref(), given.residual);
@@ -239,13 +232,17 @@ impl PlanExecutor {
         let is_sound = |bytes: &[u8]| frame::decode_splats(bytes).is_ok();
         self.kept_or(job, is_sound, || {
             let reader = job.reader(store, options.cache_bytes - 2 * self.remote_bytes);
-            let mut results = BTreeMap::new();
+            let (mut results, mut given) = (BTreeMap::new(), TrainingInfo::default());
             job.fetch_span.in_scope(|| {
-                self.inputs(job).blocks(PlannedTask::Object(task), report, |block, splats, _| {
+                self.inputs(job).blocks(PlannedTask::Object(task), report, |block, splats, training| {
                     results.insert(block, splats);
+                    // Those of the root, which all blocks pass on.
+                    given = training;
                 })
             })?;
-            let training = ObjectTraining { plan, task, order, capture, reader: &reader };
+            let (exposures, poses) = self.of_views(given)?;
+            let (exposures, poses) = (exposures.as_ref(), poses.as_ref());
+            let training = ObjectTraining { plan, task, order, capture, reader: &reader, exposures, poses };
             let memory = memory_budget(options.memory_bytes);
             let span = tracing::info_span!("train", object = task.object);
             let trained = self.pool.install(|| span.in_scope(|| training.train(results, memory, stopwatch, report)));
@@ -287,6 +284,14 @@ impl PlanExecutor {
             shared.metrics.count_reads(reader.stats());
             Ok(eval::figures_to_frame(&figures?))
         })
+    }
+
+    /// The exposures and poses of the photos that the root trained, if it did.
+    fn of_views(&self, given: TrainingInfo) -> Result<(Option<Exposures>, Option<Poses>), ExecuteError> {
+        let store = &self.context.store;
+        let exposures = given.exposures.map(|id| Exposures::from_frame(&store.get(id)?).map_err(ExecuteError::work));
+        let poses = given.poses.map(|id| Poses::from_frame(&store.get(id)?).map_err(ExecuteError::work));
+        Ok((exposures.transpose()?, poses.transpose()?))
     }
 
     /// The results of other tasks.

@@ -7,7 +7,7 @@ use blocks::{Cut, ObjectTask, Plan, object_camera};
 use dataset::windows::WindowReader;
 use glam::Vec3;
 use proto::FailureKind;
-use scene::{BlockId, Capture, MovingObject, SparsePoints, Splats};
+use scene::{BlockId, Camera, Capture, Exposures, MovingObject, Poses, SparsePoints, Splats, View};
 use train::growth::Growth;
 use train::{Backend, Job, Recipe, TrainError, TrainView, random};
 
@@ -38,6 +38,10 @@ pub(crate) struct ObjectTraining<'a> {
     pub(crate) order: &'a TaskOrder,
     pub(crate) capture: &'a Capture,
     pub(crate) reader: &'a WindowReader,
+    /// The exposures that the root trained.
+    pub(crate) exposures: Option<&'a Exposures>,
+    /// The poses that the root refined.
+    pub(crate) poses: Option<&'a Poses>,
 }
 
 impl ObjectTraining<'_> {
@@ -86,7 +90,7 @@ impl ObjectTraining<'_> {
             antialiased: plan.settings.antialiased,
             seed,
             size_bounds_metres: sizes,
-            exposures: None,
+            exposures: self.exposures,
             trains_exposures: false,
             trains_poses: false,
             recipe: &recipe,
@@ -132,13 +136,21 @@ impl ObjectTraining<'_> {
     fn views(&self, object: &MovingObject) -> Result<Vec<TrainView>, ExecuteError> {
         let window = |used: &blocks::ViewUse| {
             let seen = self.capture.views.get(used.view as usize);
-            let placed = seen.and_then(|seen| Some((seen.camera, object_camera(&seen.camera, object, seen.seconds?)?)));
+            let placed = seen.and_then(|seen| {
+                let in_world = self.in_world(used.view, seen);
+                Some((in_world.camera_from_world, object_camera(&in_world, object, seen.seconds?)?))
+            });
             let missing = || ExecuteError::work(format!("object {} is not on view {}", object.id, used.view));
-            let (in_world, camera) = placed.ok_or_else(missing)?;
-            let camera_from_context = Some(in_world.camera_from_world);
+            let (camera_from_world, camera) = placed.ok_or_else(missing)?;
+            let camera_from_context = Some(camera_from_world);
             Ok(TrainView { view: used.view, mip: used.mip, rect: used.window, camera, camera_from_context })
         };
         self.task.views.iter().map(window).collect()
+    }
+
+    /// The camera of a view in the world, from its refined pose if there is one.
+    fn in_world(&self, number: u32, view: &View) -> Camera {
+        self.poses.map_or(view.camera, |poses| poses.apply(number, view.camera))
     }
 
     /// The splats around the path that the windows show.
@@ -147,7 +159,7 @@ impl ObjectTraining<'_> {
         let in_world: Vec<TrainView> = views
             .iter()
             .map(|view| {
-                let camera = self.capture.views[view.view as usize].camera;
+                let camera = self.in_world(view.view, &self.capture.views[view.view as usize]);
                 TrainView { camera, camera_from_context: None, ..*view }
             })
             .collect();
