@@ -19,9 +19,6 @@ use crate::split::Split;
 use crate::task::{ObjectTask, Task, ViewUse};
 use crate::visibility::is_usable;
 
-/// Boxes are annotated by hand or by a tracker: windows are larger by this share of the box's sides and this many metres.
-const GROWTH: f64 = 0.05;
-const GROWTH_METRES: f64 = 0.3;
 /// The least width and height of a window, and the least area of all windows together, pixels: an object that no photo shows larger
 /// is not modelled.
 const MIN_SIDE: u32 = 12;
@@ -100,7 +97,7 @@ fn window(capture: &Capture, view: u32, object: &MovingObject) -> Option<ViewUse
     if !is_usable(&seen.camera) {
         return None;
     }
-    let corners = object.corners(GROWTH, GROWTH_METRES).map(|corner| camera.camera_from_world.apply(corner));
+    let corners = object.splat_box().map(|corner| camera.camera_from_world.apply(corner));
     let outline = camera.pinhole.outline(&corners);
     let first = *outline.first()?;
     let (low, high) = outline.iter().fold((first, first), |(low, high), p| (low.min(*p), high.max(*p)));

@@ -10,9 +10,6 @@ use train::metrics::psnr_of;
 
 use crate::figures::Comparison;
 
-/// Boxes are annotated by hand or by a tracker, as in training.
-const GROWTH: f64 = 0.05;
-const GROWTH_METRES: f64 = 0.1;
 /// Fewer pixels on a view give no meaningful figure.
 const MIN_PIXELS: u64 = 64;
 
@@ -83,7 +80,7 @@ impl<'a> MovingMeter<'a> {
         for (object, sum) in self.objects.iter().zip(&mut self.of_objects) {
             let Some(pose) = object.pose(seconds) else { continue };
             let camera_from_object = view.camera.camera_from_world.after(&pose);
-            let corners = object.corners(GROWTH, GROWTH_METRES).map(|corner| camera_from_object.apply(corner));
+            let corners = object.pixel_box().map(|corner| camera_from_object.apply(corner));
             let mut own = Sum::default();
             for (row, columns) in covered(&corners, &view.camera.pinhole) {
                 for i in columns.map(|column| row as usize * photo.width as usize + column as usize) {

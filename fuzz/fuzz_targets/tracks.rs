@@ -10,7 +10,7 @@ fuzz_target!(|bytes: &[u8]| {
             assert!(object.path.iter().all(|pose| pose.world_from_object.is_sane()));
             let first = object.path[0].seconds;
             assert!(object.pose(first).is_some_and(|pose| pose.is_sane()));
-            assert!(object.corners(0.1, 0.5).iter().all(|corner| corner.is_finite()));
+            assert!(object.splat_box().iter().all(|corner| corner.is_finite()));
         }
         assert!(objects::read(&objects::write(&tracks)).is_ok());
     }

@@ -18,6 +18,10 @@ use crate::error::CodecError;
 
 /// An object keeps its first and its last pose for this long before and after, seconds. nuScenes annotates every half second.
 const ALONE_SECONDS: f64 = 0.3;
+/// How far pixels and splats of an object may lie beside its box: a share of its sides, and metres.
+const MARGIN_SHARE: f64 = 0.05;
+const PIXEL_MARGIN_METRES: f64 = 0.1;
+const SPLAT_MARGIN_METRES: f64 = 0.3;
 /// An object that moves faster between two poses jumps, metres per second: 540 km/h.
 const MAX_SPEED: f64 = 150.0;
 /// Positions of a box that was annotated by hand or by a tracker jitter, metres.
@@ -71,9 +75,19 @@ impl MovingObject {
         }
     }
 
-    /// The corners of its box in its own axes, farther from its centre by a share of its sides and this many metres, numbered by the
-    /// bits of their signs along x, y and z.
-    pub fn corners(&self, share: f64, metres: f64) -> [DVec3; 8] {
+    /// The corners of the box in its own axes that its pixels lie in, numbered by the bits of their signs along x, y and z. Boxes are
+    /// annotated by hand or by a tracker, and the object's outline may lie beside its box.
+    pub fn pixel_box(&self) -> [DVec3; 8] {
+        self.corners(MARGIN_SHARE, PIXEL_MARGIN_METRES)
+    }
+
+    /// As [`pixel_box`](Self::pixel_box), of the box that its splats lie in.
+    pub fn splat_box(&self) -> [DVec3; 8] {
+        self.corners(MARGIN_SHARE, SPLAT_MARGIN_METRES)
+    }
+
+    /// The corners of its box, farther from its centre by a share of its sides and this many metres.
+    fn corners(&self, share: f64, metres: f64) -> [DVec3; 8] {
         let (centre, half) = (0.5 * (self.low + self.high), 0.5 * (self.high - self.low));
         let half = half * (1.0 + share) + metres;
         std::array::from_fn(|i| {

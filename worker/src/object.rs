@@ -13,16 +13,12 @@ use train::{Backend, Job, Recipe, TrainError, TrainView, random};
 
 use crate::clock::Stopwatch;
 use crate::memory_budget::MemoryBudget;
-use crate::silhouettes::{Silhouettes, visual_hull};
+use crate::silhouettes::{SHADOW_METRES, Silhouettes, visual_hull};
 use crate::task::{ExecuteError, FULL_RATE, Flow, Report, Reporter, TaskOrder};
 
 /// Weight of the silhouette loss.
 const SILHOUETTE_WEIGHT: f32 = 0.1;
-/// Splats may lie this share of the box's sides and these metres beside it.
-const GROWTH: f64 = 0.05;
-const GROWTH_METRES: f64 = 0.3;
-/// Shadows lie on the ground: this far from the box, and this high, metres.
-const SHADOW_METRES: f64 = 1.0;
+/// Shadows lie on the ground, this far up and down, metres.
 const SHADOW_HEIGHT: f64 = 0.2;
 /// Share of the budget to start with.
 const INITIAL_SHARE: f64 = 0.5;
@@ -185,7 +181,7 @@ fn size_bounds_metres(object: &MovingObject) -> [f32; 2] {
 /// Whether a place in the object's axes is in its box, or in its shadow.
 fn is_part(object: &MovingObject, place: Vec3) -> bool {
     let place = place.as_dvec3();
-    let [low, high] = [object.corners(GROWTH, GROWTH_METRES)[0], object.corners(GROWTH, GROWTH_METRES)[7]];
+    let [low, .., high] = object.splat_box();
     let in_box = place.cmpge(low).all() && place.cmple(high).all();
     let beside = |axis: usize| {
         place[axis] >= object.low[axis] - SHADOW_METRES && place[axis] <= object.high[axis] + SHADOW_METRES

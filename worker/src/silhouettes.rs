@@ -11,11 +11,8 @@ use glam::DVec3;
 use scene::{Camera, Capture, MovingObject, Pixels, Rect, Rigid};
 use train::WindowSource;
 
-/// Boxes are annotated by hand or by a tracker: an object's pixels may lie this share of its sides and these metres beside its box.
-const GROWTH: f64 = 0.05;
-const GROWTH_METRES: f64 = 0.1;
 /// How far from the object's box its shadow is looked for, metres.
-const SHADOW_METRES: f64 = 1.0;
+pub(crate) const SHADOW_METRES: f64 = 1.0;
 
 /// In [`Pixels::silhouette`].
 const THERE: u8 = 255;
@@ -92,7 +89,7 @@ impl Silhouettes<'_> {
 /// Marks the pixels that an object's box covers.
 fn cover(marks: &mut [bool], width: usize, object: &MovingObject, world_from_object: &Rigid, camera: &Camera) {
     let camera_from_object = camera.camera_from_world.after(world_from_object);
-    let corners = object.corners(GROWTH, GROWTH_METRES).map(|corner| camera_from_object.apply(corner));
+    let corners = object.pixel_box().map(|corner| camera_from_object.apply(corner));
     for (row, columns) in covered(&corners, &camera.pinhole) {
         let start = row as usize * width;
         marks[start + columns.start as usize..start + columns.end as usize].fill(true);
