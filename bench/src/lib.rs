@@ -85,6 +85,9 @@ pub struct ResultLine {
     /// Share of their pixels whose depth is within a factor of 1.25.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub depth_delta1: Option<f64>,
+    /// dB of the pixels within the boxes of objects that move, mean over the held-out views that show some (PSNR*).
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub moving_psnr: Option<f64>,
     /// Figures of the held-out aerial views, where the capture has both kinds.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub aerial: Option<KindFigures>,
@@ -176,7 +179,7 @@ impl ResultLine {
     fn is_finite(&self) -> bool {
         let numbers = [Some(self.cpu_seconds), Some(self.psnr), self.wall_seconds, self.ssim, self.lpips];
         let more = [self.tolerance_db, self.cc_psnr, self.perceptual, self.zone_psnr, self.detections_kept, self.fps];
-        let depth = [self.depth_absrel, self.depth_delta1];
+        let depth = [self.depth_absrel, self.depth_delta1, self.moving_psnr];
         self.judged.iter().all(Judged::is_finite)
             && numbers.iter().chain(&more).chain(&depth).flatten().all(|v| v.is_finite())
             && [self.aerial, self.street].iter().flatten().all(KindFigures::is_finite)

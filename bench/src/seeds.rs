@@ -89,6 +89,7 @@ fn mean(last: &ResultLine, runs: &[&ResultLine], variant: String) -> Averaged {
         judged: if runs.len() == 1 { last.judged.clone() } else { Vec::new() },
         depth_absrel: maybe(&|run| run.depth_absrel),
         depth_delta1: maybe(&|run| run.depth_delta1),
+        moving_psnr: maybe(&|run| run.moving_psnr),
         aerial: mean_kind(runs, |run| run.aerial),
         street: mean_kind(runs, |run| run.street),
         splats: whole(&|run| run.splats),

@@ -95,6 +95,7 @@ impl Record {
             judged: Vec::new(),
             depth_absrel: None,
             depth_delta1: None,
+            moving_psnr: None,
             aerial: None,
             street: None,
             splats: Some(self.splats),

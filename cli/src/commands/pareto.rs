@@ -202,6 +202,7 @@ fn train_and_measure(
     let line = ResultLine {
         depth_absrel: depth.and_then(|of| of.absrel),
         depth_delta1: depth.and_then(|of| of.delta1),
+        moving_psnr: evaluated.moving.as_ref().and_then(|of| of.psnr),
         judged: evaluated.detections.iter().map(|of| judged(of.detector.clone(), &of.groups.held_out.all)).collect(),
         aerial,
         street,

@@ -1,0 +1,26 @@
+#!/usr/bin/env bash
+# Lines of bench/results/moving: streets with objects that move, modelled and left out, one thread, nothing pruned. `moving_psnr` is of the
+# pixels within their boxes, `psnr` of all others. Makes the street in out/moving if it is not there; takes the folder of the captures for
+# drive_dgp_scene_01 too. SEED has the seeds (0). RESULTS is the folder of the lines. A quarter of an hour.
+set -euo pipefail
+repository=$(realpath "$(dirname "${BASH_SOURCE[0]}")/..")
+# Lines of results name the command, so that its paths must not be those of one machine.
+captures=${1:+$(realpath --relative-to="$repository" "$1")}
+cd "$repository"
+plat=${PLAT:-target/release/plat}
+street=out/moving/street
+common=(--seed "${SEED:-0}" --blocks whole --threads 1 --backend cpu --tolerance-db 0 --eval-every 0 --fresh --results "${RESULTS:-bench/results/moving}")
+
+if ! grep -qs '"complete": *true' "$street/manifest.json"; then
+    "$plat" --quiet synth --area-km2 0.02 --views 640 --spacing 2 --aerial 0.1 --traffic medium --size 640x360 --out "$street"
+fi
+for objects in without with; do
+    modelled=()
+    [[ $objects == without ]] || modelled=(--objects)
+    "$plat" --quiet bench pareto "$street" --label "plat, $objects objects" --steps 6000 --budget 40000 \
+        "${common[@]}" "${modelled[@]}" --out "out/moving/$objects"
+    if [[ -d $captures/drive_dgp_scene_01 ]]; then
+        "$plat" --quiet bench pareto "$captures/drive_dgp_scene_01" --label "plat, $objects objects" --steps 2000 --budget 40000 --downscale 2 \
+            "${common[@]}" "${modelled[@]}" --out "out/moving/dgp-$objects"
+    fi
+done
