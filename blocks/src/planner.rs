@@ -160,7 +160,10 @@ fn check_objects(capture: &Capture) -> Result<(), PlanError> {
     }
     // A mask says which pixels of a box are the object's.
     if !capture.views.iter().any(|view| view.masked) {
-        return bad("no photo has a mask, which shows what moves", "omit it, or add masks that leave out what moves");
+        return bad(
+            "no photo has a mask, which shows what moves",
+            "omit it, or add mask files that leave out what moves",
+        );
     }
     Ok(())
 }

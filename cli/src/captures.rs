@@ -6,7 +6,7 @@ use std::path::{Component, Path, PathBuf};
 use dataset::depth_maps::DepthMapOptions;
 use dataset::ingest::{IngestOptions, Ingested, downscaled, ingest};
 use dataset::mips::MIN_MIP_SIDE;
-use dataset::open::{OpenOptions, Photo, Source};
+use dataset::open::{OpenOptions, Source};
 use dataset::zones::{CocoFile, LabelMaps, OwnLabels, ZoneSource};
 use eval::{PhotoOptions, Photos, load_identified_detector};
 use model::Model;
@@ -44,7 +44,7 @@ pub(crate) fn open_to_plan(path: &Path, options: &PlanOptions, output: &Output) 
     let open = OpenOptions { lidar: !options.no_lidar, depths, ..OpenOptions::default() };
     let mut source = open_with(path, &open, output)?;
     if options.no_masks {
-        source.photos.iter_mut().for_each(Photo::unmask);
+        source.unmask();
     }
     match given.filter(|_| source.depth_maps() == 0) {
         Some(name) => {

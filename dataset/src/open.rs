@@ -72,12 +72,6 @@ impl Photo {
         self.boxes.iter().filter(|of| of.moves).map(|of| of.corners).collect()
     }
 
-    /// Uses all of its pixels: forgets its mask, and that labelled objects move.
-    pub fn unmask(&mut self) {
-        self.mask = None;
-        self.boxes.iter_mut().for_each(|of| of.moves = false);
-    }
-
     /// Its file, and its row if it is in a table, for messages.
     pub(crate) fn shown(&self) -> String {
         let file = files::show(&self.path);
@@ -106,6 +100,15 @@ pub struct Source {
 }
 
 impl Source {
+    /// Uses all pixels of all photos: forgets masks, and that labelled objects move.
+    pub fn unmask(&mut self) {
+        for (view, photo) in self.capture.views.iter_mut().zip(&mut self.photos) {
+            photo.mask = None;
+            photo.boxes.iter_mut().for_each(|of| of.moves = false);
+            view.masked = false;
+        }
+    }
+
     /// Whether its views have target depths from lidar or from depth maps.
     pub fn is_measured(&self) -> bool {
         self.depth_maps() > 0 || self.sweeps.iter().any(|sweep| !sweep.views.is_empty())
