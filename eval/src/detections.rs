@@ -7,7 +7,8 @@
 use std::cell::OnceCell;
 
 use perceive::{
-    Agreement, Boxes, Counts, Detection, Detector, Picture, Precision, TrueBox, agreement, masked_share, precision,
+    Agreement, Boxes, Counts, Detection, Detector, MAX_MASKED, Picture, Precision, TrueBox, agreement, masked_share,
+    precision,
 };
 use scene::{BadInput, Pixels};
 use serde::Serialize;
@@ -19,8 +20,6 @@ use crate::images::{colour_image, photo_image};
 use crate::metric_maps;
 use crate::zones::ZoneFigures;
 
-/// Largest share of a detection that may be masked.
-const MAX_MASKED: f64 = 0.5;
 /// Least score of a detection on a render that average precision sees, as COCO's evaluations choose it.
 const LEAST_SCORE: f32 = 0.05;
 

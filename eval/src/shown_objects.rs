@@ -3,14 +3,11 @@
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};
 
-use perceive::{Detection, Detector, Picture, kept, masked_share};
+use perceive::{Detection, Detector, MAX_MASKED, Picture, kept, masked_share};
 use scene::{BadInput, Pixels};
 use train::prune::ObjectJudge;
 
 use crate::images::{colour_image, photo_image};
-
-/// Largest share of a detection that may be masked.
-const MAX_MASKED: f64 = 0.5;
 
 /// Looks at photos and renders with a detector. An object is shown if it would be kept in the figures of
 /// [`crate::DetectionReport`]: the same group of classes, and boxes that overlap by half.

@@ -25,7 +25,7 @@ pub use agreement::{Agreement, Counts, agreement, kept};
 pub use boxes::{Detection, iou};
 pub use card::Card;
 pub use detector::{Cost, Detector};
-pub use masked::{box_pixels, masked_share};
+pub use masked::{MAX_MASKED, box_pixels, masked_share};
 pub use precision::{Boxes, Precision, TrueBox, precision};
 
 /// A picture: rows from the top, three bytes a pixel, red first.

@@ -11,6 +11,9 @@ pub fn box_pixels([left, top, right, bottom]: [f32; 4], width: usize, height: us
     (range(left, right, width), range(top, bottom, height))
 }
 
+/// An object of which more is masked counts nowhere: moving objects, which no static model shows, are masked.
+pub const MAX_MASKED: f64 = 0.5;
+
 /// The share of masked pixels (under 128) among those of a row-major mask whose centre a box (left, top, right, bottom,
 /// pixels) contains; 0 of none.
 pub fn masked_share(mask: &[u8], width: usize, corners: [f32; 4]) -> f64 {

@@ -12,7 +12,7 @@ use blocks::Plan;
 use dataset::byte_lru::ByteLru;
 use perceive::aligned::{Aligned, Targets};
 use perceive::gradient::Activations;
-use perceive::masked_share;
+use perceive::{MAX_MASKED, masked_share};
 use scene::{Pixels, Rect};
 use store::BlockingStore;
 use train::PictureLoss;
@@ -22,8 +22,6 @@ use crate::task::{AlignedReport, ExecuteError};
 
 /// Least side of an object's box, pixels of the window: of smaller ones a detector says little at any mip.
 const MIN_SIDE: f32 = 12.0;
-/// Largest share of an object that may be masked, as for zones.
-const MAX_MASKED: f64 = 0.5;
 /// What is kept of what the detector sees in photos, bytes. An object takes about 7 kB.
 const TARGETS_BYTES: usize = 64 << 20;
 

@@ -2,15 +2,12 @@
 
 use std::sync::Arc;
 
-use perceive::masked_share;
+use perceive::{MAX_MASKED, masked_share};
 use scene::{BadInput, Capture, Pixels, Rect, Zone};
 use store::BlockingStore;
 
 use crate::ingest::IngestError;
 use crate::windows::{WindowError, WindowReader};
-
-/// Largest share of a zone that may be masked: moving objects, which no model shows, are not its zones.
-const MAX_MASKED: f64 = 0.5;
 
 /// Reads the photos of a capture one after the other.
 pub(super) struct Photos<'a> {
