@@ -203,7 +203,8 @@ mod tests {
         let settings = PlanSettings { objects: true, mode: Mode::Whole, ..PlanSettings::default() };
         let good = capture();
         assert_eq!(planned(&good, &settings).object_tasks.len(), 1);
-        let changes: [(fn(&mut Capture), &str); 3] = [
+        type Change = fn(&mut Capture);
+        let changes: [(Change, &str); 3] = [
             (|capture| capture.objects.clear(), "knows no objects"),
             (|capture| capture.views.iter_mut().for_each(|view| view.seconds = None), "when photos were taken"),
             (|capture| capture.views.iter_mut().for_each(|view| view.masked = false), "no photo has a mask"),

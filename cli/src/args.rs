@@ -208,8 +208,8 @@ pub(crate) struct TrainArgs {
     #[serde(skip)]
     pub(crate) checkpoint_every: f64,
     /// Finish within M minutes of wall time: every task gets its share of the time, with fewer steps if needed. Such a
-    /// result depends on the machine's speed and is not reproducible
-    #[arg(long, value_name = "M", value_parser = minutes)]
+    /// result depends on the machine's speed and is not reproducible; not with --objects
+    #[arg(long, value_name = "M", value_parser = minutes, conflicts_with = "objects")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) minutes: Option<f64>,
     /// Show training and the model in a browser until Ctrl-C, on this port or address of the loopback interface

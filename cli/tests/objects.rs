@@ -117,4 +117,5 @@ fn what_moves_has_splats_of_its_own() {
     refused(at, &["inspect", "city"], "jumps");
     fs::write(at.join("city/tracks.json"), &tracks).unwrap();
     refused(at, &["plan", "city", "--blocks", "flat", "--objects", "--out", "plan.json"], "--objects");
+    refused(at, &["train", "city", "--objects", "--minutes", "1", "--out", "x"], "--minutes");
 }
