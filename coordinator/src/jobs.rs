@@ -75,21 +75,27 @@ impl Jobs {
         jobs
     }
 
-    /// The durable jobs, under a new epoch.
+    /// The durable jobs, under a new epoch. `began` is the wall clock's time at time 0, milliseconds since 1970.
     ///
     /// # Errors
     /// A state that no coordinator could have written.
-    pub(crate) fn restore(options: Options, restored: Restored, epoch: u64) -> Result<Self, RestoreError> {
+    pub(crate) fn restore(options: Options, restored: Restored, epoch: u64, began: u64) -> Result<Self, RestoreError> {
         let settings = Self::settings(&options);
-        let Restored { snapshot, origins, workers, next_job } = restored;
-        let began = options.journal.is_some().then(|| snapshot.clone());
+        let Restored { snapshot, origins, workers, next_job, lines } = restored;
+        let replayed = options.journal.is_some().then(|| snapshot.clone());
         let mut jobs = Self::of(options, Scheduler::restore(snapshot, settings, epoch, 0)?);
         jobs.workers = workers.iter().cloned().zip((0..).map(WorkerId)).collect();
         jobs.names = workers;
         let job = |(id, origin)| (id, Job { origin, watchers: Watchers::default() });
         jobs.jobs = origins.into_iter().map(job).collect();
         jobs.next_job = next_job;
-        jobs.write_journal(|| Line::Began { settings, snapshot: began.unwrap_or_default(), epoch, now_millis: 0 });
+        jobs.log = Log::restore(lines, began);
+        let running: Vec<JobId> =
+            jobs.jobs.keys().filter(|id| jobs.scheduler.finished(**id).is_none()).copied().collect();
+        for id in running {
+            jobs.log.job(0, id, format!("another coordinator leads, the {epoch}. in this store"));
+        }
+        jobs.write_journal(|| Line::Began { settings, snapshot: replayed.unwrap_or_default(), epoch, now_millis: 0 });
         Ok(jobs)
     }
 
@@ -139,7 +145,8 @@ impl Jobs {
 
     /// Takes the changes to make durable, and what waits for them.
     pub(crate) fn take_batch(&mut self) -> (Batch, Vec<Pending>) {
-        (std::mem::take(&mut self.batch), std::mem::take(&mut self.due))
+        let batch = Batch { log: self.log.take_changes(), ..std::mem::take(&mut self.batch) };
+        (batch, std::mem::take(&mut self.due))
     }
 
     /// Sends replies and updates that are durable now.
@@ -178,6 +185,7 @@ impl Jobs {
                 oldest.ok_or_else(|| Status::resource_exhausted(format!("{} jobs are running", self.jobs.len())))?;
             self.step(now, Event::ForgetRequested { job: oldest });
             self.jobs.remove(&oldest);
+            self.log.forget(oldest);
         }
         let id = JobId(self.next_job);
         self.jobs.insert(id, Job { origin: Origin { plan, traced }, watchers: Watchers::default() });

@@ -139,7 +139,9 @@ async fn lead_with(
     stop: &CancellationToken,
 ) -> Result<Leader, ServeError> {
     let epoch = state.epoch();
-    let jobs = Jobs::restore(options.clone(), restored, epoch).map_err(|error| state.damaged(&error.to_string()))?;
+    let began = (options.wall_clock)();
+    let jobs =
+        Jobs::restore(options.clone(), restored, epoch, began).map_err(|error| state.damaged(&error.to_string()))?;
     let lease = Leader { epoch, address: durable.address.clone(), beat: 0, released: false };
     announce(&options.store, &lease).await?;
     tracing::info!(epoch, jobs = jobs.len(), "leading");

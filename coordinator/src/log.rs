@@ -1,9 +1,11 @@
-//! The job log: a bounded list of lines for people. Each line is also an event of the process's log. Nothing depends on it.
+//! The job log: a bounded list of lines for people. Each line is also an event of the process's log. Where jobs are durable, so are its
+//! lines, and their numbers go on under the next leader. Nothing else depends on it.
 
 use std::collections::VecDeque;
 
 use cluster::{Action, AttemptId, JobId, Scheduler, TaskIndex, TaskState, WorkerId};
 use proto::{LogKind, LogLine};
+use serde::{Deserialize, Serialize};
 
 /// Lines of all jobs that are kept; the oldest are dropped.
 const LINES_LIMIT: usize = 100_000;
@@ -17,37 +19,80 @@ const PAGE: usize = 1000;
 pub(crate) struct Log {
     lines: VecDeque<Line>,
     next: u64,
+    /// The wall clock's time at the coordinator's time 0, milliseconds since 1970.
+    began: u64,
+    /// What is not in the state yet; `None` if nothing is durable.
+    changes: Option<LogChanges>,
 }
 
-#[derive(Debug)]
-struct Line {
-    number: u64,
-    now: u64,
-    job: JobId,
+/// Changes of the log for the durable state.
+#[derive(Debug, Default)]
+pub(crate) struct LogChanges {
+    pub(crate) added: Vec<Line>,
+    /// Lines that are no longer kept.
+    pub(crate) dropped: Vec<(JobId, u64)>,
+}
+
+/// One line.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) struct Line {
+    /// Of all jobs' lines, from 1.
+    pub(crate) number: u64,
+    pub(crate) job: JobId,
+    /// Milliseconds since 1970.
+    at: u64,
     task: Option<TaskIndex>,
     /// 0 if the line is about no attempt.
     attempt: u32,
     /// The worker's number.
     worker: Option<u32>,
-    kind: LogKind,
+    /// A [`LogKind`], as it is on the wire.
+    kind: i32,
     message: String,
 }
 
 impl Line {
+    /// A line about a job. [`Log::keep`] gives it its number.
+    fn new(now: u64, job: JobId, kind: LogKind, message: String) -> Self {
+        Self { number: 0, job, at: now, task: None, attempt: 0, worker: None, kind: kind.into(), message }
+    }
+
     /// A line about an attempt.
     fn of(now: u64, of: AttemptId, kind: LogKind, message: String) -> Self {
         let AttemptId { job, task, fence } = of;
-        Self { number: 0, now, job, task: Some(task), attempt: fence.number, worker: None, kind, message }
+        Self { task: Some(task), attempt: fence.number, ..Self::new(now, job, kind, message) }
+    }
+}
+
+impl LogChanges {
+    pub(crate) fn is_empty(&self) -> bool {
+        self.added.is_empty() && self.dropped.is_empty()
     }
 }
 
 impl Log {
+    /// The log with the lines of earlier leaders. `began` is the wall clock's time at the coordinator's time 0, milliseconds since 1970.
+    pub(crate) fn restore(mut lines: Vec<Line>, began: u64) -> Self {
+        lines.sort_unstable_by_key(|line| line.number);
+        let next = lines.last().map_or(0, |line| line.number);
+        Self { lines: lines.into(), next, began, changes: Some(LogChanges::default()) }
+    }
+
+    /// Takes the changes that are to be made durable.
+    pub(crate) fn take_changes(&mut self) -> LogChanges {
+        self.changes.as_mut().map(std::mem::take).unwrap_or_default()
+    }
+
+    /// Drops the lines of a job that is forgotten; the state drops its rows with the job's.
+    pub(crate) fn forget(&mut self, job: JobId) {
+        self.lines.retain(|line| line.job != job);
+    }
+
     /// Adds a line about a whole job.
     pub(crate) fn job(&mut self, now: u64, job: JobId, message: impl Into<String>) {
         let message = message.into();
         tracing::info!(job = job.0, "{message}");
-        let kind = LogKind::Other;
-        self.keep(Line { number: 0, now, job, task: None, attempt: 0, worker: None, kind, message });
+        self.keep(Line::new(now, job, LogKind::Other, message));
     }
 
     /// Adds a line about a failed attempt.
@@ -96,8 +141,7 @@ impl Log {
                         }
                         _ => tracing::info!(job = job.0, task = task.0, attempt, "{message}"),
                     }
-                    let (job, task) = (*job, Some(*task));
-                    self.keep(Line { number: 0, now, job, task, attempt, worker: None, kind, message });
+                    self.keep(Line { task: Some(*task), attempt, ..Line::new(now, *job, kind, message) });
                 }
                 Action::JobFinished { job, outcome } => self.job(now, *job, format!("finished: {outcome:?}")),
                 _ => {}
@@ -112,12 +156,12 @@ impl Log {
         let worker = |line: &Line| line.worker.and_then(|worker| names.get(worker as usize).cloned());
         let to_wire = |line: &Line| LogLine {
             number: line.number,
-            millis_ago: now.saturating_sub(line.now),
+            millis_ago: (self.began + now).saturating_sub(line.at),
             task: line.task.map(|task| task.0),
             attempt: line.attempt,
             worker: worker(line).unwrap_or_default(),
             what: line.message.clone(),
-            kind: line.kind.into(),
+            kind: line.kind,
         };
         lines.map(to_wire).collect()
     }
@@ -140,11 +184,13 @@ impl Log {
             let end = (0..=MESSAGE_LIMIT).rev().find(|&end| line.message.is_char_boundary(end));
             line.message.truncate(end.unwrap_or(0));
         }
-        if self.lines.len() >= LINES_LIMIT {
-            self.lines.pop_front();
-        }
         self.next += 1;
-        line.number = self.next;
+        (line.number, line.at) = (self.next, self.began + line.at);
+        let oldest = if self.lines.len() >= LINES_LIMIT { self.lines.pop_front() } else { None };
+        if let Some(changes) = &mut self.changes {
+            changes.dropped.extend(oldest.map(|line| (line.job, line.number)));
+            changes.added.push(line.clone());
+        }
         self.lines.push_back(line);
     }
 }

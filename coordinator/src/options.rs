@@ -37,10 +37,12 @@ pub struct Options {
     pub security: Security,
     /// The coordinator's metrics.
     pub metrics: Arc<Metrics>,
+    /// Milliseconds since 1970: the age of log lines that an earlier leader wrote. Nothing else depends on it.
+    pub wall_clock: fn() -> u64,
 }
 
 impl Options {
-    /// The defaults: 30 s leases, 200 ms waits, no draining, jobs in memory, no journal, loopback only.
+    /// The defaults: 30 s leases, 200 ms waits, no draining, jobs in memory, no journal, loopback only, and a wall clock that stands still.
     pub fn new(store: Store) -> Self {
         Self {
             store,
@@ -52,6 +54,7 @@ impl Options {
             journal: None,
             security: Security::default(),
             metrics: Arc::default(),
+            wall_clock: || 0,
         }
     }
 }

@@ -6,6 +6,7 @@
 //! job/<16 hex>            header of a job, its plan and its parent span
 //! task/<16 hex>/<8 hex>   a task's record
 //! worker/<8 hex>          the name of a worker by its number
+//! log/<16 hex>/<16 hex>   a line of a job's log by its number
 //! ```
 //! Each value is a `scene::frame` with kind, version and checksum. Opening the state fences the previous writer: its next write fails,
 //! however late it comes. This only requires that the store creates objects atomically. Each write is one atomic batch, and returns once
@@ -27,6 +28,8 @@ use slatedb::{CloseReason, Db, ErrorKind, WriteBatch};
 use store::Store;
 use telemetry::TraceParent;
 
+use crate::log::{Line, LogChanges};
+
 /// The database's folder below the store's URL.
 const FOLDER: &str = "state";
 /// Writes after which the write-ahead log is flushed to a table, because replaying many log files makes a takeover slow. slatedb itself
@@ -39,6 +42,7 @@ const JOB: Kind = Kind(*b"job ", 2);
 const UNTRACED_JOB: Kind = Kind(*b"job ", 1);
 const TASK: Kind = Kind(*b"task", 1);
 const NAME: Kind = Kind(*b"name", 1);
+const LINE: Kind = Kind(*b"line", 1);
 
 /// Why the durable state cannot be used.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -77,11 +81,12 @@ pub(crate) struct Batch {
     /// New workers by number.
     pub(crate) workers: BTreeMap<u32, String>,
     pub(crate) next_job: Option<u64>,
+    pub(crate) log: LogChanges,
 }
 
 impl Batch {
     pub(crate) fn is_empty(&self) -> bool {
-        self.changes.is_empty() && self.workers.is_empty() && self.next_job.is_none()
+        self.changes.is_empty() && self.workers.is_empty() && self.next_job.is_none() && self.log.is_empty()
     }
 }
 
@@ -93,6 +98,8 @@ pub(crate) struct Restored {
     /// Names of workers by number.
     pub(crate) workers: Vec<String>,
     pub(crate) next_job: u64,
+    /// Lines of the jobs' logs, in any order.
+    pub(crate) lines: Vec<Line>,
 }
 
 /// The constant part of a job.
@@ -163,6 +170,13 @@ impl State {
     /// Makes a batch durable atomically.
     pub(crate) async fn write(&self, batch: Batch) -> Result<(), StateError> {
         let mut rows = WriteBatch::new();
+        let is_forgotten = |job: &JobId| matches!(batch.changes.headers.get(job), Some(None));
+        for line in batch.log.added.iter().filter(|line| !is_forgotten(&line.job)) {
+            rows.put(line_key(line.job, line.number), frame::encode(LINE, line, &[]));
+        }
+        for (job, number) in batch.log.dropped {
+            rows.delete(line_key(job, number));
+        }
         for (job, header) in batch.changes.headers {
             match (header, batch.origins.get(&job)) {
                 (Some(header), Some(origin)) => {
@@ -172,8 +186,10 @@ impl State {
                 (Some(_), None) => return Err(self.damaged(&format!("job {} has no plan", job.0))),
                 (None, _) => {
                     rows.delete(job_key(job));
-                    for (key, _) in self.read(&format!("task/{:016x}/", job.0)).await? {
-                        rows.delete(key);
+                    for of_job in ["task", "log"] {
+                        for (key, _) in self.read(&format!("{of_job}/{:016x}/", job.0)).await? {
+                            rows.delete(key);
+                        }
                     }
                 }
             }
@@ -223,6 +239,13 @@ impl State {
                 return Err(self.damaged(&format!("'{key}' does not follow the worker before it")));
             }
             restored.workers.push(name);
+        }
+        for (key, value) in self.read("log/").await? {
+            let line: Line = self.decode(LINE, &key, &value)?;
+            if key != line_key(line.job, line.number) {
+                return Err(self.damaged(&format!("'{key}' is line {} of job {}", line.number, line.job.0)));
+            }
+            restored.lines.push(line);
         }
         for (key, value) in self.read("job/").await? {
             let JobRow { header, origin } = self.job_row(&key, &value)?;
@@ -285,6 +308,10 @@ fn job_key(job: JobId) -> String {
 
 fn task_key(job: JobId, task: u32) -> String {
     format!("task/{:016x}/{task:08x}", job.0)
+}
+
+fn line_key(job: JobId, number: u64) -> String {
+    format!("log/{:016x}/{number:016x}", job.0)
 }
 
 /// Whether another coordinator opened the state at the same moment and won. slatedb 0.18 reports this as [`ErrorKind::Data`] without a

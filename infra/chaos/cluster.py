@@ -41,7 +41,8 @@ def docker(*words, **options):
 class Cluster:
     """The cluster. Only one can run at a time, as its name is fixed."""
 
-    def __init__(self, capture, scratch, workers, lease_seconds, checkpoint_seconds):
+    def __init__(self, capture, scratch, workers, lease_seconds, checkpoint_seconds, pages):
+        self.pages = pages
         self.models = scratch / "models"
         self.models.mkdir()
         os.chown(self.models, USER, USER)
@@ -59,8 +60,16 @@ class Cluster:
     def start(self, store):
         """Restarts everything on this store, except the object server if it already runs."""
         self.env["PLAT_STORE"] = store
-        self.compose("rm", "--stop", "--force", "worker", "coordinator", "standby", "certificates")
+        self.compose("rm", "--stop", "--force", "worker", "coordinator", "standby", "certificates", "dashboard")
         self.compose("up", "--detach", "--no-build", "--wait", "coordinator", "standby", "worker")
+
+    def watch(self):
+        """Starts the dashboard and a browser that watches it; returns the browser's process."""
+        self.compose("up", "--detach", "--no-build", "--no-deps", "dashboard")
+        token = docker("exec", self.containers("dashboard")[0], "cat", "/cluster/token").decode().strip()
+        env = self.env | {"URL": f"https://localhost:{self.env.get('DASHBOARD_PORT', '7288')}", "TOKEN": token}
+        words = ["node", str(self.pages / "tests/compose.mjs")]
+        return subprocess.Popen(words, env=env, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
 
     def end(self):
         self.compose("--profile", "*", "down", "--volumes", "--timeout", "5", check=False)
@@ -123,7 +132,7 @@ class Cluster:
         return found[0] if found else None
 
     def logs(self):
-        services = ["store", "bucket", "certificates", "coordinator", "standby", "worker"]
+        services = ["store", "bucket", "certificates", "coordinator", "standby", "worker", "dashboard"]
         return self.compose("logs", "--no-color", "--tail", "40", *services, check=False).decode(errors="replace")
 
     def rados(self, *words, **options):

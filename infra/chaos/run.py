@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Injects faults into a running cluster and compares its model with the bytes that a single undisturbed process makes of the same plan.
 
-    infra/chaos/run.py --capture FOLDER [--seeds 0..20] [--cases kill-worker,corrupt] [--out LINES.jsonl]
+    infra/chaos/run.py --capture FOLDER --pages FOLDER [--seeds 0..20] [--cases kill-worker,corrupt] [--out LINES.jsonl]
 
 The images must exist (.ci/chaos.sh builds them). A case's seed determines when it strikes, its target and its duration. Prints one line
 per case; exit code 1 if a model differs or a job fails.
@@ -93,6 +93,24 @@ def corrupt(cluster, job, chance, about):
     cluster.ask("resume", "1")
 
 
+def watched(cluster, job, chance, about):
+    """A browser watches the dashboard while a worker is silent and the leader dies. Needs --pages."""
+    watcher = cluster.watch()
+    paused = None
+    for line in watcher.stdout:
+        match line.decode().strip().removeprefix("next: "):
+            case "pause":
+                docker("pause", paused := busy_worker(cluster, job, chance))
+            case "go on":
+                docker("unpause", paused)
+            case "kill":
+                kill(cluster.coordinators()[0])
+            case said:
+                about["watcher"] = said
+    if watcher.wait() != 0:
+        raise StepFailed(watcher.stderr.read().decode()[-1500:])
+
+
 CASES = {
     "calm": calm,
     "kill-worker": kill_worker,
@@ -103,6 +121,7 @@ CASES = {
     "pause-leader": pause_leader,
     "fill-disk": fill_disk,
     "corrupt": corrupt,
+    "watched": watched,
 }
 
 
@@ -179,7 +198,7 @@ def run_case(cluster, case, seed, wanted, tries=1):
         wait_for(cluster, job, 0)
         cluster.ask("pause", "1")
         wait_for(cluster, job, 1)
-    elif case != "calm":
+    elif case not in ("calm", "watched"):
         status = wait_for(cluster, job, 0)
         if (done := chance.randrange(status["tasks"] - 1)) > 0:
             wait_for(cluster, job, done)
@@ -223,11 +242,14 @@ def arguments():
     parser.add_argument("--capture", type=Path, required=True, help="a folder of photos, as plat train takes it")
     parser.add_argument("--out", type=Path, help="append a line of JSON for each case")
     parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--pages", type=Path, help="the dashboard's folder with its packages installed, for the case watched")
     parser.add_argument("--keep", action="store_true", help="leave the cluster as it is after the last case")
     chosen = parser.parse_args()
     chosen.cases = chosen.cases.split(",")
     if unknown := [case for case in chosen.cases if case not in CASES]:
         parser.error(f"--cases: {', '.join(unknown)}: choose from {', '.join(CASES)}")
+    if "watched" in chosen.cases and not chosen.pages:
+        parser.error("the case watched needs --pages")
     try:
         chosen.seeds = range(*map(int, chosen.seeds.split("..")))
     except (ValueError, TypeError):
@@ -250,7 +272,7 @@ def main():
     with tempfile.TemporaryDirectory(prefix="plat-chaos-") as scratch:
         scratch = Path(scratch)
         scratch.chmod(0o755)
-        cluster = Cluster(chosen.capture.resolve(), scratch, chosen.workers, LEASE_SECONDS, CHECKPOINT_SECONDS)
+        cluster = Cluster(chosen.capture.resolve(), scratch, chosen.workers, LEASE_SECONDS, CHECKPOINT_SECONDS, chosen.pages)
         alone = lambda *words: finish(cluster.client("--entrypoint", "plat", "client", *words), about) == 0
         try:
             about = {"case": "start", "seed": "-"}

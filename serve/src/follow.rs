@@ -71,9 +71,11 @@ impl Follower {
     async fn session(&mut self, mut client: Client, url: &str, pause: &mut Duration) -> Result<(), Status> {
         let about = client.about(proto::AboutRequest {}).await?.into_inner();
         let store = Store::open(&about.store_url).map_err(|error| Status::failed_precondition(error.to_string()))?;
+        // The next leader on a store goes on with the log of the one before; jobs of other stores have logs of their own.
+        if self.store.as_ref().is_none_or(|before| before.url() != store.url()) {
+            self.logs.clear();
+        }
         self.store = Some(store);
-        // Another coordinator numbers its lines anew.
-        self.logs.clear();
         // Jobs whose stream is open, and those that were watched at all: one that has ended has to be watched once.
         let (mut open, mut seen) = (BTreeSet::new(), BTreeSet::new());
         let mut watching = JoinSet::new();

@@ -26,6 +26,8 @@ use common::{BACKEND, fake, plan_of, result_of, task, worker_options};
 
 /// Interval at which the lease is read.
 const QUICK: Duration = Duration::from_millis(10);
+/// Milliseconds.
+const AGE_OF_FIRST: u64 = 86_400_000;
 /// Longer than any test.
 const LONG: Duration = Duration::from_secs(3600);
 
@@ -63,8 +65,10 @@ impl Host {
         let durable = Durable { beat, patience, ..Durable::new(&address).unwrap() };
         // No speculative attempts: each task is to be executed once.
         let settings = Settings { speculation: false, ..Settings::default() };
-        let options =
-            Options { settings, wait_millis: 5, durable: Some(durable), journal, ..Options::new(store.clone()) };
+        // Of a leader that began a day later, if there was one before.
+        let wall_clock: fn() -> u64 = if journal.is_some() { || AGE_OF_FIRST + 3_600_000 } else { || 0 };
+        let durable = Some(durable);
+        let options = Options { settings, wait_millis: 5, durable, journal, wall_clock, ..Options::new(store.clone()) };
         let stop = CancellationToken::new();
         let serving = tokio::spawn(serve(listener, options, stop.clone().cancelled_owned()));
         let client = proto::connect(&address, &Access::default()).unwrap();
@@ -103,6 +107,10 @@ impl Host {
         reply.map(|reply| reply.into_inner().accepted)
     }
 
+    async fn log(&mut self, job: u64) -> Vec<proto::LogLine> {
+        self.client.logs(proto::LogsRequest { job, after: 0 }).await.unwrap().into_inner().lines
+    }
+
     async fn status(&mut self, job: u64) -> StatusReply {
         self.client.status(proto::StatusRequest { job }).await.unwrap().into_inner()
     }
@@ -117,12 +125,23 @@ async fn acknowledged_changes_survive_a_kill_and_the_epoch_rises() {
     assert!(first.complete(root, b"root").await.unwrap());
     let [one, two] = [first.lease("w1").await, first.lease("w2").await];
     assert_eq!((one.epoch, two.epoch), (1, 1));
+    let before = first.log(job).await;
     first.kill().await;
 
     let (journal, mut lines) = tokio::sync::mpsc::channel(10_000);
     let mut second = Host::start_with(&store, QUICK, Duration::from_millis(50), Some(journal)).await.leads().await;
     let status = second.status(job).await;
     assert_eq!((status.done, status.leased, status.ready, status.waiting), (1, 2, 2, 8));
+    // The log goes on: every line that was shown, with its number, then the change of leaders.
+    let after = second.log(job).await;
+    let told = |lines: &[proto::LogLine]| -> Vec<_> {
+        lines.iter().map(|line| (line.number, line.kind, line.task, line.worker.clone(), line.what.clone())).collect()
+    };
+    assert_eq!(told(&before), told(&after[..before.len()]));
+    assert!(before.iter().any(|line| line.worker == "w2" && line.what == "granted"), "{before:?}");
+    let [changed] = &after[before.len()..] else { panic!("{after:?}") };
+    assert!(changed.number > before.len() as u64 && changed.what.contains("another coordinator leads"), "{changed:?}");
+    assert!(changed.millis_ago < 3_600_000 && after[0].millis_ago >= AGE_OF_FIRST, "{after:?}");
     // Running attempts go on under the fencing token of their grant.
     assert!(
         !second
@@ -396,6 +415,8 @@ async fn a_finished_job_is_forgotten_with_the_objects_that_only_it_refers_to() {
     let mut next = Host::start(&store, QUICK, Duration::from_millis(50)).await.leads().await;
     gone(next.client.status(proto::StatusRequest { job }).await.unwrap_err());
     assert_eq!(next.submit(&store).await, job + 1);
+    gone(next.client.logs(proto::LogsRequest { job, after: 0 }).await.unwrap_err());
+    assert_eq!(next.log(job + 1).await[0].what.split(':').next(), Some("submitted"));
 }
 
 #[tokio::test(flavor = "multi_thread")]

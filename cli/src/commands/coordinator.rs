@@ -15,6 +15,7 @@ use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 
 use crate::args::CoordinatorArgs;
+use crate::clock::unix_ms;
 use crate::failure::{Failure, cannot};
 use crate::output::Output;
 use crate::remote::{finder_in, key_pair, pem, runtime, token};
@@ -52,7 +53,7 @@ pub(crate) fn run(args: &CoordinatorArgs, output: &Output) -> Result<(), Failure
         let store = Store::open(&absolute(&args.store)?)?;
         let advertised = advertised_url(args, address, security.identity.is_some())?;
         let durable = Some(Durable::new(&advertised)?);
-        let mut options = Options { durable, security, ..Options::new(store.clone()) };
+        let mut options = Options { durable, security, wall_clock: unix_ms, ..Options::new(store.clone()) };
         options.settings.lease_millis = (args.lease_seconds * 1e3) as u64;
         let journal = match &args.journal {
             None => None,

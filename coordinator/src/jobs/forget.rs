@@ -38,6 +38,7 @@ impl Jobs {
         if deleted {
             self.control(now, id, What::Forget(proto::Forget {}))?;
             self.jobs.remove(&JobId(id));
+            self.log.forget(JobId(id));
         }
         Ok(())
     }

@@ -5,6 +5,7 @@ use std::sync::Arc;
 use cluster::{Action, Event, JobSpec, Offer, Scheduler, TaskIndex, TaskNode, TaskState, WorkerId};
 
 use super::*;
+use crate::log::Log;
 
 async fn open(store: &Store) -> (State, Restored) {
     State::take_over(store, 0).await.unwrap()
@@ -157,12 +158,52 @@ async fn job_rows_without_a_span_are_read() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn lines_of_logs_are_kept_until_they_are_dropped_or_their_job_is() {
+    let store = Store::open("memory://").unwrap();
+    let (state, _) = open(&store).await;
+    let mut scheduler = Scheduler::new(cluster::Settings::default(), 1);
+    let mut log = Log::restore(Vec::new(), 1000);
+    for job in [1, 2] {
+        step(&mut scheduler, &state, Event::Submitted { job: JobId(job), spec: spec(3) }).await;
+        log.job(5, JobId(job), format!("submitted {job}"));
+        log.job(6, JobId(job), "second line");
+    }
+    let added = log.take_changes();
+    let [first, .., last] = &added.added[..] else { panic!("{added:?}") };
+    let (first, last) = ((first.job, first.number), last.clone());
+    state.write(Batch { log: added, ..Batch::default() }).await.unwrap();
+    let dropped = LogChanges { added: Vec::new(), dropped: vec![first] };
+    state.write(Batch { log: dropped, ..Batch::default() }).await.unwrap();
+    drop(state);
+    let (state, restored) = open(&store).await;
+    assert_eq!(restored.lines.len(), 3);
+    assert!(restored.lines.contains(&last) && restored.lines.iter().all(|line| (line.job, line.number) != first));
+
+    // A line that is written with the end of its job leaves nothing behind.
+    step(&mut scheduler, &state, Event::CancelRequested { job: JobId(2) }).await;
+    let forget = Event::ForgetRequested { job: JobId(2) };
+    let actions = scheduler.step(1, forget.clone());
+    log.job(7, JobId(2), "requested: forget");
+    let changes = Changes::of(&scheduler, &forget, &actions);
+    state.write(Batch { changes, log: log.take_changes(), ..Batch::default() }).await.unwrap();
+    drop(state);
+    let (_, restored) = open(&store).await;
+    let [line] = &restored.lines[..] else { panic!("{:?}", restored.lines) };
+    assert_eq!(line.job, JobId(1));
+    // Numbers go on.
+    let mut log = Log::restore(restored.lines, 2000);
+    log.job(0, JobId(1), "third line");
+    assert!(log.take_changes().added[0].number > 2);
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn damaged_rows_are_named() {
     let store = Store::open("memory://").unwrap();
     for (key, value, words) in [
         ("worker/00000001", frame::encode(NAME, &"w", &[]), "does not follow the worker"),
         ("worker/00000000", b"nonsense".to_vec(), "not a plat 'name' frame"),
         ("next_job", frame::encode(NAME, &"w", &[]), "'next_job'"),
+        ("log/0000000000000001/0000000000000001", frame::encode(NAME, &"w", &[]), "'log/0000000000000001/"),
         ("job/0000000000000001", frame::encode(JOB, &"w", &[]), "'job/0000000000000001'"),
     ] {
         let (state, _) = open(&store).await;
