@@ -27,15 +27,14 @@ pub(crate) struct Objects {
 }
 
 impl Objects {
-    /// Reads the files for a capture, opened from this path, and a backend, before any photo is read.
+    /// Reads the files for a capture, opened from this path, before any photo is read.
     ///
     /// # Errors
     /// A file that is no detector, objects that do not fit the photos, a capture without labels, a detector that cannot be run; with
-    /// the perception-aligned loss a network without a gradient, or a GPU.
+    /// the perception-aligned loss a network without a gradient.
     pub(crate) fn of(
         (zones, aligned): (&ZoneOptions, &AlignedOptions),
         (capture, source): (&Path, &Source),
-        backend: &str,
     ) -> Result<Self, BadInput> {
         let (mut known, mut detector) = (None, None);
         if let Some(path) = &zones.finder.zone_detector {
@@ -43,11 +42,6 @@ impl Objects {
             let artefact = file.artefact();
             let DetectorFile { name, onnx, card } = file;
             if aligned.weight() > 0.0 {
-                if !backend.starts_with("cpu-") {
-                    let problem = format!("is computed on the CPU, and the job is for {backend}");
-                    let advice = "give --backend cpu, or leave the loss out";
-                    return Err(BadInput::new("--aligned-weight", problem, advice));
-                }
                 Aligned::new(&name, &onnx, card.as_deref(), Weights::default())?;
             }
             let loaded = Detector::load(&name, onnx, card.as_deref())?;

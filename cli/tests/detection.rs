@@ -20,9 +20,7 @@ use store::{BlockingStore, Store};
 /// A plan with zones of a small network's objects, trained in one process into the folder `calm`.
 fn calm(at: &Path, views: u32) -> (Plan, Value) {
     city(at, views, 64, 48);
-    let tiny = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../perceive/tests/yolov8_tiny.onnx");
-    fs::copy(tiny, at.join("tiny.onnx")).unwrap();
-    fs::write(at.join("tiny.toml"), "classes = ['car', 'person', 'bench']\nscore = 0.5").unwrap();
+    common::write_tiny(at);
     #[rustfmt::skip]
     let words = [
         "train", "city", "--steps", "200", "--budget", "600", "--levels", "1", "--blocks", "tree", "--detector", "tiny.onnx",

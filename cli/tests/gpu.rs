@@ -113,6 +113,35 @@ fn exposures_and_poses_train_on_a_gpu_as_on_the_cpu() {
 }
 
 #[test]
+fn a_detectors_loss_is_in_training_on_a_gpu_as_on_the_cpu() {
+    if gpu().is_none() {
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    common::city(at, 16, 96, 64);
+    common::write_tiny(at);
+    let train = |on, out, weight| {
+        let words = ["--detector", "tiny.onnx", "--zone-weight", "0", "--aligned-weight", weight, "--out", out];
+        done(at, on, &words)["psnr"].as_f64().unwrap()
+    };
+    let [cpu, one, _, _] = [("cpu", "cpu", "0.1"), ("gpu", "one", "0.1"), ("gpu", "two", "0.1"), ("gpu", "plain", "0")]
+        .map(|(on, out, weight)| train(on, out, weight));
+    println!("{cpu:.2} dB on the CPU, {one:.2} dB on the GPU");
+    assert!((cpu - one).abs() < 0.3, "{cpu} {one}");
+    let bytes = |out: &str| std::fs::read(at.join(out).join("merged.ply")).unwrap();
+    assert!(bytes("one") == bytes("two") && bytes("one") != bytes("plain"));
+    let values = |out: &str| -> Vec<f64> {
+        let log = std::fs::read_to_string(at.join(out).join("metrics.jsonl")).unwrap();
+        let lines = log.lines().map(|line| serde_json::from_str::<Value>(line).unwrap());
+        lines.filter_map(|line| line["aligned_loss"].as_f64()).collect()
+    };
+    let (on_cpu, on_gpu) = (values("cpu"), values("one"));
+    println!("{on_cpu:?} {on_gpu:?}");
+    assert!(on_gpu.iter().any(|loss| *loss > 0.0) && on_gpu.len() == on_cpu.len());
+}
+
+#[test]
 fn too_little_memory_ends_the_job_and_names_the_block() {
     if gpu().is_none() {
         return;

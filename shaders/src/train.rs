@@ -93,8 +93,8 @@ pub struct Photo {
     pub first_depth: u32,
     /// Number of the exposure, from 1; 0: the render is shown as it is.
     pub exposure: u32,
-    /// Padding.
-    pub padding: u32,
+    /// Word of the first slope of the picture loss, three planes; 0: there are none.
+    pub first_slope: u32,
 }
 
 /// The target photos of a step. Uniform.
@@ -113,8 +113,10 @@ pub struct Photos {
     pub extras: u32,
     /// Weight of the depth loss; 0 leaves it out. Needs `extras`.
     pub depth_weight: f32,
+    /// Sum of the views' picture losses, which the host computed, each times its weight.
+    pub picture_loss: f32,
     /// Padding.
-    pub padding: [u32; 2],
+    pub padding: u32,
     /// The photos; only the first `count` are defined.
     pub photo: [Photo; MAX_VIEWS],
 }

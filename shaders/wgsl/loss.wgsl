@@ -9,8 +9,8 @@
 @group(0) @binding(0) var<uniform> photos: Photos;
 // Planes per view: red, green, blue, transmittance and, with extras, depth and trainable alpha.
 @group(0) @binding(1) var<storage, read> frame: array<f32>;
-// Bytes per photo: red, green and blue planes, then the mask if there is one; then words: the pixel weights and the
-// target depths, each if there are any.
+// Bytes per photo: red, green and blue planes, then the mask if there is one; then words: the pixel weights, the
+// target depths and the slopes of the picture loss (three planes), each if there are any.
 @group(0) @binding(2) var<storage, read> photo_words: array<u32>;
 // Per view: dSSIM/dmu, dSSIM/dE[x^2], dSSIM/dE[xy], each times the pixel's weight; three colour planes each.
 @group(0) @binding(3) var<storage, read_write> partials: array<f32>;
@@ -302,6 +302,7 @@ fn finish_loss(@builtin(local_invocation_index) local: u32) {
     if status.overflow != 0u {
         return;
     }
+    loss += photos.picture_loss;
     state.steps_done++;
     state.loss = loss / f32(photos.count);
     if is_finite(loss) {
@@ -386,5 +387,9 @@ fn loss_backward(
     let scales = state.gradient_scales[at.view];
     let d_l1 = select(select(0.0, -w, x < y), w, y < x);
     let d_ssim = means[0] + 2.0 * x * means[1] + y * means[2];
-    upstream[5u * photo.first_pixel + plane + i] = fma(d_l1, scales.x, d_ssim * scales.y);
+    var slope = fma(d_l1, scales.x, d_ssim * scales.y);
+    if photo.first_slope != 0u {
+        slope += bitcast<f32>(photo_words[photo.first_slope + plane + i]);
+    }
+    upstream[5u * photo.first_pixel + plane + i] = slope;
 }

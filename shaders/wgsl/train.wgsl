@@ -39,7 +39,8 @@ struct Photo {
     first_depth: u32,
     // Number of the exposure, from 1; 0: the render is shown as it is.
     exposure: u32,
-    padding: u32,
+    // Word of the first slope of the picture loss, three planes; 0: there are none.
+    first_slope: u32,
 }
 
 // The target photos of a step.
@@ -55,7 +56,9 @@ struct Photos {
     extras: u32,
     // Weight of the depth loss; 0 leaves it out.
     depth_weight: f32,
-    padding: vec2<u32>,
+    // Sum of the views' picture losses, which the host computed, each times its weight.
+    picture_loss: f32,
+    padding: u32,
     photo: array<Photo, MAX_VIEWS>,
 }
 

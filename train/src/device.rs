@@ -44,7 +44,7 @@ impl Backend {
     /// `given` are the poses that displacements of the state refer to.
     ///
     /// # Errors
-    /// A GPU that fails or has too little memory, or a picture loss on a GPU.
+    /// A GPU that fails or has too little memory.
     #[cfg_attr(not(feature = "gpu"), allow(unused_variables))]
     pub(crate) fn open<'a>(
         &self,
@@ -56,13 +56,8 @@ impl Backend {
     ) -> Result<Box<dyn TrainDevice + 'a>, TrainError> {
         Ok(match self {
             Self::Cpu => Box::new(cpu::CpuDevice::new(lambda, picture_loss, context, given)),
-            // Such a step would wait for a read-back, and its last bits depend on the CPU, which a GPU's name does not tell.
             #[cfg(feature = "gpu")]
-            Self::Gpu(_) if picture_loss.is_some() => {
-                return Err(TrainError::Device("a loss of whole pictures is computed on the CPU backend only".into()));
-            }
-            #[cfg(feature = "gpu")]
-            Self::Gpu(gpu) => Box::new(gpu::GpuDevice::new(gpu, state, lambda, context, given)?),
+            Self::Gpu(gpu) => Box::new(gpu::GpuDevice::new(gpu, state, lambda, picture_loss, context, given)?),
         })
     }
 }

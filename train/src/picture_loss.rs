@@ -60,7 +60,7 @@ pub(crate) fn add_picture_loss(
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use std::sync::Arc;
 
     use glam::{DQuat, DVec3, Vec3};
@@ -82,7 +82,7 @@ mod tests {
     const HEIGHT: u32 = 20;
 
     /// Σ (picture − photo)³, which tells signs apart and is smooth.
-    struct Cubes;
+    pub(crate) struct Cubes;
 
     impl PictureLoss for Cubes {
         fn evaluate(

@@ -61,7 +61,8 @@ impl ZoneOptions {
 #[serde(rename_all = "kebab-case")]
 pub(crate) struct AlignedOptions {
     /// Weight of the perception-aligned loss in the last 30 % of the steps and while pruning: what --detector sees in renders shall be
-    /// what it sees in the photos. From 0, the default, which leaves it out, to 1000; above 0.01 pictures suffer. On the CPU only
+    /// what it sees in the photos. From 0, the default, which leaves it out, to 1000; above 0.01 pictures suffer. The detector runs on the
+    /// CPU, also beside a GPU, whose results then depend on the CPU's instruction set
     #[arg(long, value_name = "A", value_parser = aligned_weight, requires = "zone_detector")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) aligned_weight: Option<f64>,

@@ -56,7 +56,7 @@ pub(crate) fn run(args: &SubmitArgs, output: &Output) -> Result<(), Failure> {
     let mut remote = Remote::open(&args.connection)?;
     let about = remote.call(async |client: &mut Client| client.about(proto::AboutRequest {}).await)?;
     let backend = backend_of(args, &about, output)?;
-    let objects = Objects::of((&args.zones, &args.aligned), (&args.capture, &source), &backend)?;
+    let objects = Objects::of((&args.zones, &args.aligned), (&args.capture, &source))?;
     let plan = objects.add_to(Plan { backend: backend.clone(), ..plan }, &planned_for);
     check_plan(&plan, &planned_for, output)?;
     if let Some(out) = &args.out {

@@ -199,7 +199,7 @@ fn prepare(args: &TrainArgs, clock: &Stopwatch, output: &Output) -> Result<Prepa
     // The plan is checked before any photo is read.
     let (planned_for, plan) = plan_of(&source, &args.plan)?;
     let backend = backend::open(args.backend)?;
-    let objects = Objects::of((&args.zones, &args.aligned), (&args.capture, &source), &backend.name())?;
+    let objects = Objects::of((&args.zones, &args.aligned), (&args.capture, &source))?;
     let plan = objects.add_to(Plan { backend: backend.name(), ..plan }, &planned_for);
     check_plan(&plan, &planned_for, output)?;
     make_folder(&args.out)?;

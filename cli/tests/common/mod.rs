@@ -4,12 +4,21 @@
 #[cfg(unix)]
 pub(crate) mod cluster;
 
-use std::path::Path;
+use std::fs;
+use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
 use city::{CitySettings, Layout, Traffic};
 use dataset::synth::{self, Settings};
 use serde_json::Value;
+
+/// A small detector of random weights, with its card.
+pub(crate) fn write_tiny(at: &Path) -> Vec<u8> {
+    let onnx = fs::read(PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../perceive/tests/yolov8_tiny.onnx")).unwrap();
+    fs::write(at.join("tiny.onnx"), &onnx).unwrap();
+    fs::write(at.join("tiny.toml"), "classes = ['car', 'person', 'bench']\nscore = 0.5").unwrap();
+    onnx
+}
 
 /// The command with these arguments in a folder, not yet started.
 pub(crate) fn command(folder: &Path, words: &[&str]) -> Command {

@@ -7,7 +7,8 @@
 //!         ─loss_backward→ upstream ─expose_backward→ upstream ─backward→ gradients ─adam→ splats
 //!                        └→ sums ─exposure_step→ exposures   └→ pose gradients ─pose_step→ displacements
 //! ```
-//! A step reads nothing back. The device itself checks that the loss is finite and counts finished steps in its
+//! A step reads nothing back, but one with a picture loss, which the host computes from the frames before it submits the step:
+//! its slopes are then a part of the photos. The device itself checks that the loss is finite and counts finished steps in its
 //! optimiser state. When a step has more tile pairs than the pair buffer holds, that step and all after it change
 //! nothing. The host finds this at the next synchronisation, enlarges the buffer and resubmits those steps. The result
 //! therefore depends neither on the buffer's size nor on when the host synchronises.
@@ -30,12 +31,15 @@ use shaders::{MAX_VIEWS, TILE, WORKGROUP_SIZE, args};
 
 use self::exposures::{GpuExposures, LossBuffers};
 use self::poses::GpuPoses;
+use super::cpu::pixel_weights;
 use super::step::{MAX_VIEWS_PER_STEP, StatePart, Step, TrainDevice, ViewSample};
 use crate::checkpoint::State;
 use crate::coarse_to_fine::Tally;
 use crate::error::TrainError;
+use crate::exposure::expose;
 use crate::growth::DensificationStats;
 use crate::optimiser::{self, Adam};
+use crate::picture_loss::{PictureLoss, add_picture_loss};
 use crate::pose::GivenPoses;
 
 mod exposures;
@@ -51,11 +55,12 @@ const _: () = assert!(MAX_VIEWS_PER_STEP as usize == MAX_VIEWS);
 const BANKS: [usize; 5] = [0, column::SH + 3, column::SH + 18, column::SH + 33, column::SH + 48];
 
 /// The training state on a GPU.
-pub(crate) struct GpuDevice {
+pub(crate) struct GpuDevice<'a> {
     gpu: Arc<Gpu>,
     renderer: GpuRenderer,
     kernels: Kernels,
     lambda: f32,
+    picture_loss: Option<&'a dyn PictureLoss>,
     splats: GpuSplats,
     context: Option<GpuSplats>,
     /// First and second moments, with the splats' stride.
@@ -64,7 +69,7 @@ pub(crate) struct GpuDevice {
     stats: GrowableBuffer,
     /// One [`OptimiserState`].
     optimiser: Buffer,
-    /// Photos with their masks, one byte per value, then pixel weights and target depths, one float per pixel.
+    /// Photos with their masks, one byte per value, then pixel weights, target depths and slopes of the picture loss, as floats.
     photo: GrowableBuffer,
     /// Derivatives of SSIM.
     partials: GrowableBuffer,
@@ -73,10 +78,26 @@ pub(crate) struct GpuDevice {
     exposures: GpuExposures,
     poses: GpuPoses,
     /// Submitted steps that are not known to be finished.
-    pending: VecDeque<Step>,
+    pending: VecDeque<Submission>,
     /// Finished steps at the last synchronisation.
     done: u32,
     in_flight: VecDeque<wgpu::SubmissionIndex>,
+}
+
+/// What a step was submitted with.
+#[derive(Clone)]
+struct Submission {
+    step: Step,
+    pictures: Option<Pictures>,
+}
+
+/// The picture loss of a step, times its weight.
+#[derive(Clone, Default)]
+struct Pictures {
+    /// Sum over the samples.
+    loss: f64,
+    /// Its derivative with respect to each sample's shown picture, three planes.
+    slopes: Vec<Vec<f32>>,
 }
 
 struct Kernels {
@@ -89,12 +110,13 @@ struct Kernels {
     rearrange: Kernel,
 }
 
-impl GpuDevice {
+impl<'a> GpuDevice<'a> {
     /// Uploads a state. `lambda` is the weight of D-SSIM in the loss; `given` are the poses that displacements refer to.
     pub(crate) fn new(
         gpu: &Arc<Gpu>,
         state: &State,
         lambda: f32,
+        picture_loss: Option<&'a dyn PictureLoss>,
         context: Option<&Splats>,
         given: &Arc<GivenPoses>,
     ) -> Result<Self, TrainError> {
@@ -113,6 +135,7 @@ impl GpuDevice {
             renderer: GpuRenderer::new(Arc::clone(gpu))?,
             kernels,
             lambda,
+            picture_loss,
             splats: GpuSplats::upload(gpu, &state.splats, state.splats.len())?,
             context: context.map(|context| GpuSplats::upload(gpu, context, context.len())).transpose()?,
             moments: [moments()?, moments()?],
@@ -166,11 +189,10 @@ impl GpuDevice {
     }
 
     /// Submits a step.
-    fn submit(&mut self, step: &Step) -> Result<(), GpuError> {
+    fn submit(&mut self, Submission { step, pictures }: &Submission) -> Result<(), GpuError> {
         let gpu = Arc::clone(&self.gpu);
-        // Without a picture loss, which `Backend::open` refuses.
         let Step { samples, options, rates, depth_weight, exposure_rate, pose_rates, .. } = step;
-        let (photos, bytes) = self.photos(samples, options.extras, *depth_weight);
+        let (photos, bytes) = self.photos(samples, options.extras, *depth_weight, pictures.as_ref());
         let area: usize = samples.iter().map(|sample| sample.photo.area()).sum();
         let (of_photos, tiles) = (photos.tiles, 3 * photos.tiles);
         self.photo.reserve(&gpu, bytes.len() as u64)?;
@@ -180,12 +202,8 @@ impl GpuDevice {
         let mut encoder = gpu.encoder();
         gpu.write(&mut encoder, &self.photo, 0, &bytes);
         self.exposures.prepare(&gpu, &mut encoder, samples, of_photos)?;
-        let cameras: Vec<Camera> = samples.iter().map(|sample| sample.camera).collect();
         let rows = self.poses.rows(samples);
-        let displacements = self.poses.displacements(&rows);
-        let context = self.context.as_ref().map(GpuPart::beside);
-        let parts = context.as_slice();
-        self.renderer.forward_displaced(&mut encoder, &self.splats, parts, &cameras, options, displacements)?;
+        self.forward(&mut encoder, step, &rows)?;
         let photos = gpu.uniform(&photos);
         {
             let pass = &mut encoder.begin_compute_pass(&wgpu::ComputePassDescriptor::default());
@@ -219,8 +237,56 @@ impl GpuDevice {
         }
     }
 
+    /// Encodes the forward pass of a step; `rows` are those of its samples' poses.
+    fn forward(
+        &mut self,
+        encoder: &mut wgpu::CommandEncoder,
+        Step { samples, options, .. }: &Step,
+        rows: &[Option<u32>],
+    ) -> Result<(), GpuError> {
+        let cameras: Vec<Camera> = samples.iter().map(|sample| sample.camera).collect();
+        let displacements = self.poses.displacements(rows);
+        let context = self.context.as_ref().map(GpuPart::beside);
+        self.renderer.forward_displaced(encoder, &self.splats, context.as_slice(), &cameras, options, displacements)
+    }
+
+    /// The picture loss of a step, of frames that are drawn for it alone. No submitted step is pending.
+    fn pictures(&mut self, of: &dyn PictureLoss, step: &Step) -> Result<Pictures, TrainError> {
+        let rows = self.poses.rows(&step.samples);
+        loop {
+            let mut encoder = self.gpu.encoder();
+            self.forward(&mut encoder, step, &rows)?;
+            self.gpu.submit(encoder)?;
+            if !self.renderer.grow_after_overflow()? {
+                break;
+            }
+        }
+        let trained = self.exposures.download(&self.gpu)?;
+        let (mut weights, mut exposed) = (Vec::new(), Vec::new());
+        let mut pictures = Pictures::default();
+        for (n, sample) in step.samples.iter().enumerate() {
+            let frame = self.renderer.read_frame(n)?;
+            pixel_weights(&frame, &sample.photo, self.context.is_some(), &mut weights);
+            let exposure = trained.as_ref().map_or(sample.exposure, |trained| trained.of(sample.view));
+            let shown = exposure.as_ref().map_or(&frame.colour, |exposure| {
+                expose(exposure, &frame.colour, &mut exposed);
+                &exposed
+            });
+            let mut slopes = vec![0.0; shown.len()];
+            pictures.loss += add_picture_loss(of, step.picture_weight, sample, shown, &weights, &mut slopes)?;
+            pictures.slopes.push(slopes);
+        }
+        Ok(pictures)
+    }
+
     /// The layout of the photos in the photo buffer, and the bytes of all photos.
-    fn photos(&self, samples: &[ViewSample], extras: bool, depth_weight: f32) -> (Photos, Vec<u8>) {
+    fn photos(
+        &self,
+        samples: &[ViewSample],
+        extras: bool,
+        depth_weight: f32,
+        pictures: Option<&Pictures>,
+    ) -> (Photos, Vec<u8>) {
         let (mut bytes, mut first_pixel) = (Vec::new(), 0);
         let mut photos = Photos {
             count: samples.len() as u32,
@@ -228,6 +294,7 @@ impl GpuDevice {
             share_weighted: self.context.is_some().into(),
             extras: extras.into(),
             depth_weight,
+            picture_loss: pictures.map_or(0.0, |pictures| pictures.loss as f32),
             ..Photos::zeroed()
         };
         for (n, (layout, sample)) in photos.photo.iter_mut().zip(samples).enumerate() {
@@ -250,16 +317,17 @@ impl GpuDevice {
             bytes.extend_from_slice(&photo.rgb);
             bytes.extend_from_slice(photo.mask.as_deref().unwrap_or_default());
             bytes.resize(bytes.len().next_multiple_of(4), 0);
-            let mut append = |plane: &Option<Vec<f32>>| match plane {
-                Some(plane) => {
+            let mut append = |planes: Option<&Vec<f32>>| match planes {
+                Some(planes) => {
                     let first_word = (bytes.len() / 4) as u32;
-                    bytes.extend_from_slice(bytemuck::cast_slice(plane));
+                    bytes.extend_from_slice(bytemuck::cast_slice(planes));
                     first_word
                 }
                 None => 0,
             };
-            layout.first_weight = append(&photo.weights);
-            layout.first_depth = if depth_weight > 0.0 { append(&photo.depth) } else { 0 };
+            layout.first_weight = append(photo.weights.as_ref());
+            layout.first_depth = append(photo.depth.as_ref().filter(|_| depth_weight > 0.0));
+            layout.first_slope = append(pictures.map(|pictures| &pictures.slopes[n]));
         }
         (photos, bytes)
     }
@@ -367,19 +435,24 @@ impl GpuDevice {
             if !grown {
                 return Err(GpuError::Failed("submitted steps were neither finished nor skipped".into()));
             }
-            let again: Vec<Step> = self.pending.iter().cloned().collect();
-            again.iter().try_for_each(|step| self.submit(step))?;
+            let again: Vec<Submission> = self.pending.iter().cloned().collect();
+            again.iter().try_for_each(|submission| self.submit(submission))?;
         }
     }
 }
 
-impl TrainDevice for GpuDevice {
+impl TrainDevice for GpuDevice<'_> {
     fn step(&mut self, _: &mut State, step: Step) -> Result<(), TrainError> {
-        if self.pending.iter().map(|step| step.samples.len()).sum::<usize>() >= SYNC_EVERY {
+        let of_pictures = self.picture_loss.filter(|_| step.picture_weight > 0.0);
+        let samples = self.pending.iter().map(|submission| submission.step.samples.len()).sum::<usize>();
+        // A picture is drawn from splats that all steps before it have changed.
+        if samples >= SYNC_EVERY || of_pictures.is_some() {
             self.synchronise()?;
         }
-        self.submit(&step)?;
-        self.pending.push_back(step);
+        let pictures = of_pictures.map(|of| self.pictures(of, &step)).transpose()?;
+        let submission = Submission { step, pictures };
+        self.submit(&submission)?;
+        self.pending.push_back(submission);
         Ok(())
     }
 

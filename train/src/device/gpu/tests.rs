@@ -9,6 +9,7 @@ use crate::coarse_to_fine::CoarseToFine;
 use crate::depth_loss::depth_loss;
 use crate::exposure::ExposureTraining;
 use crate::loss::PhotometricLoss;
+use crate::picture_loss::tests::Cubes;
 use crate::pose::{PoseRates, PoseTraining};
 use crate::random::{bits, uniform};
 use crate::view::TrainView;
@@ -133,7 +134,7 @@ fn stages_agree_with_the_cpu() {
     for (sh_degree, masked, extras, depth_weight) in cases.into_iter().chain(deep) {
         let context = extras.then(|| cloud(7, 60, 3));
         let mut state = new_state(cloud(3, 300, sh_degree));
-        let mut device = GpuDevice::new(&gpu, &state, 0.2, context.as_ref(), &none()).unwrap();
+        let mut device = GpuDevice::new(&gpu, &state, 0.2, None, context.as_ref(), &none()).unwrap();
         // The second step starts with nonzero moments.
         for key in [1, 2] {
             let mut step = step(masked, extras, key);
@@ -200,20 +201,26 @@ fn stages_agree_with_the_cpu() {
 /// Samples of several sizes, one of them masked, in front of a context. The CPU renders them one after the other.
 #[test]
 fn steps_of_several_samples_agree_with_the_cpu() {
-    several_samples_agree_with_the_cpu(0.0);
+    several_samples_agree_with_the_cpu(0.0, 0.0);
 }
 
 /// The same, with pixel weights and target depths in two of the samples.
 #[test]
 fn steps_of_several_samples_with_weights_and_depth_agree_with_the_cpu() {
-    several_samples_agree_with_the_cpu(1.0);
+    several_samples_agree_with_the_cpu(1.0, 0.0);
 }
 
-fn several_samples_agree_with_the_cpu(depth_weight: f32) {
+/// The same, with a loss of whole pictures that the host computes; one sample has an exposure.
+#[test]
+fn steps_of_several_samples_with_a_picture_loss_agree_with_the_cpu() {
+    several_samples_agree_with_the_cpu(1.0, 0.02);
+}
+
+fn several_samples_agree_with_the_cpu(depth_weight: f32, picture_weight: f32) {
     let Some(gpu) = gpu() else { return };
     let context = cloud(7, 60, 3);
     let begin = new_state(cloud(3, 300, 2));
-    let samples: Vec<ViewSample> = [[75, 53], [16, 16], [33, 90], [64, 48]]
+    let mut samples: Vec<ViewSample> = [[75, 53], [16, 16], [33, 90], [64, 48]]
         .into_iter()
         .zip(1..)
         .map(|(size, key)| (key, sample(key == 3, key, size, DVec3::new(0.3 * key as f64, 0.0, 0.5))))
@@ -222,12 +229,16 @@ fn several_samples_agree_with_the_cpu(depth_weight: f32) {
             false => sample,
         })
         .collect();
+    let picture_loss = (picture_weight > 0.0).then_some(&Cubes as &dyn PictureLoss);
+    if picture_loss.is_some() {
+        samples[1].exposure = Some(Exposure([[1.1, 0.1, 0.0, 0.05], [0.0, 0.9, 0.1, 0.0], [0.2, 0.0, 0.8, -0.05]]));
+    }
     let one = |samples: &[ViewSample]| {
         let mut step = step(false, true, 1);
         // Regularisers large enough to exceed rounding errors.
         let rates = step.rates.as_mut().unwrap();
         (rates.opacity_reg, rates.needle_reg) = (30.0, 30.0);
-        step.depth_weight = depth_weight;
+        (step.depth_weight, step.picture_weight) = (depth_weight, picture_weight);
         Step { samples: samples.to_vec(), ..step }
     };
     let run = |device: &mut dyn TrainDevice, samples: &[ViewSample]| {
@@ -236,8 +247,8 @@ fn several_samples_agree_with_the_cpu(depth_weight: f32) {
         device.download(&mut state, StatePart::All).unwrap();
         state
     };
-    let cpu = run(&mut super::super::cpu::CpuDevice::new(0.2, None, Some(&context), &none()), &samples);
-    let gpu_device = || GpuDevice::new(&gpu, &begin, 0.2, Some(&context), &none()).unwrap();
+    let cpu = run(&mut super::super::cpu::CpuDevice::new(0.2, picture_loss, Some(&context), &none()), &samples);
+    let gpu_device = || GpuDevice::new(&gpu, &begin, 0.2, picture_loss, Some(&context), &none()).unwrap();
     let on_gpu = run(&mut gpu_device(), &samples);
     assert!(words(&on_gpu) == words(&run(&mut gpu_device(), &samples)), "the same bits");
 
@@ -268,7 +279,7 @@ fn several_samples_agree_with_the_cpu(depth_weight: f32) {
         assert!(moments_off(&without, &on_gpu) > 1e-2 && without.loss != on_gpu.loss, "sample {n} has no effect");
     }
     // A loss that is not finite skips the whole step.
-    let mut gpu_nan = GpuDevice::new(&gpu, &begin, f32::NAN, Some(&context), &none()).unwrap();
+    let mut gpu_nan = GpuDevice::new(&gpu, &begin, f32::NAN, None, Some(&context), &none()).unwrap();
     let mut cpu_nan = super::super::cpu::CpuDevice::new(f32::NAN, None, Some(&context), &none());
     for device in [&mut gpu_nan as &mut dyn TrainDevice, &mut cpu_nan] {
         let skipped = run(device, &samples);
@@ -311,7 +322,7 @@ fn fixed_exposures_agree_with_the_cpu() {
         state
     };
     let cpu = run(&mut super::super::cpu::CpuDevice::new(0.2, None, None, &none()), &exposed);
-    let mut device = GpuDevice::new(&gpu, &begin, 0.2, None, &none()).unwrap();
+    let mut device = GpuDevice::new(&gpu, &begin, 0.2, None, None, &none()).unwrap();
     let on_gpu = run(&mut device, &exposed);
     assert_eq!(on_gpu.exposures, None);
     let moments_off = |a: &State, b: &State| {
@@ -340,7 +351,7 @@ fn trained_exposures_agree_with_the_cpu() {
     cpu.exposures = Some(ExposureTraining { views, steps, values: [values, rows(51, 1e-3), rows(52, 1e-6)] });
     let mut on_gpu = cpu.clone();
     let mut cpu_device = super::super::cpu::CpuDevice::new(0.2, None, None, &none());
-    let mut device = GpuDevice::new(&gpu, &cpu, 0.2, None, &none()).unwrap();
+    let mut device = GpuDevice::new(&gpu, &cpu, 0.2, None, None, &none()).unwrap();
     for n in 0..3 {
         // Later steps have fewer samples, so that buffers are larger than the step needs.
         let samples: Vec<ViewSample> = samples_of_views().into_iter().skip(n).collect();
@@ -358,7 +369,7 @@ fn trained_exposures_agree_with_the_cpu() {
     }
     let before = on_gpu.exposures.clone();
     // A loss that is not finite changes no exposure.
-    let mut device = GpuDevice::new(&gpu, &on_gpu, f32::NAN, None, &none()).unwrap();
+    let mut device = GpuDevice::new(&gpu, &on_gpu, f32::NAN, None, None, &none()).unwrap();
     device
         .step(&mut on_gpu, Step { exposure_rate: 0.01, samples: samples_of_views(), ..step(false, false, 1) })
         .unwrap();
@@ -391,7 +402,7 @@ fn trained_poses_agree_with_the_cpu() {
     cpu.poses = Some(PoseTraining { views: given.views.clone(), steps: vec![7, 0, 1, 3, 2], values });
     let mut on_gpu = cpu.clone();
     let mut cpu_device = super::super::cpu::CpuDevice::new(0.2, None, None, &given);
-    let mut device = GpuDevice::new(&gpu, &cpu, 0.2, None, &given).unwrap();
+    let mut device = GpuDevice::new(&gpu, &cpu, 0.2, None, None, &given).unwrap();
     let pose_rates = Some(PoseRates { rate: 2e-3, decay: 0.01 });
     for n in 0..3 {
         let samples: Vec<ViewSample> = samples_of_views().into_iter().skip(n).collect();
@@ -415,7 +426,7 @@ fn trained_poses_agree_with_the_cpu() {
     }
     let before = on_gpu.poses.clone();
     // A loss that is not finite moves no camera.
-    let mut device = GpuDevice::new(&gpu, &on_gpu, f32::NAN, None, &given).unwrap();
+    let mut device = GpuDevice::new(&gpu, &on_gpu, f32::NAN, None, None, &given).unwrap();
     device.step(&mut on_gpu, Step { pose_rates, samples: samples_of_views(), ..step(false, false, 1) }).unwrap();
     device.download(&mut on_gpu, StatePart::All).unwrap();
     assert_eq!((on_gpu.skipped, on_gpu.poses), (1, before));
@@ -432,7 +443,7 @@ fn pair_buffer_size_changes_no_byte() {
     let rows = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]].concat().try_into().unwrap();
     let values = [vec![rows; 2], vec![[0.0; 12]; 2], vec![[0.0; 12]; 2]];
     begin.exposures = Some(ExposureTraining { views: vec![0, 1], steps: vec![0; 2], values });
-    let mut device = GpuDevice::new(&gpu, &begin, 0.2, None, &none()).unwrap();
+    let mut device = GpuDevice::new(&gpu, &begin, 0.2, None, None, &none()).unwrap();
     let mut run = |expect_overflow: bool| {
         let mut state = begin.clone();
         device.upload(&state, StatePart::All).unwrap();
@@ -458,7 +469,7 @@ fn rows_are_rearranged_as_on_the_host() {
     // 300 splats have room for 320: fewer, a few more, and more than there is room for.
     for (sh_degree, count) in [(0, 250), (3, 250), (3, 315), (3, 700)] {
         let begin = new_state(cloud(3, 300, sh_degree));
-        let mut device = GpuDevice::new(&gpu, &begin, 0.2, None, &none()).unwrap();
+        let mut device = GpuDevice::new(&gpu, &begin, 0.2, None, None, &none()).unwrap();
         let run = |device: &mut GpuDevice, state: &mut State, key: u64| {
             (key..key + 3).for_each(|key| device.step(state, step(false, false, key)).unwrap());
             device.download(state, StatePart::All).unwrap();
@@ -478,7 +489,7 @@ fn rows_are_rearranged_as_on_the_host() {
             state.densification.error.clear();
         }
         expected.adam.rearrange(&old);
-        let mut fresh = GpuDevice::new(&gpu, &expected, 0.2, None, &none()).unwrap();
+        let mut fresh = GpuDevice::new(&gpu, &expected, 0.2, None, None, &none()).unwrap();
         device.rearrange(&mut state, &old).unwrap();
         device.download(&mut state, StatePart::All).unwrap();
         expected.densification.error.resize(rows.len(), 0.0);
