@@ -79,7 +79,7 @@ pub fn write(out: &Path, settings: &Settings, progress: Progress) -> Result<Summ
         nuscenes::write(out, &world, &shots, &stations, &turns, settings, progress)?;
     }
     if settings.kitti_raw {
-        kitti_raw::write(out, &shots, &legs, &stations, settings, progress)?;
+        kitti_raw::write(out, &world, &shots, &legs, &stations, &turns, settings, progress)?;
     }
     if settings.waymo {
         waymo::write(out, &world, &shots, &legs, &stations, &turns, settings, progress)?;

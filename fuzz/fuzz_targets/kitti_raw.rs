@@ -1,4 +1,4 @@
-//! KITTI raw: calibration and oxts.
+//! KITTI raw: calibration, oxts, times and tracklets.
 #![no_main]
 
 use libfuzzer_sys::fuzz_target;
@@ -10,6 +10,10 @@ fuzz_target!(|bytes: &[u8]| {
     }
     if let Ok(pose) = kitti_raw::read_mounting(bytes) {
         assert!(pose.is_sane());
+    }
+    let _ = kitti_raw::read_times(bytes);
+    if let Ok(found) = kitti_raw::read_tracklets(bytes) {
+        assert!(found.iter().all(|of| of.size.min_element() > 0.0 && of.poses.iter().all(|pose| pose.is_sane())));
     }
     if let Ok(oxts) = kitti_raw::read_oxts(bytes) {
         assert!(kitti_raw::Mercator::new(&oxts.place).world_from_imu(&oxts).is_sane());

@@ -6,13 +6,18 @@
 //! | `calib_velo_to_cam.txt` | camera 0, not rectified, from the Velodyne: `R` and `T` |
 //! | `calib_imu_to_velo.txt` | the Velodyne from the IMU: `R` and `T` |
 //! | `oxts/data/FRAME.txt` | a line of 30 numbers: position, orientation and motion of the IMU |
+//! | `oxts/timestamps.txt`, `image_0X/timestamps.txt` | a line for each frame: its time |
+//! | `tracklet_labels.xml` | boxes of objects, in the axes of the Velodyne of each frame |
 //!
 //! The IMU's axes are x ahead, y left, z up, as the Velodyne's. The world is x east, y north, z up in metres, its origin the
 //! first position.
 //!
 //! Source: the readme and `dataformat.txt` of the raw data's development kit; its `latlonToMercator.m` for the positions.
 
+mod tracklets;
+
 use std::collections::BTreeMap;
+use std::time::UNIX_EPOCH;
 
 use glam::{DQuat, DVec3, EulerRot};
 
@@ -21,6 +26,8 @@ use crate::capture::GeoOrigin;
 use crate::error::CodecError;
 use crate::kitti::projection;
 use crate::kitti360::{entries, numbers, rigid, text};
+
+pub use self::tracklets::{Tracklet, read_tracklets};
 
 /// Radius of the earth in the Mercator projection, metres.
 const EARTH_METRES: f64 = 6_378_137.0;
@@ -142,6 +149,21 @@ pub fn read_oxts(bytes: &[u8]) -> Result<Oxts, CodecError> {
         && oxts.velocity.length() < 1e3
         && oxts.spin.length() < 1e3;
     if is_sane { Ok(oxts) } else { Err(CodecError::new("has a position, an angle or a speed out of range")) }
+}
+
+/// Reads a file of times: microseconds since 1970 of each frame from the first.
+///
+/// # Errors
+/// A line that is no time after 1970.
+pub fn read_times(bytes: &[u8]) -> Result<Vec<i64>, CodecError> {
+    let time = |(number, line): (usize, &str)| {
+        let since =
+            humantime::parse_rfc3339_weak(line.trim()).ok().and_then(|time| time.duration_since(UNIX_EPOCH).ok());
+        let microseconds = since.and_then(|since| i64::try_from(since.as_micros()).ok());
+        microseconds
+            .ok_or_else(|| CodecError::new(format!("line {} is not a time as 2011-09-26 13:02:25.96", number + 1)))
+    };
+    text(bytes)?.trim_end().lines().enumerate().map(time).collect()
 }
 
 /// Mercator's projection around a first position, at the scale of its latitude.

@@ -24,7 +24,7 @@ pub(crate) struct ZoneFinder {
     /// Objects whose pixels count more in training and in pruning, by --zone-weight: a JSON file in COCO's layout (boxes, polygons, run
     /// lengths, in pixels of the photos without their lens distortion), a folder of label maps NAME.png of the photos as they were taken
     /// (ids as Cityscapes' instanceIds, or those in its classes.json or classes.txt), or @labels for the labels that the capture itself
-    /// has (DGP, nuScenes, Waymo, plat synth)
+    /// has (DGP, nuScenes, KITTI raw, Waymo, plat synth)
     #[arg(long, value_name = "FILE|DIR|@labels")]
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) zones: Option<PathBuf>,

@@ -6,11 +6,14 @@
 //! kitti_raw/1970_01_01/1970_01_01_drive_LEG_sync/image_0{2,3}/data/FRAME.png      photos of the cameras that look ahead
 //! kitti_raw/1970_01_01/1970_01_01_drive_LEG_sync/oxts/data/FRAME.txt
 //! kitti_raw/1970_01_01/1970_01_01_drive_LEG_sync/velodyne_points/data/FRAME.bin   with a lidar
+//! kitti_raw/1970_01_01/1970_01_01_drive_LEG_sync/tracklet_labels.xml              boxes of vehicles and people
 //! ```
 //!
 //! The IMU is on the road under the car's centre. A frame has one position: that of its first photo as reported, with its
 //! errors, or the true one without a photo. The cameras of the rig that look to the sides and to the rear have no place in the
 //! format.
+
+mod tracklets;
 
 use std::collections::BTreeMap;
 use std::fmt::Write;
@@ -21,14 +24,17 @@ use city::Waypoint;
 use city::sense::lidar::{Lidar, Return};
 use city::sense::rig::{Mount, sensor_pose_at};
 use city::sense::{Motion, Shot};
+use city::trace::World;
 use glam::{DMat3, DQuat, DVec3, EulerRot};
 use scene::kitti_raw::Mercator;
 use scene::lidar::Turn;
 use scene::{Pinhole, Rigid};
 use store::file::{SaveError, save};
 
+use self::tracklets::Frame;
 use super::cameras::ORIGIN;
-use super::nuscenes::{mount_of, vehicle_from_camera};
+use super::lidar_turn::LidarTurn;
+use super::nuscenes::{Sample, mount_of, vehicle_from_camera};
 use super::output::create_folder;
 use super::settings::{Progress, Settings, SynthError};
 use super::shots::Station;
@@ -44,12 +50,15 @@ const SEAM_METRES: f64 = 1e-4;
 /// Numbers of a colour camera, in the order of the rig.
 const COLOUR: [u8; 2] = [2, 3];
 
-/// Writes calibration, positions and photos; the sweeps are there ([`save_sweep`]). `shots` are sorted by name.
+/// Writes calibration, positions, photos and tracklets; the sweeps are there ([`save_sweep`]). `shots` are sorted by name, `turns`
+/// those of the stations.
 pub(super) fn write(
     out: &Path,
+    world: &World,
     shots: &[Shot],
     legs: &[Vec<Waypoint>],
     stations: &[Station],
+    turns: &[Option<LidarTurn>],
     settings: &Settings,
     progress: Progress,
 ) -> Result<(), SynthError> {
@@ -57,8 +66,10 @@ pub(super) fn write(
     let Some(shot) = shots.iter().find(|shot| mount_of(&mounts, shot).is_some()) else { return Ok(()) };
     save_calibration(&out.join(FOLDER).join(DATE), &mounts, &shot.reported.pinhole)?;
     let projection = Mercator::new(&ORIGIN);
-    let mut drives: BTreeMap<usize, Vec<&Station>> = BTreeMap::new();
-    stations.iter().for_each(|station| drives.entry(station.leg).or_default().push(station));
+    let mut drives: BTreeMap<usize, Vec<(&Station, Option<&LidarTurn>)>> = BTreeMap::new();
+    for (i, station) in stations.iter().enumerate() {
+        drives.entry(station.leg).or_default().push((station, turns.get(i).and_then(Option::as_ref)));
+    }
     for (done, (leg, stations)) in drives.iter().enumerate() {
         progress("kitti raw", done + 1, drives.len());
         let drive = folder(out, *leg);
@@ -66,14 +77,18 @@ pub(super) fn write(
         let cameras = mounts.iter().zip(COLOUR);
         cameras.clone().try_for_each(|(_, number)| create_folder(&drive.join(format!("image_0{number}/data"))))?;
         let car = Mount { name: String::new(), offset: DVec3::ZERO, yaw_degrees: 0.0 };
-        for station in stations {
+        let mut frames = Vec::new();
+        for (station, turn) in stations {
             let pose = legs.get(*leg).and_then(|leg| sensor_pose_at(leg, &car, station.seconds));
             let Some((mut vehicle, motion)) = pose else { continue };
+            let world_from_velodyne = vehicle.compose(&vehicle_from_lidar());
+            let mut photos = Vec::new();
             let frame = format!("{:010}", station.frame);
             for (i, (mount, number)) in cameras.clone().enumerate() {
                 let is_photo = |shot: &&Shot| mount_of(&mounts, shot).is_some_and(|other| other.name == mount.name);
                 let find = |name: &String| shots.binary_search_by(|shot| shot.name.cmp(name)).ok().map(|at| &shots[at]);
                 let Some(shot) = station.photos.iter().filter_map(find).find(is_photo) else { continue };
+                photos.push(shot);
                 if i == 0 {
                     let world_from_camera = shot.reported.camera_from_world.inverse();
                     vehicle = world_from_camera.after(&vehicle_from_camera(mount).inverse());
@@ -84,8 +99,10 @@ pub(super) fn write(
             }
             let oxts = oxts(&projection, &vehicle, &motion);
             save(&drive.join(format!("oxts/data/{frame}.txt")), oxts.as_bytes())?;
+            frames.push(Frame { sample: Sample { station, photos, turn: *turn }, world_from_velodyne });
         }
-        save_times(&drive, stations, settings.lidar)?;
+        save(&drive.join("tracklet_labels.xml"), tracklets::text(world, &frames).as_bytes())?;
+        save_times(&drive, stations.iter().map(|(station, _)| *station), settings.lidar)?;
     }
     Ok(())
 }
@@ -158,10 +175,14 @@ fn oxts(projection: &Mercator, vehicle: &Rigid, motion: &Motion) -> String {
 }
 
 /// Writes a line for each frame into the files of times.
-fn save_times(drive: &Path, stations: &[&Station], lidar: bool) -> Result<(), SaveError> {
+fn save_times<'a>(
+    drive: &Path,
+    stations: impl Iterator<Item = &'a Station> + Clone,
+    lidar: bool,
+) -> Result<(), SaveError> {
     let lines = |delay: f64| {
         let mut text = String::new();
-        for station in stations {
+        for station in stations.clone() {
             writeln!(text, "{}", time_text(station.seconds + delay)).expect("writing to a string cannot fail");
         }
         text

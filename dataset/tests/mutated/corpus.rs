@@ -88,6 +88,9 @@ pub(crate) fn swelling() -> Vec<Seed> {
     let text = "1 ".repeat(1_000_000);
     let poses = format!(r#"{{"tracks": [{{"class": "", "poses": [{}]"#, "[0,[0,0,0],[0,0,0,0]],".repeat(100_000));
     corpus.plain("poses without end in tracks.json", poses, &tracks_codec());
+    let items = |item: &str| format!("<a><tracklets>{}</tracklets></a>", item.repeat(60_000));
+    corpus.plain("empty objects in tracklet_labels.xml", items("<item></item>"), &kitti_raw_codecs()[4]);
+    corpus.plain("deep elements in tracklet_labels.xml", items("<a>"), &kitti_raw_codecs()[4]);
     corpus.plain("a long line of oxts", text.as_str(), &kitti_raw_codecs()[2]);
     let text = format!("P_rect_00: {text}");
     corpus.plain("a long line in calib_cam_to_cam.txt", text.as_str(), &kitti_raw_codecs()[0]);
@@ -476,7 +479,7 @@ fn waymo() -> Vec<(&'static str, Vec<(&'static str, Cells)>)> {
 }
 
 /// KITTI raw: a file of each kind.
-const KITTI_RAW: [(&str, &str); 3] = [
+const KITTI_RAW: [(&str, &str); 5] = [
     (
         "calib_cam_to_cam.txt",
         "calib_time: 09-Jan-2012 13:57:47\nS_rect_00: 80 40\nR_rect_00: 1 0 0 0 1 0 0 0 1\n\
@@ -487,6 +490,16 @@ const KITTI_RAW: [(&str, &str); 3] = [
         "0000000000.txt",
         "49.01 8.42 112.8 0.02 1e-05 -1.22 -3.3 1.1 3.5 0.03 -0.03 -0.3 0.04 9.9 -0.3 -0.2 9.9 -0.01 0.02 0.14 -0.01 \
          0.02 0.14 0.5 0.06 4 10 4 4 0\n",
+    ),
+    ("timestamps.txt", "2011-09-26 13:02:25.964389445\n2011-09-26 13:02:26.067\n2011-09-26 13:02:26\n"),
+    (
+        "tracklet_labels.xml",
+        "<?xml version=\"1.0\" encoding=\"UTF-8\" standalone=\"yes\" ?>\n<!DOCTYPE boost_serialization>\n<boost_serialization \
+         signature=\"serialization::archive\" version=\"9\"><tracklets><count>1</count><item_version>1</item_version><item \
+         class_id=\"1\"><objectType>Car</objectType><h>1.5</h><w>1.8</w><l>4.2</l><first_frame>2</first_frame><poses><count>2\
+         </count><item><tx>9.5</tx><ty>-3</ty><tz>-1.6</tz><rx>0</rx><ry>0</ry><rz>-1.57</rz><state>2</state></item><item>\
+         <tx>9.9</tx><ty>-3.1</ty><tz>-1.6</tz><rx>0.01</rx><ry>0</ry><rz>-1.5</rz></item></poses><finished>1</finished></item>\
+         </tracklets></boost_serialization>\n",
     ),
 ];
 const PERSPECTIVE: &str = "calib_time: x\nS_rect_00: 80 40\nR_rect_00: 1 0 0 0 1 0 0 0 1\n\

@@ -130,8 +130,8 @@ pub(crate) fn kitti_codecs() -> [Read; 5] {
     ]
 }
 
-/// `calib_cam_to_cam.txt`, a mounting, and a file of oxts.
-pub(crate) fn kitti_raw_codecs() -> [Read; 3] {
+/// `calib_cam_to_cam.txt`, a mounting, a file of oxts, one of times, and the tracklets.
+pub(crate) fn kitti_raw_codecs() -> [Read; 5] {
     [
         codec("kitti_raw", kitti_raw::read_cameras, |found| {
             let sane = |c: &kitti_raw::RawCamera| camera_is_sane(&c.model, c.width, c.height) && c.from_first.is_sane();
@@ -141,6 +141,10 @@ pub(crate) fn kitti_raw_codecs() -> [Read; 3] {
         codec("kitti_raw", kitti_raw::read_oxts, |oxts| {
             let world = kitti_raw::Mercator::new(&oxts.place);
             world.world_from_imu(&oxts).is_sane() && oxts.velocity.is_finite() && oxts.spin.is_finite()
+        }),
+        codec("kitti_raw", kitti_raw::read_times, |_| true),
+        codec("kitti_raw", kitti_raw::read_tracklets, |tracklets| {
+            tracklets.iter().all(|of| of.size.min_element() > 0.0 && of.poses.iter().all(scene::Rigid::is_sane))
         }),
     ]
 }

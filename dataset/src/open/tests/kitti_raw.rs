@@ -95,6 +95,61 @@ fn a_drive_has_its_photos_and_sweeps() {
     assert_eq!((views.len(), views[1].name.as_str()), (2, "image_00/0000000001.jpg"));
 }
 
+/// A car that keeps 10 m ahead of the scanner, 2 m to its left, in all frames; and one that is parked, in the last two.
+fn tracklets() -> String {
+    let pose = |[x, y, z]: [f64; 3], yaw: f64| {
+        format!("<item><tx>{x}</tx><ty>{y}</ty><tz>{z}</tz><rx>0</rx><ry>0</ry><rz>{yaw}</rz><state>2</state></item>")
+    };
+    let item = |class: &str, first: u32, poses: &[String]| {
+        let poses = poses.concat();
+        format!(
+            "<item><objectType>{class}</objectType><h>1.5</h><w>2</w><l>4</l><first_frame>{first}</first_frame>\
+             <poses><count>9</count>{poses}</poses><finished>1</finished></item>"
+        )
+    };
+    let ahead: Vec<String> = (0..3).map(|_| pose([10.0, 2.0, -1.6], 0.0)).collect();
+    let parked: Vec<String> = (1..3).map(|frame| pose([20.0 - f64::from(frame), -3.0, -1.6], 1.0)).collect();
+    let items = [item("Car", 0, &ahead), item("Van", 1, &parked)].concat();
+    format!("<boost_serialization><tracklets><count>2</count>{items}</tracklets></boost_serialization>")
+}
+
+#[test]
+fn a_drive_has_its_annotated_objects() {
+    let folder = archive();
+    let at = |name: &str| folder.path().join(DRIVE).join(name);
+    assert!(with_lidar(folder.path()).unwrap().labels.is_empty());
+    write(&at("tracklet_labels.xml"), tracklets());
+    let times = |by: u32| -> String {
+        (25..28).map(|second| format!("2011-09-26 13:02:{second}.{}00000000\n", 5 + by)).collect()
+    };
+    for (sensor, by) in [("oxts", 0), ("image_02", 0), ("image_03", 1)] {
+        write(&at(&format!("{sensor}/timestamps.txt")), times(by));
+    }
+    let source = with_lidar(folder.path()).unwrap();
+    assert_eq!(source.labels, BTreeMap::from([("Car".into(), 3), ("Van".into(), 2)]));
+    let [car] = &source.capture.objects[..] else { panic!("{:?}", source.capture.objects) };
+    assert_eq!((car.class.as_str(), car.high - car.low, car.path.len()), ("Car", DVec3::new(4.0, 2.0, 1.5), 3));
+    let views = &source.capture.views;
+    // Of camera 2, then of camera 3, a tenth of a second later.
+    let seconds: Vec<f64> = views.iter().map(|view| view.seconds.unwrap()).collect();
+    assert!(seconds.iter().zip([0.0, 1.0, 2.0, 0.1, 1.1]).all(|(a, b)| (a - b).abs() < 1e-6), "{seconds:?}");
+    for (view, photo) in views.iter().zip(&source.photos).take(3) {
+        let place = view.camera.camera_from_world.after(&car.pose(view.seconds.unwrap()).unwrap()).translation;
+        // The camera is 0.3 m ahead of the scanner; the box's middle is 0.85 m below it.
+        assert!(place.distance(DVec3::new(-2.0, 0.85, 9.7)) < 1e-3, "{place}");
+        let [corners] = &photo.moving()[..] else { panic!("{:?}", photo.boxes) };
+        assert!((corners.iter().sum::<DVec3>() / 8.0).distance(place) < 1e-6);
+    }
+    source.capture.check().unwrap();
+
+    // Without times, frames are ten a second.
+    for sensor in ["oxts", "image_02", "image_03"] {
+        fs::remove_file(at(&format!("{sensor}/timestamps.txt"))).unwrap();
+    }
+    let views = with_lidar(folder.path()).unwrap().capture.views;
+    assert!((views[2].seconds.unwrap() - 0.2).abs() < 1e-9);
+}
+
 #[test]
 fn a_drive_is_named_by_its_folder_its_date_or_the_archive() {
     let folder = archive();
@@ -150,6 +205,9 @@ fn damaged_drives_are_refused_in_a_line() {
     damaged(&["0000000001.txt", "not a number"], &drive("oxts/data/0000000001.txt", nan));
     damaged(&["0000000001.txt", "3 numbers instead of 30"], &drive("oxts/data/0000000001.txt", b"1 2 3".to_vec()));
     damaged(&["0000000000.txt", "larger than 1 MB"], &drive("oxts/data/0000000000.txt", vec![b' '; 2 << 20]));
+    let broken = tracklets().replace("<h>1.5</h>", "").into_bytes();
+    damaged(&["tracklet_labels.xml", "`h`"], &drive("tracklet_labels.xml", broken));
+    damaged(&["oxts/timestamps.txt", "line 2"], &drive("oxts/timestamps.txt", b"2011-09-26 13:02:25\nnoon\n".to_vec()));
     damaged(&["0000000002.bin", "cut short"], &drive("velodyne_points/data/0000000002.bin", vec![0; 33]));
     let nothing = f32::NAN.to_le_bytes().repeat(8);
     damaged(&["0000000002.bin", "none of which is finite"], &drive("velodyne_points/data/0000000002.bin", nothing));

@@ -72,6 +72,38 @@ fn drives_as_kitti_raw_have_the_cameras_and_sweeps_of_the_capture() {
     }
     assert!(views > 30 && 3 * views == plain.capture.views.len(), "{views} of {}", plain.capture.views.len());
     assert_eq!(sweeps, plain.sweeps.len());
+    compare_objects(&plain, &drives);
     // A firing's azimuth gives its time only up to the half column that the reader of the plain capture does not know of.
     assert!(largest < 0.02, "{largest} m in {compared} points");
+}
+
+/// The moving objects of the drives are where the capture's own are.
+fn compare_objects(plain: &Source, drives: &[Source]) {
+    let (mut compared, mut labels) = (0, 0);
+    for drive in drives {
+        labels += drive.labels.values().sum::<usize>();
+        for view in &drive.capture.views {
+            // Photos of the capture that look the same way: the drive's origin is another one.
+            let Some(seconds) = view.seconds else { continue };
+            let same = |other: &&scene::View| {
+                let turn =
+                    other.camera.camera_from_world.rotation.angle_between(view.camera.camera_from_world.rotation);
+                turn < 1e-6 && other.seconds.is_some()
+            };
+            for object in &drive.capture.objects {
+                let Some(pose) = object.pose(seconds) else { continue };
+                let here = view.camera.camera_from_world.apply(pose.translation);
+                let near = plain.capture.views.iter().filter(same).flat_map(|other| {
+                    plain.capture.objects.iter().filter_map(move |own| {
+                        let middle = own.pose(other.seconds.unwrap())?.apply(0.5 * (own.low + own.high));
+                        Some(other.camera.camera_from_world.apply(middle).distance(here))
+                    })
+                });
+                let metres = near.fold(f64::INFINITY, f64::min);
+                assert!(metres < 0.02, "{metres} m: {} in {}", object.id, view.name);
+                compared += 1;
+            }
+        }
+    }
+    assert!(compared > 10 && labels > 50, "{compared} of {labels}");
 }
