@@ -28,7 +28,9 @@ pub(crate) use cluster::{
     Connection, CoordinatorArgs, JobArgs, JobsArgs, LogFormat, LogsArgs, RetryArgs, ServeArgs, StatusArgs, SubmitArgs,
     TaskName, TelemetryArgs, WorkerArgs,
 };
-pub(crate) use model::{EvalArgs, ExportArgs, Format, ImportArgs, PruneArgs, PruneCapture, RenderArgs};
+pub(crate) use model::{
+    EvalArgs, ExportArgs, Format, ImportArgs, ObjectsCommand, PoseArgs, PruneArgs, PruneCapture, RenderArgs,
+};
 pub(crate) use plan::{BLOCK_MEMORY_MIB, Blocks, DepthKind, PlanOptions, RESIDUAL};
 pub(crate) use sweep::Named;
 pub(crate) use synth::{Rig, SynthArgs};
@@ -79,6 +81,9 @@ pub(crate) enum Command {
     Import(ImportArgs),
     /// Show jobs and models in a browser, and serve exported files
     Serve(ServeArgs),
+    /// Work on objects that move
+    #[command(subcommand)]
+    Objects(ObjectsCommand),
     /// Run the coordinator of a cluster until it is stopped
     Coordinator(CoordinatorArgs),
     /// Run a worker that trains blocks for a coordinator until it is stopped

@@ -30,7 +30,7 @@ mod telemetry_setup;
 
 use std::process::ExitCode;
 
-use args::{BenchCommand, Command};
+use args::{BenchCommand, Command, ObjectsCommand};
 use failure::Failure;
 use output::Output;
 
@@ -61,6 +61,7 @@ fn main() -> ExitCode {
         Command::Export(args) => commands::export::run(args, &output),
         Command::Import(args) => commands::import::run(args, &output),
         Command::Serve(args) => commands::serve::run(args, &output),
+        Command::Objects(ObjectsCommand::Pose(args)) => commands::object_poses::run(args, &output),
         Command::Coordinator(args) => commands::coordinator::run(args, &output),
         Command::Worker(args) => commands::worker::run(args, &output),
         Command::Submit(args) => commands::submit::run(args, &output),

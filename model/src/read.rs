@@ -6,7 +6,7 @@ use std::convert::Infallible;
 use std::path::{Path, PathBuf};
 
 use blocks::{Cut, Ground, Mode, Plan};
-use glam::DVec3;
+use glam::{DQuat, DVec3};
 use scene::{
     BLOCK_ATTRIBUTE, BadInput, BlockId, CodecError, Exposures, GeoOrigin, MovingObject, Poses, Splats, frame, ply,
 };
@@ -55,6 +55,17 @@ fn read_trained(folder: &Path) -> Result<Model, BadInput> {
     let objects = read_objects(&out.join(OBJECTS_FOLDER))?;
     let trained = Some((manifest, out.to_path_buf()));
     Ok(Model { splats, objects, antialiased, geo_origin, exposures, poses, trained })
+}
+
+/// Turns the axes of a model's world to those of its ground, z up. A file says nothing of its ground: its z is taken for up.
+///
+/// # Errors
+/// As [`read`], of a folder that `plat train` wrote.
+pub fn ground_from_world(path: &Path) -> Result<DQuat, BadInput> {
+    match trained_folder(path) {
+        Some(folder) => read_plan(&folder).map(|(_, plan)| plan.ground.ground_from_world),
+        None => Ok(DQuat::IDENTITY),
+    }
 }
 
 /// The objects of a folder, by name; none without their paths.

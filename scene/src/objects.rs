@@ -7,6 +7,7 @@
 //! ```
 //! `poses` are world_from_object with a quaternion; `low` and `high` the corners of its box in its own axes (x ahead, y left, z up),
 //! metres. `seconds` are the times of the photos, on the clock of the poses. `plat synth` writes `instance`, a number, for `id`.
+//! `positions`, as `[seconds, [x, y, z]]`, may stand for `poses` where rotations are not known ([`read_positions`]).
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -175,7 +176,10 @@ struct Track {
     class: String,
     low: [f64; 3],
     high: [f64; 3],
+    #[serde(default)]
     poses: Vec<(f64, [f64; 3], [f64; 4])>,
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    positions: Vec<(f64, [f64; 3])>,
 }
 
 /// Decodes objects and the times of photos, in the order of the objects' names.
@@ -184,6 +188,31 @@ struct Track {
 /// Malformed JSON, or objects that [`check_all`] refuses.
 pub fn read(bytes: &[u8]) -> Result<Tracks, CodecError> {
     let file: File = serde_json::from_slice(bytes).map_err(|error| CodecError::new(error.to_string()))?;
+    if let Some(track) = file.tracks.iter().find(|track| !track.positions.is_empty()) {
+        let id = track.id.as_deref().unwrap_or_default();
+        return Err(CodecError::new(format!("object {id:?} has positions instead of poses; see plat objects pose")));
+    }
+    tracks(file)
+}
+
+/// As [`read`], of objects whose rotations are not known: one with `positions` has none in its path (the identity).
+///
+/// # Errors
+/// As [`read`], or an object with both.
+pub fn read_positions(bytes: &[u8]) -> Result<Tracks, CodecError> {
+    let mut file: File = serde_json::from_slice(bytes).map_err(|error| CodecError::new(error.to_string()))?;
+    for track in &mut file.tracks {
+        if !track.poses.is_empty() && !track.positions.is_empty() {
+            let id = track.id.as_deref().unwrap_or_default();
+            return Err(CodecError::new(format!("object {id:?} has poses and positions")));
+        }
+        let still = DQuat::IDENTITY.to_array();
+        track.poses.extend(track.positions.drain(..).map(|(seconds, place)| (seconds, place, still)));
+    }
+    tracks(file)
+}
+
+fn tracks(file: File) -> Result<Tracks, CodecError> {
     let object = |track: Track| {
         let id = track.id.or_else(|| track.instance.map(|number| number.to_string())).unwrap_or_default();
         let pose = |(seconds, translation, rotation): (f64, [f64; 3], [f64; 4])| {
@@ -219,6 +248,7 @@ pub fn write(tracks: &Tracks) -> Vec<u8> {
                 (*seconds, at.translation.to_array(), at.rotation.to_array())
             })
             .collect(),
+        positions: Vec::new(),
     };
     let file = File { tracks: tracks.objects.iter().map(track).collect(), seconds: tracks.seconds.clone() };
     let mut bytes = serde_json::to_vec(&file).expect("numbers and texts are JSON");
@@ -279,6 +309,23 @@ mod tests {
         let text = r#"{"about": "…", "tracks": [{"asset": "van", "instance": 7, "class": "car", "low": [0, 0, 0],
             "high": [4, 2, 1.5], "poses": [[0.5, [1, 2, 3], [0.0, 0.0, 0.707107, 0.707107]]]}]}"#;
         assert_eq!(read(text.as_bytes()).unwrap().objects[0].id, "7");
+    }
+
+    #[test]
+    fn positions_stand_for_poses_only_where_they_may() {
+        let text = r#"{"tracks": [{"id": "a", "class": "car", "low": [0, 0, 0], "high": [4, 2, 1.5],
+            "positions": [[0.5, [1, 2, 3]], [1, [2, 2, 3]]]}], "seconds": {"x.png": 0.7}}"#;
+        let found = read_positions(text.as_bytes()).unwrap();
+        let path = &found.objects[0].path;
+        assert_eq!((path.len(), path[1].seconds, path[1].world_from_object.translation.x), (2, 1.0, 2.0));
+        assert_eq!(found.seconds.len(), 1);
+        assert!(read(text.as_bytes()).unwrap_err().to_string().contains("positions"));
+        let both = text.replace("\"class\"", "\"poses\": [[0, [0, 0, 0], [0, 0, 0, 1]]], \"class\"");
+        assert!(read_positions(both.as_bytes()).unwrap_err().to_string().contains("poses and positions"));
+        let jumps = text.replace("[2, 2, 3]", "[500, 2, 3]");
+        assert!(read_positions(jumps.as_bytes()).unwrap_err().to_string().contains("jumps"));
+        let posed = write(&Tracks { objects: vec![car()], ..Tracks::default() });
+        assert_eq!(read_positions(&posed), read(&posed));
     }
 
     #[test]

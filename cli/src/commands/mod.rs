@@ -12,6 +12,7 @@ pub(crate) mod inspect;
 mod inspect_objects;
 pub(crate) mod jobs;
 pub(crate) mod kernels;
+pub(crate) mod object_poses;
 pub(crate) mod pareto;
 pub(crate) mod plan;
 pub(crate) mod prune;

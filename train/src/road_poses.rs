@@ -1,0 +1,331 @@
+//! Poses of an object on the road from a path of its positions (EDeRF, section 3.3).
+//!
+//! Heading and pitch follow from where it goes. Height, roll and a better pitch follow from contact: lines through the four lower
+//! corners of its box meet the road in the splats of the static scene, and the box's lower side is laid on what they meet. Times that
+//! are missing are filled by Lagrange's polynomial through the positions next to them.
+
+use glam::{DMat3, DQuat, DVec2, DVec3};
+use render::surface::Surface;
+use scene::{PathPose, Rigid};
+
+/// The road lies at most this far above and below where the position says, metres.
+const REACH_METRES: f64 = 1.0;
+/// Heading follows the velocity over a displacement of at least this length, metres, found within this many seconds on either side.
+const DISPLACEMENT_METRES: f64 = 3.0;
+const DISPLACEMENT_SECONDS: f64 = 2.0;
+/// It stands still where it moves by less than this in that time, metres.
+const LEAST_METRES: f64 = 0.5;
+/// An object that seems to turn by more than this between two times has changed gear, radians.
+const REVERSED: f64 = 2.0;
+/// Positions that fill a gap lie within this many seconds of it; longer gaps stay, seconds.
+const GAP_SECONDS: f64 = 5.0;
+/// Positions on each side of a gap that its polynomial goes through: more would let it swing.
+const GAP_SIDE: usize = 2;
+/// Positions at most that fill a gap: the median interval may be tiny.
+const MAX_FILLED: f64 = 500.0;
+/// A corner that lies farther off the plane of the others stands on something else, or on a hole, metres.
+const OFF_METRES: f64 = 0.25;
+/// No road is steeper, radians.
+const MAX_TILT: f64 = 0.6;
+/// Rounds of laying the box down: the corners move a little when it tilts.
+const ROUNDS: usize = 2;
+
+/// Where an object was, and what of it touches the road.
+pub struct Positions<'a> {
+    /// Times, seconds, ascending, with the origin of the object's axes in the world, metres.
+    pub places: &'a [(f64, DVec3)],
+    /// The lower and the upper corner of its box in its own axes (x ahead, y left, z up), metres.
+    pub low: DVec3,
+    /// As `low`.
+    pub high: DVec3,
+    /// Its heading at first, if that is known: it may drive backwards.
+    pub first: Option<DQuat>,
+}
+
+/// The path with poses, gaps filled. Where the road is not found the object keeps the height of its position, and the pitch of its
+/// displacement.
+pub fn road_poses(positions: &Positions, road: &Surface) -> Vec<PathPose> {
+    let ground_from_world = road.ground_from_world();
+    let on_ground = positions.places.iter().map(|(seconds, place)| (*seconds, ground_from_world * *place));
+    let places = without_gaps(&on_ground.collect::<Vec<_>>());
+    let first = positions.first.map(|rotation| {
+        let ahead = ground_from_world * rotation * DVec3::X;
+        ahead.y.atan2(ahead.x)
+    });
+    let courses = courses(&places, first);
+    let pose = |(&(seconds, place), &(heading, pitch)): (&(f64, DVec3), &(f64, f64))| {
+        let (rotation, translation) = laid_down(place, heading, pitch, positions, road);
+        let world_from_object = Rigid {
+            rotation: (ground_from_world.inverse() * rotation).normalize(),
+            translation: ground_from_world.inverse() * translation,
+        };
+        PathPose { seconds, world_from_object }
+    };
+    places.iter().zip(&courses).map(pose).collect()
+}
+
+/// The positions with those that are missing, by the median interval.
+fn without_gaps(places: &[(f64, DVec3)]) -> Vec<(f64, DVec3)> {
+    let mut intervals: Vec<f64> = places.windows(2).map(|pair| pair[1].0 - pair[0].0).collect();
+    intervals.sort_by(f64::total_cmp);
+    let Some(&interval) = intervals.get(intervals.len() / 2) else { return places.to_vec() };
+    let mut filled = Vec::new();
+    for (i, &(seconds, place)) in places.iter().enumerate() {
+        filled.push((seconds, place));
+        let Some(&(next, _)) = places.get(i + 1) else { break };
+        let missing = ((next - seconds) / interval).round() - 1.0;
+        if !(1.0..=MAX_FILLED).contains(&missing) || next - seconds > 2.0 * GAP_SECONDS {
+            continue;
+        }
+        let near = |other: &&(f64, DVec3)| other.0 >= seconds - GAP_SECONDS && other.0 <= next + GAP_SECONDS;
+        let (from, to) = ((i + 1).saturating_sub(GAP_SIDE), (i + 1 + GAP_SIDE).min(places.len()));
+        let through: Vec<(f64, DVec3)> = places[from..to].iter().filter(near).copied().collect();
+        for k in 1..=missing as u32 {
+            let at = seconds + (next - seconds) * f64::from(k) / (missing + 1.0);
+            filled.push((at, lagrange(&through, at)));
+        }
+    }
+    filled
+}
+
+/// The polynomial through these positions, at a time (equation 5).
+fn lagrange(through: &[(f64, DVec3)], at: f64) -> DVec3 {
+    let basis = |i: usize| {
+        let others = through.iter().enumerate().filter(|(j, _)| *j != i);
+        others.map(|(_, other)| (at - other.0) / (through[i].0 - other.0)).product::<f64>()
+    };
+    through.iter().enumerate().map(|(i, (_, place))| *place * basis(i)).sum()
+}
+
+/// Heading and pitch at each position, radians: those of the velocity around it, or of the nearest one that moves.
+fn courses(places: &[(f64, DVec3)], first: Option<f64>) -> Vec<(f64, f64)> {
+    let around = |i: usize| {
+        let (mut from, mut to) = (i, i);
+        loop {
+            let apart = (places[to].1 - places[from].1).truncate().length();
+            if apart >= DISPLACEMENT_METRES {
+                return Some(direction(velocity(&places[from..=to])));
+            }
+            let is_near = |j: usize| (places[j].0 - places[i].0).abs() <= DISPLACEMENT_SECONDS;
+            let earlier = from.checked_sub(1).filter(|&j| is_near(j));
+            let later = Some(to + 1).filter(|&j| j < places.len() && is_near(j));
+            if earlier.is_none() && later.is_none() {
+                return (apart >= LEAST_METRES).then(|| direction(velocity(&places[from..=to])));
+            }
+            (from, to) = (earlier.unwrap_or(from), later.unwrap_or(to));
+        }
+    };
+    let known: Vec<Option<(f64, f64)>> = (0..places.len()).map(around).collect();
+    let nearest = |i: usize| {
+        let distance = |j: &usize| (places[*j].0 - places[i].0).abs();
+        let with = (0..known.len()).filter(|&j| known[j].is_some());
+        with.min_by(|a, b| distance(a).total_cmp(&distance(b))).and_then(|j| known[j])
+    };
+    let mut before = first;
+    let mut courses = Vec::new();
+    for (i, found) in known.iter().enumerate() {
+        let (mut heading, mut pitch) = found.or_else(|| nearest(i)).unwrap_or((first.unwrap_or(0.0), 0.0));
+        if before.is_some_and(|before| turn(before, heading).abs() > REVERSED) {
+            (heading, pitch) = (turn(0.0, heading + std::f64::consts::PI), -pitch);
+        }
+        before = Some(heading);
+        courses.push((heading, pitch));
+    }
+    courses
+}
+
+/// The velocity that fits positions best: of errors of single positions, as those of satellites, less remains than in the displacement
+/// from the first to the last.
+fn velocity(places: &[(f64, DVec3)]) -> DVec3 {
+    let count = places.len() as f64;
+    let middle = places.iter().map(|(seconds, _)| seconds).sum::<f64>() / count;
+    let centre = places.iter().map(|(_, place)| *place).sum::<DVec3>() / count;
+    places.iter().map(|(seconds, place)| (seconds - middle) * (*place - centre)).sum()
+}
+
+/// Heading and pitch, radians.
+fn direction(along: DVec3) -> (f64, f64) {
+    (along.y.atan2(along.x), along.z.atan2(along.truncate().length()))
+}
+
+/// From one heading to another, -π to π.
+fn turn(from: f64, to: f64) -> f64 {
+    (to - from).sin().atan2((to - from).cos())
+}
+
+/// Rotation and origin of the object at a position, on the road; in ground axes.
+fn laid_down(place: DVec3, heading: f64, pitch: f64, of: &Positions, road: &Surface) -> (DQuat, DVec3) {
+    let ahead = DVec2::from_angle(heading);
+    // Slopes of the lower side ahead and to the left, and its height under the origin.
+    let (mut along, mut across) = (pitch.clamp(-MAX_TILT, MAX_TILT).tan(), 0.0);
+    let (mut rotation, mut height) = (tilted(ahead, along, across), place.z);
+    for _ in 0..ROUNDS {
+        let corners = [(of.low.x, of.low.y), (of.low.x, of.high.y), (of.high.x, of.low.y), (of.high.x, of.high.y)];
+        let met = corners.iter().filter_map(|&(x, y)| {
+            let corner = DVec3::new(place.x, place.y, height) + rotation * DVec3::new(x, y, of.low.z);
+            let above = corner + REACH_METRES * DVec3::Z;
+            let found = road.height_below(above, 2.0 * REACH_METRES)?;
+            // Where it lies in the axes of the heading.
+            let off = corner.truncate() - place.truncate();
+            Some((DVec3::new(off.dot(ahead), off.dot(ahead.perp()), found), found - corner.z))
+        });
+        let met = without_the_odd_one(met.collect());
+        match plane(&met) {
+            Some((base, x, y)) if x.atan().abs() < MAX_TILT && y.atan().abs() < MAX_TILT => {
+                (along, across) = (x, y);
+                rotation = tilted(ahead, along, across);
+                // The lower side's middle lies on the plane.
+                let middle = rotation * DVec3::new(0.0, 0.0, of.low.z);
+                let off = middle.truncate();
+                height = base + along * off.dot(ahead) + across * off.dot(ahead.perp()) - middle.z;
+            }
+            _ if met.is_empty() => break,
+            _ => height += met.iter().map(|(_, off)| off).sum::<f64>() / met.len() as f64,
+        }
+    }
+    (rotation, DVec3::new(place.x, place.y, height))
+}
+
+/// The rotation whose x looks ahead and whose lower side has these slopes ahead and to the left.
+fn tilted(ahead: DVec2, along: f64, across: f64) -> DQuat {
+    let x = ahead.extend(along).normalize();
+    let z = x.cross(ahead.perp().extend(across)).normalize();
+    DQuat::from_mat3(&DMat3::from_cols(x, z.cross(x), z)).normalize()
+}
+
+/// Leaves out the corner whose height differs most from the others', if by much.
+fn without_the_odd_one(mut met: Vec<(DVec3, f64)>) -> Vec<(DVec3, f64)> {
+    let mut offs: Vec<f64> = met.iter().map(|(_, off)| *off).collect();
+    offs.sort_by(f64::total_cmp);
+    let Some(&median) = offs.get(offs.len() / 2) else { return met };
+    let lower = offs[(offs.len() - 1) / 2];
+    let middle = 0.5 * (median + lower);
+    met.retain(|(_, off)| (off - middle).abs() <= OFF_METRES);
+    met
+}
+
+/// The plane z = base + x·along + y·across that fits best; `None` for fewer than three places.
+fn plane(met: &[(DVec3, f64)]) -> Option<(f64, f64, f64)> {
+    if met.len() < 3 {
+        return None;
+    }
+    let (mut matrix, mut right) = (DMat3::ZERO, DVec3::ZERO);
+    for (place, _) in met {
+        let row = DVec3::new(1.0, place.x, place.y);
+        matrix += DMat3::from_cols(row * row.x, row * row.y, row * row.z);
+        right += row * place.z;
+    }
+    let found = matrix.inverse() * right;
+    (matrix.determinant().abs() > 1e-9 && found.is_finite()).then_some((found.x, found.y, found.z))
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::Vec3;
+    use scene::{Splat, Splats};
+
+    use super::*;
+    use crate::random::uniform;
+
+    /// A road that rises by `slope` ahead (x) and by `crossfall` to the left, with a kerb of `kerb` metres beyond y = 3.
+    fn road(slope: f32, crossfall: f32, kerb: f32) -> Surface {
+        let mut splats = Splats::new(0);
+        for i in 0..120 * 24u32 {
+            let (x, y) = (0.5 * (i % 120) as f32 - 5.0, 0.5 * (i / 120) as f32 - 6.0);
+            let z = slope * x + crossfall * y + if y > 3.0 { kerb } else { 0.0 };
+            let mut splat = Splat::round(Vec3::new(x, y, z), 0.3f32.ln(), Vec3::splat(0.5), 0.95);
+            splat.log_scale.z = 0.01f32.ln();
+            splats.push(&splat);
+        }
+        Surface::new(&splats, DQuat::IDENTITY, |_| true)
+    }
+
+    const LOW: DVec3 = DVec3::new(-2.0, -0.9, 0.0);
+    const HIGH: DVec3 = DVec3::new(2.0, 0.9, 1.5);
+
+    fn angle(a: DQuat, b: DQuat) -> f64 {
+        a.angle_between(b).to_degrees()
+    }
+
+    #[test]
+    fn a_car_lies_on_a_slope_with_crossfall_whatever_its_height_was() {
+        let (slope, crossfall) = (0.12f32, 0.05f32);
+        let surface = road(slope, crossfall, 0.0);
+        let at = |i: u32, noise: f64| {
+            let t = 0.2 * f64::from(i);
+            let off = |k| noise * (f64::from(uniform(3, u64::from(3 * i + k))) - 0.5);
+            (t, DVec3::new(2.0 * t, off(0), f64::from(slope) * 2.0 * t + 4.0 * off(1)))
+        };
+        for noise in [0.0, 0.1] {
+            let places: Vec<(f64, DVec3)> = (0..50).filter(|i| !(20..24).contains(i)).map(|i| at(i, noise)).collect();
+            let path = road_poses(&Positions { places: &places, low: LOW, high: HIGH, first: None }, &surface);
+            assert_eq!(path.len(), 50, "the gap is filled");
+            let z = DVec3::new(-f64::from(slope), -f64::from(crossfall), 1.0).normalize();
+            let x = DVec3::new(1.0, 0.0, f64::from(slope)).normalize();
+            let truth = DQuat::from_mat3(&DMat3::from_cols(x, z.cross(x), z));
+            for pose in &path {
+                let Rigid { rotation, translation } = pose.world_from_object;
+                let height = translation.z - (f64::from(slope) * translation.x + f64::from(crossfall) * translation.y);
+                let off = angle(rotation, truth);
+                assert!(off < if noise > 0.0 { 6.0 } else { 1.0 } && height.abs() < 0.05, "{off} degrees, {height} m");
+            }
+        }
+    }
+
+    #[test]
+    fn wheels_on_a_kerb_tilt_the_car() {
+        let surface = road(0.0, 0.0, 0.15);
+        let places: Vec<(f64, DVec3)> =
+            (0..20).map(|i| (0.2 * f64::from(i), DVec3::new(f64::from(i), 3.0, 0.0))).collect();
+        let path = road_poses(&Positions { places: &places, low: LOW, high: HIGH, first: None }, &surface);
+        let left = path[10].world_from_object.rotation * DVec3::Y;
+        let roll = left.z.asin().to_degrees();
+        // 0.15 m over 1.8 m.
+        assert!((roll - 4.8).abs() < 0.7, "{roll}");
+    }
+
+    #[test]
+    fn a_car_that_stands_keeps_its_heading_and_may_reverse() {
+        let surface = road(0.0, 0.0, 0.0);
+        let x = |i: u32| {
+            if i < 10 {
+                f64::from(i)
+            } else if i < 40 {
+                10.0
+            } else {
+                10.0 - 0.5 * f64::from(i - 40)
+            }
+        };
+        let places: Vec<(f64, DVec3)> = (0..60).map(|i| (0.2 * f64::from(i), DVec3::new(x(i), 0.0, 0.0))).collect();
+        let heading = |first: Option<DQuat>| -> Vec<f64> {
+            let path = road_poses(&Positions { places: &places, low: LOW, high: HIGH, first }, &surface);
+            path.iter().map(|pose| pose.world_from_object.rotation * DVec3::X).map(|a| a.y.atan2(a.x).abs()).collect()
+        };
+        assert!(heading(None).iter().all(|turn| *turn < 1e-6));
+        let backwards = heading(Some(DQuat::from_rotation_z(std::f64::consts::PI)));
+        assert!(backwards.iter().all(|turn| *turn > 3.1), "{backwards:?}");
+    }
+
+    #[test]
+    fn without_a_road_positions_and_displacements_are_kept() {
+        let surface = Surface::new(&Splats::new(0), DQuat::from_rotation_x(0.3), |_| true);
+        let up = DQuat::from_rotation_x(-0.3) * DVec3::Z;
+        let places: Vec<(f64, DVec3)> =
+            (0..9).map(|i| (f64::from(i), (DVec3::X + 0.1 * up) * f64::from(2 * i))).collect();
+        let path = road_poses(&Positions { places: &places, low: LOW, high: HIGH, first: None }, &surface);
+        for (pose, (seconds, place)) in path.iter().zip(&places) {
+            let Rigid { rotation, translation } = pose.world_from_object;
+            assert!(pose.seconds == *seconds && translation.distance(*place) < 1e-9);
+            assert!((rotation * DVec3::X).distance((DVec3::X + 0.1 * up).normalize()) < 1e-6);
+        }
+        let one = [(3.0, DVec3::ONE)];
+        for (places, count) in [(&one[..], 1), (&[], 0)] {
+            let path = road_poses(&Positions { places, low: LOW, high: HIGH, first: None }, &surface);
+            assert!(path.len() == count && path.iter().all(|pose| pose.world_from_object.is_sane()));
+        }
+        // Positions at one time, of which only one is right.
+        let same = [(1.0, DVec3::ZERO), (1.0 + 1e-9, DVec3::X), (9.0, DVec3::Y)];
+        let path = road_poses(&Positions { places: &same, low: LOW, high: HIGH, first: None }, &surface);
+        assert!(path.iter().all(|pose| pose.world_from_object.is_sane()));
+    }
+}
