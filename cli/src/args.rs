@@ -2,6 +2,7 @@
 
 mod bench;
 mod cluster;
+mod garage;
 mod model;
 mod plan;
 #[cfg(test)]
@@ -28,6 +29,7 @@ pub(crate) use cluster::{
     Connection, CoordinatorArgs, JobArgs, JobsArgs, LogFormat, LogsArgs, RetryArgs, ServeArgs, StatusArgs, SubmitArgs,
     TaskName, TelemetryArgs, WorkerArgs,
 };
+pub(crate) use garage::{GarageAddArgs, GarageCommand, GarageListArgs, GaragePlaceArgs, Stand};
 pub(crate) use model::{
     EvalArgs, ExportArgs, Format, ImportArgs, ObjectsCommand, PoseArgs, PruneArgs, PruneCapture, RenderArgs,
 };
@@ -84,6 +86,9 @@ pub(crate) enum Command {
     /// Work on objects that move
     #[command(subcommand)]
     Objects(ObjectsCommand),
+    /// Keep vehicles of models, and place them in others
+    #[command(subcommand)]
+    Garage(GarageCommand),
     /// Run the coordinator of a cluster until it is stopped
     Coordinator(CoordinatorArgs),
     /// Run a worker that trains blocks for a coordinator until it is stopped

@@ -30,7 +30,7 @@ mod telemetry_setup;
 
 use std::process::ExitCode;
 
-use args::{BenchCommand, Command, ObjectsCommand};
+use args::{BenchCommand, Command, GarageCommand, ObjectsCommand};
 use failure::Failure;
 use output::Output;
 
@@ -61,6 +61,9 @@ fn main() -> ExitCode {
         Command::Export(args) => commands::export::run(args, &output),
         Command::Import(args) => commands::import::run(args, &output),
         Command::Serve(args) => commands::serve::run(args, &output),
+        Command::Garage(GarageCommand::Add(args)) => commands::garage::add(args, &output),
+        Command::Garage(GarageCommand::List(args)) => commands::garage::list(args, &output),
+        Command::Garage(GarageCommand::Place(args)) => commands::garage::place(args, &output),
         Command::Objects(ObjectsCommand::Pose(args)) => commands::object_poses::run(args, &output),
         Command::Coordinator(args) => commands::coordinator::run(args, &output),
         Command::Worker(args) => commands::worker::run(args, &output),

@@ -103,8 +103,7 @@ impl MovingObject {
     /// The first thing that is wrong.
     pub fn check(&self) -> Result<(), CodecError> {
         let bad = |problem: &str| Err(CodecError::new(format!("object {:?} {problem}", self.id)));
-        let is_named = |c: char| c.is_ascii_alphanumeric() || c == '-' || c == '_';
-        if self.id.is_empty() || self.id.len() > MAX_NAME_BYTES || !self.id.chars().all(is_named) {
+        if !is_name(&self.id) {
             return bad("has a name that is not 1 to 64 letters, digits, - or _");
         }
         if self.class.is_empty() || self.class.len() > MAX_NAME_BYTES || self.class.chars().any(char::is_control) {
@@ -131,6 +130,12 @@ impl MovingObject {
         }
         Ok(())
     }
+}
+
+/// Whether a text can name an object: 1 to 64 letters, digits, `-` and `_`.
+pub fn is_name(text: &str) -> bool {
+    let is_named = |c: char| c.is_ascii_alphanumeric() || c == '-' || c == '_';
+    !text.is_empty() && text.len() <= MAX_NAME_BYTES && text.chars().all(is_named)
 }
 
 /// Checks objects of one capture or model.

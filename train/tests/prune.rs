@@ -191,7 +191,8 @@ fn holes_in_front_of_the_context_count_as_error() {
         let red_at = |view| render(splats, Some(&red), view)[..AREA].iter().filter(|v| **v > 0.6).count();
         views().iter().map(red_at).max().unwrap_or(0)
     };
-    assert!(outcome.splats[1] <= shell, "invisible splats are removed: {outcome:?}");
+    // Twenty are invisible. Where each search for a share ends depends on the last bits, and so on the instruction set.
+    assert!(outcome.splats[1] <= shell + 5, "invisible splats are removed: {outcome:?}");
     assert!(worst(&Splats::new(0)) > 100, "the context alone must be visible");
     assert!(worst(&pruned) <= worst(&green) + 10, "{} of {}", worst(&pruned), worst(&green));
 }

@@ -73,6 +73,13 @@ impl FromStr for ObjectMove {
     }
 }
 
+/// So many numbers with commas between them, each finite and under a million.
+pub(crate) fn numbers<const N: usize>(text: &str) -> Option<[f64; N]> {
+    let numbers: Vec<f64> = text.split(',').map(|part| part.trim().parse().ok()).collect::<Option<_>>()?;
+    let is_sane = numbers.iter().all(|number| number.is_finite() && number.abs() < 1e6);
+    numbers.try_into().ok().filter(|_| is_sane)
+}
+
 /// A time in seconds.
 pub(crate) fn clock_seconds(text: &str) -> Result<f64, String> {
     text.parse().ok().filter(|value: &f64| value.is_finite()).ok_or_else(|| "give seconds, such as 2.5".into())

@@ -7,6 +7,7 @@ pub(crate) mod demo;
 pub(crate) mod doctor;
 pub(crate) mod eval;
 pub(crate) mod export;
+pub(crate) mod garage;
 pub(crate) mod import;
 pub(crate) mod inspect;
 mod inspect_objects;

@@ -108,7 +108,11 @@ pub(crate) fn run(args: &PoseArgs, output: &Output) -> Result<(), Failure> {
     output.result(&said, &format!("{text}\n{}", args.out.display()))
 }
 
-fn read(path: &Path, decode: fn(&[u8]) -> Result<Tracks, CodecError>) -> Result<Tracks, BadInput> {
+/// Reads objects from a file.
+///
+/// # Errors
+/// A file that cannot be read or decoded, or without objects.
+pub(crate) fn read(path: &Path, decode: fn(&[u8]) -> Result<Tracks, CodecError>) -> Result<Tracks, BadInput> {
     let bad = |problem: String, advice: &str| BadInput::new(path.display().to_string(), problem, advice);
     let mut bytes = Vec::new();
     let read = File::open(path).and_then(|file| file.take(MAX_BYTES + 1).read_to_end(&mut bytes));
