@@ -93,7 +93,7 @@ impl Jobs {
         let running: Vec<JobId> =
             jobs.jobs.keys().filter(|id| jobs.scheduler.finished(**id).is_none()).copied().collect();
         for id in running {
-            jobs.log.job(0, id, format!("another coordinator leads, the {epoch}. in this store"));
+            jobs.log.job(0, id, format!("another coordinator leads, epoch {epoch}"));
         }
         jobs.write_journal(|| Line::Began { settings, snapshot: replayed.unwrap_or_default(), epoch, now_millis: 0 });
         Ok(jobs)

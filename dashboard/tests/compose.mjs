@@ -47,11 +47,13 @@ try {
   await page.waitForSelector('[data-testid=coordinator-lost]', { state: 'detached', timeout: 60000 });
   next('finish');
   const job = await until('the job is done', async () => (await api('/api/snapshot')).jobs.find((j) => j.id === 1 && j.state === 'done'), 150);
-  await page.waitForFunction(() => /done/.test(document.querySelector('.bar').textContent), undefined, { timeout: 20000 });
+  const settled = () => page.waitForFunction(() => /· done/.test(document.querySelector('.bar select').textContent) && /Live/.test(document.querySelector('[data-testid=link]').textContent), undefined, { timeout: 30000 });
+  await settled();
   await shot(page, 'compose-overview');
   assert.deepEqual(await violations(page), []);
   await page.goto(`${url}/#/events`);
   await page.waitForSelector('[data-testid=events] li');
+  await settled();
   await shot(page, 'compose-events');
   assert.deepEqual(page.problems, []);
 
@@ -62,7 +64,7 @@ try {
   const seen = await colours(viewer);
   assert.ok(seen.distinct > 200 && seen.lit > 0.15, JSON.stringify(seen));
   assert.deepEqual(viewer.problems, []);
-  console.log(`shown: ${job.counts.done} tasks done, ${after.length} lines of the log, ${seen.distinct} colours in the viewer`);
+  console.log(`shown: ${job.counts.done} tasks done, ${before.length} lines of the log before the leader died and ${after.length} soon after, ${seen.distinct} colours in the viewer`);
 } catch (e) {
   console.error(e);
   process.exitCode = 1;
