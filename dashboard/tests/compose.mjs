@@ -64,7 +64,7 @@ try {
   const seen = await colours(viewer);
   assert.ok(seen.distinct > 200 && seen.lit > 0.15, JSON.stringify(seen));
   assert.deepEqual(viewer.problems, []);
-  console.log(`shown: ${job.counts.done} tasks done, ${before.length} lines of the log before the leader died and ${after.length} soon after, ${seen.distinct} colours in the viewer`);
+  console.log(`shown: ${job.counts.done} tasks done, ${before.lines.length} lines of the log before the leader died and ${after.length} soon after, ${seen.distinct} colours in the viewer`);
 } catch (e) {
   console.error(e);
   process.exitCode = 1;
