@@ -138,7 +138,7 @@ fn a_detectors_loss_is_in_training_on_a_gpu_as_on_the_cpu() {
     };
     let (on_cpu, on_gpu) = (values("cpu"), values("one"));
     println!("{on_cpu:?} {on_gpu:?}");
-    assert!(on_gpu.iter().any(|loss| *loss > 0.0) && on_gpu.len() == on_cpu.len());
+    assert!(on_cpu.iter().any(|loss| *loss > 0.0) && on_gpu.iter().any(|loss| *loss > 0.0));
 }
 
 #[test]
