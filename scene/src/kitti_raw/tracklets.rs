@@ -67,7 +67,10 @@ struct Pose {
 /// # Errors
 /// Malformed XML, an element that is missing or no number, values out of range, too many objects or poses.
 pub fn read_tracklets(bytes: &[u8]) -> Result<Vec<Tracklet>, CodecError> {
-    let bad = |error: quick_xml::DeError| CodecError::new(error.to_string().replace('\n', " "));
+    // It quotes the file.
+    let plain = |c: char| if c.is_control() { ' ' } else { c };
+    let bad =
+        |error: quick_xml::DeError| CodecError::new(error.to_string().chars().map(plain).take(200).collect::<String>());
     let Archive { tracklets } = quick_xml::de::from_reader(bytes).map_err(bad)?;
     let items = tracklets.items;
     let poses: usize = items.iter().map(|item| item.poses.items.len()).sum();
@@ -133,7 +136,7 @@ mod tests {
     fn damaged_files_are_refused_in_one_line() {
         for (from, to, says) in [
             ("<h>1.5</h>", "", "`h`"),
-            ("<h>1.5</h>", "<h>tall</h>", "invalid float"),
+            ("<h>1.5</h>", "<h>tall</h>", "f64"),
             ("<h>1.5</h>", "<h>0</h>", "no size"),
             ("<l>4</l>", "<l>201</l>", "200 m"),
             ("<l>4</l>", "<l>nan</l>", "no size"),
@@ -147,8 +150,11 @@ mod tests {
         ] {
             assert!(CAR.contains(from));
             let error = read_tracklets(CAR.replace(from, to).as_bytes()).unwrap_err().to_string();
-            assert!(error.contains(says) && !error.contains('\n'), "{from} {to}: {error}");
+            assert!(error.contains(says) && !error.contains(char::is_control), "{from} {to}: {error}");
         }
+        let quoted =
+            read_tracklets(CAR.replace("</objectType>", "</object\u{1}Type>").as_bytes()).unwrap_err().to_string();
+        assert!(!quoted.contains(char::is_control), "{quoted}");
         assert!(read_tracklets(b"").is_err() && read_tracklets(&[0xff, 0xfe, 0x00]).is_err());
     }
 }
