@@ -163,8 +163,8 @@ pub fn place(path: &Path, object: ModelObject, antialiased: bool) -> Result<(), 
     let Some((_, out)) = &model.trained else {
         return Err(bad("is one file, which has no objects".into(), "give a folder that plat train wrote").into());
     };
-    if model.antialiased != antialiased && !model.objects.is_empty() {
-        let problem = "draws its objects with another filter than the vehicle was trained with";
+    if model.antialiased != antialiased {
+        let problem = "is drawn with another filter than the vehicle was trained with";
         return Err(bad(problem.into(), "give a vehicle of a model of the same kind").into());
     }
     let id = &object.about.id;
