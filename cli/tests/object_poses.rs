@@ -70,5 +70,12 @@ fn vehicles_get_their_poses_from_positions_and_the_road() {
     fs::write(at.join("text.json"), "positions").unwrap();
     refused_with("text.json", "text.json");
     refused_with("missing.json", "missing.json");
+    write(
+        "other.json",
+        &[
+            json!({"id": "x", "class": "car", "low": [0, 0, 0], "high": [1, 1, 1], "poses": [[0, [0, 0, 0], [0, 0, 0, 1]]]}),
+        ],
+    );
+    refused(at, &[&pose[..], &["--against", "other.json", "--out", "o.json"]].concat(), "none of the objects");
     assert!(!at.join("o.json").exists());
 }

@@ -56,6 +56,12 @@ struct Errors {
 pub(crate) fn run(args: &PoseArgs, output: &Output) -> Result<(), Failure> {
     let given = read(&args.positions, objects::read_positions)?;
     let truth = args.against.as_deref().map(|path| read(path, objects::read)).transpose()?;
+    if let (Some(path), Some(truth)) = (&args.against, &truth)
+        && !truth.objects.iter().any(|own| given.objects.iter().any(|object| object.id == own.id))
+    {
+        let problem = format!("has none of the objects of {}", args.positions.display());
+        return Err(BadInput::new(path.display().to_string(), problem, "give true paths of the same names").into());
+    }
     let ground_from_world = model::ground_from_world(&args.model)?;
     let model = model::read(&args.model)?;
     let cell = |place: DVec3| [place.x, place.y].map(|side| (side / CELL_METRES).floor() as i64);
