@@ -4,21 +4,12 @@
 // Reads no answer: what happened has to show on the page.
 import assert from 'node:assert/strict';
 import { colours } from './realpages.mjs';
-import { browser, open, shot, violations } from './helper.mjs';
+import { browser, open, shot, until, violations } from './helper.mjs';
 
 const url = process.env.URL.replace(/\/$/, '');
 const access = { ignoreHTTPSErrors: true, httpCredentials: { username: 'anyone', password: process.env.TOKEN, send: 'always' } };
 const next = (word) => console.log(`next: ${word}`);
 const b = await browser();
-
-async function until(what, check, seconds = 60) {
-  for (const end = Date.now() + 1000 * seconds; Date.now() < end;) {
-    const found = await check();
-    if (found) return found;
-    await new Promise((done) => setTimeout(done, 150));
-  }
-  throw new Error(`not within ${seconds} s: ${what}`);
-}
 
 try {
   const stranger = await (await b.newContext({ ignoreHTTPSErrors: true })).request.get(`${url}/api/snapshot`);

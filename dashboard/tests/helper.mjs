@@ -58,3 +58,13 @@ export async function violations(page) {
 }
 
 export const shot = (page, name) => page.screenshot({ path: join(OUT, `${name}.png`), timeout: 60000 });
+
+/** What `check` finds, asked again until it finds something. */
+export async function until(what, check, seconds = 60) {
+  for (const end = Date.now() + 1000 * seconds; Date.now() < end;) {
+    const found = await check();
+    if (found) return found;
+    await new Promise((done) => setTimeout(done, 150));
+  }
+  throw new Error(`not within ${seconds} s: ${what}`);
+}

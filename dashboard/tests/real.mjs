@@ -6,7 +6,7 @@ import { mkdtempSync, rmSync } from 'node:fs';
 import { tmpdir } from 'node:os';
 import { join } from 'node:path';
 import { Cluster, front } from './cluster.mjs';
-import { browser, open, shot, violations } from './helper.mjs';
+import { browser, open, shot, until, violations } from './helper.mjs';
 import { colours, everyPage } from './realpages.mjs';
 
 const began = Date.now();
@@ -33,15 +33,6 @@ const legend = (page) => page.locator('.legend').first().innerText().then((text)
 const snapshot = () => fetch(`${cluster.pages}/api/snapshot`).then((r) => r.json());
 const state = async (id = 2) => (await snapshot()).jobs.find((j) => j.id === id);
 const submit = (...more) => cluster.submit(process.env.CAPTURE, '--levels', 1, '--steps', process.env.STEPS ?? 6000, ...more);
-async function until(what, check, seconds = 60) {
-  for (const end = Date.now() + 1000 * seconds; Date.now() < end;) {
-    const found = await check();
-    if (found) return found;
-    await new Promise((done) => setTimeout(done, 150));
-  }
-  throw new Error(`not within ${seconds} s: ${what}`);
-}
-
 try {
   await cluster.coordinator();
   await cluster.observer();
