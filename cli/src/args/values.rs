@@ -57,17 +57,9 @@ impl FromStr for ObjectMove {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
-        let numbers = |text: &str| {
-            let numbers: Vec<f64> = text.split(',').map(|part| part.trim().parse().ok()).collect::<Option<_>>()?;
-            Some(numbers).filter(|of| of.iter().all(|number| number.is_finite() && number.abs() < 1e6))
-        };
-        let parsed = text.split_once('=').and_then(|(id, rest)| Some((id, numbers(rest)?)));
-        match parsed {
-            Some((id, of)) if matches!(of.len(), 3 | 4) => Ok(Self {
-                id: id.to_owned(),
-                metres: DVec3::new(of[0], of[1], of[2]),
-                degrees: of.get(3).copied().unwrap_or(0.0),
-            }),
+        let numbers = |text| numbers::<3>(text).map(|[x, y, z]| [x, y, z, 0.0]).or_else(|| numbers::<4>(text));
+        match text.split_once('=').and_then(|(id, rest)| Some((id, numbers(rest)?))) {
+            Some((id, [x, y, z, degrees])) => Ok(Self { id: id.to_owned(), metres: DVec3::new(x, y, z), degrees }),
             _ => Err("give ID=X,Y,Z or ID=X,Y,Z,DEGREES, such as 160=2.5,0,0".into()),
         }
     }
