@@ -17,6 +17,7 @@ use crate::props::Prop;
 use crate::random::Random;
 use crate::roads::Roads;
 use crate::settings::CitySettings;
+use crate::street_furniture::random_car;
 use crate::terrain::Terrain;
 use crate::traffic::{self, Mover};
 use crate::types::{Actor, City, Class, Trajectory};
@@ -56,6 +57,16 @@ impl City {
         );
         city.populate(&placements, plan.movers(deck.as_ref()), &plan.random.fork(0x9409));
         Ok(city)
+    }
+
+    /// Parks a car at a pose (on the road, x ahead). The seed chooses which.
+    pub fn park(&mut self, pose: Rigid, seed: u64) {
+        let mut random = Random::new(seed).fork(0x9A4C);
+        let prop = random_car(&mut random);
+        let asset = self.assets.len() as u32;
+        self.assets.push(prop.build(&random));
+        let instance = 1 + self.actors.iter().map(|actor| actor.instance).max().unwrap_or(0);
+        self.actors.push(Actor { asset, class: prop.class(), instance, world_from_asset: pose, trajectory: None });
     }
 
     fn lay_ground(&mut self, plan: &Plan, deck: Option<&Deck>) {

@@ -9,6 +9,7 @@ mod plan;
 mod reference;
 mod sweep;
 mod synth;
+mod update;
 mod values;
 mod zones;
 
@@ -29,13 +30,14 @@ pub(crate) use cluster::{
     Connection, CoordinatorArgs, JobArgs, JobsArgs, LogFormat, LogsArgs, RetryArgs, ServeArgs, StatusArgs, SubmitArgs,
     TaskName, TelemetryArgs, WorkerArgs,
 };
-pub(crate) use garage::{GarageAddArgs, GarageCommand, GarageListArgs, GaragePlaceArgs, Stand};
+pub(crate) use garage::{GarageAddArgs, GarageCommand, GarageListArgs, GaragePlaceArgs, Stand, VehicleBox};
 pub(crate) use model::{
     EvalArgs, ExportArgs, Format, ImportArgs, ObjectsCommand, PoseArgs, PruneArgs, PruneCapture, RenderArgs,
 };
 pub(crate) use plan::{BLOCK_MEMORY_MIB, Blocks, DepthKind, PlanOptions, RESIDUAL};
 pub(crate) use sweep::Named;
 pub(crate) use synth::{Rig, SynthArgs};
+pub(crate) use update::UpdateArgs;
 pub(crate) use values::{Auto, Backend, Size};
 pub(crate) use zones::{AlignedOptions, OWN_LABELS, ZoneFinder, ZoneOptions};
 
@@ -77,6 +79,8 @@ pub(crate) enum Command {
     Render(RenderArgs),
     /// Remove the least important splats of a model
     Prune(PruneArgs),
+    /// Train a place of a finished model on new photos of it; everything else stays as it is
+    Update(UpdateArgs),
     /// Write a model in a format that other programs read
     Export(ExportArgs),
     /// Write a model of another program as PLY or SPZ; every command reads such models as they are, too

@@ -58,6 +58,7 @@ fn main() -> ExitCode {
         Command::Eval(args) => commands::eval::run(args, &output),
         Command::Render(args) => commands::render::run(args, &output),
         Command::Prune(args) => commands::prune::run(args, &output),
+        Command::Update(args) => commands::update::run(args, &output),
         Command::Export(args) => commands::export::run(args, &output),
         Command::Import(args) => commands::import::run(args, &output),
         Command::Serve(args) => commands::serve::run(args, &output),

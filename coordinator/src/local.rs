@@ -2,6 +2,7 @@
 
 use std::fmt;
 use std::future::Future;
+use std::pin::Pin;
 use std::time::Duration;
 
 use proto::watch_event::Event as Update;
@@ -33,14 +34,44 @@ pub async fn run_local<W, E>(
     options: Options,
     plan: ArtefactId,
     workers: usize,
-    start_worker: impl Fn(String, usize, CancellationToken) -> W,
-    mut on_update: impl FnMut(&Update),
+    start_worker: impl Fn(String, usize, CancellationToken) -> W + Send + Sync,
+    mut on_update: impl FnMut(&Update) + Send,
     stop: CancellationToken,
 ) -> Result<Vec<ArtefactId>, LocalError>
 where
     W: Future<Output = Result<(), E>> + Send + 'static,
     E: fmt::Display + Send + 'static,
 {
+    let start_worker = |url: String, number: usize, stop: CancellationToken| -> Running {
+        let worker = start_worker(url, number, stop);
+        Box::pin(async move { worker.await.map_err(|error| error.to_string()) })
+    };
+    compiled_here(options, plan, workers, &start_worker, &mut on_update, stop).await
+}
+
+/// A worker; the text of its error.
+type Running = Pin<Box<dyn Future<Output = Result<(), String>> + Send>>;
+
+/// Behind a pointer, as in [`serve`].
+fn compiled_here<'a>(
+    options: Options,
+    plan: ArtefactId,
+    workers: usize,
+    start_worker: &'a (dyn Fn(String, usize, CancellationToken) -> Running + Send + Sync),
+    on_update: &'a mut (dyn FnMut(&Update) + Send),
+    stop: CancellationToken,
+) -> Pin<Box<dyn Future<Output = Result<Vec<ArtefactId>, LocalError>> + Send + 'a>> {
+    Box::pin(run(options, plan, workers, start_worker, on_update, stop))
+}
+
+async fn run(
+    options: Options,
+    plan: ArtefactId,
+    workers: usize,
+    start_worker: &(dyn Fn(String, usize, CancellationToken) -> Running + Send + Sync),
+    on_update: &mut (dyn FnMut(&Update) + Send),
+    stop: CancellationToken,
+) -> Result<Vec<ArtefactId>, LocalError> {
     let listener = TcpListener::bind("127.0.0.1:0").await.map_err(failed("cannot listen on 127.0.0.1"))?;
     let address = listener.local_addr().map_err(failed("cannot listen on 127.0.0.1"))?;
     let url = format!("http://{address}");
@@ -76,7 +107,7 @@ where
             () = stop.cancelled(), if !cancelled => {}
             Some(ended) = running.join_next() => {
                 let ended = ended.map_err(|error| error.to_string());
-                worker_error = worker_error.or(ended.and_then(|worker| worker.map_err(|error| error.to_string())).err());
+                worker_error = worker_error.or(ended.and_then(|worker| worker).err());
             }
             event = updates.message() => {
                 let event = event.map_err(of_status)?.and_then(|event| event.event);

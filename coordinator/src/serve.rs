@@ -1,6 +1,7 @@
 //! Runs the gRPC server and the actor until shutdown.
 
 use std::future::Future;
+use std::pin::Pin;
 use std::time::Duration;
 
 use tokio::net::TcpListener;
@@ -33,6 +34,24 @@ pub async fn serve(
     listener: TcpListener,
     options: Options,
     shutdown: impl Future<Output = ()> + Send,
+) -> Result<(), ServeError> {
+    compiled_here(listener, options, Box::pin(shutdown)).await
+}
+
+/// The server behind a pointer. The body of an `async fn` is compiled in each crate that awaits it, and of this one that is a database, TLS
+/// and HTTP: the tests of this workspace took six minutes of compilation for it.
+fn compiled_here<'a>(
+    listener: TcpListener,
+    options: Options,
+    shutdown: Pin<Box<dyn Future<Output = ()> + Send + 'a>>,
+) -> Pin<Box<dyn Future<Output = Result<(), ServeError>> + Send + 'a>> {
+    Box::pin(run(listener, options, shutdown))
+}
+
+async fn run(
+    listener: TcpListener,
+    options: Options,
+    shutdown: Pin<Box<dyn Future<Output = ()> + Send + '_>>,
 ) -> Result<(), ServeError> {
     let address = listener.local_addr()?;
     options.security.check(address)?;

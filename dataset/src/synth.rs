@@ -46,11 +46,13 @@ use std::path::Path;
 
 use city::City;
 use city::faults;
+use city::sense::watch::nearest_on_street;
 use city::trace::World;
+use glam::{DVec2, DVec3};
 use scene::BadInput;
 
 pub use gallery::gallery;
-pub use settings::{CarRig, Driven, Progress, Settings, Summary, SynthError, VoxelRegion};
+pub use settings::{CarRig, Driven, Progress, Settings, Summary, SynthError, VoxelRegion, Watched, WatchedPlace};
 use settings::{SUBJECT, unsupported};
 use shots::PlannedShots;
 
@@ -61,7 +63,8 @@ use shots::PlannedShots;
 pub fn write(out: &Path, settings: &Settings, progress: Progress) -> Result<Summary, SynthError> {
     settings.check()?;
     manifest::begin(out, settings)?;
-    let city = City::generate(&settings.city)?;
+    let mut city = City::generate(&settings.city)?;
+    let watched = settings.watched.and_then(|place| watched_place(&mut city, place, settings.city.seed));
     let world = World::new(&city).map_err(|e| unsupported(&e))?;
     let PlannedShots { shots, legs, stations, driven } = shots::plan(&world, settings)?;
     let mut shots = faults::degrade_shots(shots, &settings.faults);
@@ -102,9 +105,29 @@ pub fn write(out: &Path, settings: &Settings, progress: Progress) -> Result<Summ
         moving: city.actors.iter().filter(|actor| actor.trajectory.is_some()).count(),
         triangles: meshes.map(|mesh| mesh.triangles.len()).sum(),
         driven,
+        watched,
     };
     manifest::complete(out, settings, &city, &summary)?;
     Ok(summary)
+}
+
+/// The watched place of a street, where a car is parked if the settings say so.
+fn watched_place(city: &mut City, settings: Watched, seed: u64) -> Option<WatchedPlace> {
+    let pose = nearest_on_street(city, DVec2::new(settings.x, settings.y))?;
+    let ahead = pose.rotation * DVec3::X;
+    let degrees = ahead.y.atan2(ahead.x).to_degrees();
+    let millimetres = |number: f64| (1e3 * number).round() / 1e3;
+    let place = pose.translation.to_array().map(millimetres);
+    let parked = settings.parked.then(|| {
+        city.park(pose, seed);
+        let asset = city.actors.last().map_or(0, |actor| actor.asset);
+        let (low, high) = tracks_and_boxes::bounds(city, asset).unwrap_or_default();
+        let middle = pose.apply((0.5 * (low + high)).with_z(low.z).as_dvec3());
+        let [x, y, z] = middle.to_array();
+        let [length, width, height] = (high - low).as_dvec3().to_array();
+        [x, y, z, degrees, length, width, height].map(millimetres)
+    });
+    Some(WatchedPlace { place, degrees: millimetres(degrees), parked })
 }
 
 /// As [`write`], replacing a synthetic capture of other settings. A folder with anything else in it is refused.

@@ -3,7 +3,7 @@
 //! [`evaluate`] renders every held-out view once and compares it with its photo: PSNR, SSIM, SSIMULACRA2, LPIPS. On request it also
 //! measures the depth, what a detector finds, the cuts of a level-of-detail tree ([`cuts`]) and the seams between blocks
 //! ([`seams`]) on the same views.
-//! [`Pruner`] prunes a model by a capture's photos. Contact sheets, error maps and bird's-eye cameras are here too.
+//! [`Pruner`] prunes a model by a capture's photos, and [`update()`] trains an area of it on new ones. Contact sheets, error maps and bird's-eye cameras are here too.
 //!
 //! Architecture invariant: no command line, no terminal, no clock. Progress and time come from the caller's [`Observer`].
 
@@ -38,6 +38,7 @@ mod sheet;
 mod shown_objects;
 mod summary;
 mod surface;
+mod update;
 mod zone_pictures;
 mod zones;
 
@@ -71,5 +72,6 @@ pub use pruning::Pruner;
 pub use renderer::{Placed, Renderer, Uploaded};
 pub use sheet::gallery;
 pub use summary::{ByKind, Group, Summary};
+pub use update::{Gain, HALO, UpdateOptions, Updated, WorldBox, update};
 pub use zone_pictures::{count_zones, draw_zones};
 pub use zones::ZoneFigures;

@@ -24,6 +24,8 @@ pub struct PhotoOptions<'a> {
     pub test_every: Option<u32>,
     /// Width of the stretches of streets of which some are held out, metres; 0: none.
     pub test_stretches: Option<f64>,
+    /// Uses a temporary store by default, even if the model's own still exists: the photos are not the model's.
+    pub leaves_store_of_model: bool,
 }
 
 /// An ingested capture.
@@ -61,7 +63,7 @@ impl Photos {
         options: &PhotoOptions,
         observer: &dyn Observer,
     ) -> Result<Self, EvalError> {
-        let (store, temporary) = open_store(model, options.store)?;
+        let (store, temporary) = open_store(model, options)?;
         let store = store.blocking();
         let downscale = options.downscale.unwrap_or(model.downscale());
         let threads = std::thread::available_parallelism().map_or(1, usize::from);
@@ -94,9 +96,10 @@ impl Photos {
     }
 }
 
-fn open_store(model: &Model, url: Option<&str>) -> Result<(Store, Option<TempDir>), EvalError> {
-    let own = model.trained.as_ref().map(|(_, out)| out.join("store")).filter(|store| store.is_dir());
-    match (url, own) {
+fn open_store(model: &Model, options: &PhotoOptions) -> Result<(Store, Option<TempDir>), EvalError> {
+    let trained = model.trained.as_ref().filter(|_| !options.leaves_store_of_model);
+    let own = trained.map(|(_, out)| out.join("store")).filter(|store| store.is_dir());
+    match (options.store, own) {
         (Some(url), _) => Ok((Store::open(url)?, None)),
         (None, Some(own)) => Ok((Store::open(&own.display().to_string())?, None)),
         (None, None) => {

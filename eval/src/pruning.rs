@@ -154,7 +154,7 @@ impl<'a> Pruner<'a> {
 }
 
 /// Smallest and largest standard deviation of the splats, metres.
-fn size_bounds(splats: &Splats) -> [f32; 2] {
+pub(crate) fn size_bounds(splats: &Splats) -> [f32; 2] {
     let sizes = (0..3).flat_map(|axis| splats.col(column::LOG_SCALE + axis)).filter(|size| size.is_finite());
     let (low, high) = sizes.fold((f32::MAX, f32::MIN), |(low, high), &size| (low.min(size), high.max(size)));
     if low <= high { [low.exp(), high.exp()] } else { [1e-6, 1e6] }

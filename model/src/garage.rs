@@ -110,20 +110,27 @@ impl Garage {
         Ok((vehicle.clone(), splats))
     }
 
+    /// Checks that a vehicle of this name can be added.
+    ///
+    /// # Errors
+    /// A name that is taken or no name.
+    pub fn check_name(&self, name: &str) -> Result<(), BadInput> {
+        if !is_name(name) {
+            return Err(bad_vehicle(name, "is no name", "use letters, digits, - and _"));
+        }
+        match self.vehicles.iter().any(|other| other.name == name) {
+            true => Err(bad_vehicle(name, "is in the garage already", "give another --name")),
+            false => Ok(()),
+        }
+    }
+
     /// Adds a vehicle.
     ///
     /// # Errors
     /// A name that is taken or no name, a box that is wrong, no splats, a file that cannot be written.
     pub fn add(&mut self, vehicle: Vehicle, splats: &Splats) -> Result<(), ModelError> {
-        let bad = |problem: &str, advice: &str| {
-            BadInput::new(format!("vehicle '{:.64}'", vehicle.name), problem, advice.to_owned())
-        };
-        if !is_name(&vehicle.name) {
-            return Err(bad("is no name", "use letters, digits, - and _").into());
-        }
-        if self.vehicles.iter().any(|other| other.name == vehicle.name) {
-            return Err(bad("is in the garage already", "give another --name").into());
-        }
+        self.check_name(&vehicle.name)?;
+        let bad = |problem: &str, advice: &str| bad_vehicle(&vehicle.name, problem, advice);
         vehicle.check().map_err(|error| bad(&error.to_string(), "correct the box"))?;
         if splats.is_empty() {
             return Err(bad("would have no splats", "check that the box is where the model shows it").into());
@@ -135,6 +142,10 @@ impl Garage {
         self.vehicles.insert(at, Vehicle { splats: splats.len(), ..vehicle });
         Ok(save_json(&self.folder.join(FILE), &File { version: VERSION, vehicles: self.vehicles.clone() })?)
     }
+}
+
+fn bad_vehicle(name: &str, problem: &str, advice: &str) -> BadInput {
+    BadInput::new(format!("vehicle '{name:.64}'"), problem, advice.to_owned())
 }
 
 /// The splats in a box of the world, in the axes of the box, whose origin `world_from_box` moves.

@@ -44,7 +44,7 @@ pub use import::{Kind, kind};
 pub use manifest::{BlockEntry, Manifest};
 pub use rad::write_rad;
 pub use read::{Tree, ground_from_world, read, read_tree};
-pub use rewrite::{check_out, rewrite};
+pub use rewrite::{check_out, replace_blocks, rewrite};
 pub use streamed_sog::write_streamed_sog;
 pub use tiles::write_tiles;
 pub use write::{Written, write};

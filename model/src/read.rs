@@ -69,7 +69,7 @@ pub fn ground_from_world(path: &Path) -> Result<DQuat, BadInput> {
 }
 
 /// The objects of a folder, by name; none without their paths.
-fn read_objects(folder: &Path) -> Result<Vec<ModelObject>, BadInput> {
+pub(crate) fn read_objects(folder: &Path) -> Result<Vec<ModelObject>, BadInput> {
     let path = folder.join(PATHS_FILE);
     if !path.is_file() {
         return Ok(Vec::new());

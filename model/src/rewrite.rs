@@ -1,16 +1,22 @@
 //! Writes a model that was read before with other splats, in the same format.
 
+use std::borrow::Cow;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
+use std::io::ErrorKind;
 use std::path::Path;
 
-use scene::{ArtefactId, BadInput, Splats, frame};
+use scene::{ArtefactId, BadInput, BlockId, Splats, frame};
 use store::file::save;
 
 use crate::error::{ModelError, cannot};
-use crate::files::{EXPOSURES_FILE, MANIFEST_FILE, MERGED_FILE, POSES_FILE, block_file, save_json};
+use crate::files::{
+    CAMERAS_FILE, EXPOSURES_FILE, MANIFEST_FILE, MERGED_FILE, OBJECTS_FOLDER, PATHS_FILE, POSES_FILE, block_file,
+    save_json,
+};
 use crate::import::{Kind, kind};
-use crate::read::{Tree, read_tree};
-use crate::write::{begin, save_objects};
+use crate::read::{Opened, Tree, open, read_block, read_objects, read_tree};
+use crate::write::{begin, save_objects, write_merged};
 use crate::{BlockEntry, Manifest, Model};
 
 /// Checks where a rewritten model shall go.
@@ -76,6 +82,63 @@ pub fn rewrite(path: &Path, out: &Path, model: Model, splats: Splats) -> Result<
     let splats = Tree { plan, results, antialiased }.merged(&leaves);
     let manifest = Manifest { splats: splats.len() as u64, blocks, ..manifest.clone() };
     finish(out, &folder, &manifest, &Model { splats, trained: None, ..model })
+}
+
+/// Writes the model in the folder `path` with other splats of some blocks (halo included) to another folder. All other blocks, objects,
+/// exposures and poses are copied byte for byte. Returns the bytes of `merged.ply`.
+///
+/// # Errors
+/// A model that is none, a block that cannot be read, or a file that cannot be written.
+pub fn replace_blocks(path: &Path, out: &Path, changed: &BTreeMap<BlockId, Splats>) -> Result<u64, ModelError> {
+    let (from, manifest, plan) = match open(path)? {
+        Opened::Trained { folder, manifest, plan } => (folder, *manifest, *plan),
+        Opened::File { .. } => {
+            let advice = "give a folder that plat train wrote";
+            return Err(BadInput::new(path.display().to_string(), "is one file, which has no blocks", advice).into());
+        }
+    };
+    let outer = from.parent().filter(|_| from.ends_with("model")).unwrap_or(&from);
+    let leaves = plan.leaves();
+    let folder = begin(out, &plan)?;
+    let copy = |name: &Path, from: &Path, to: &Path| match fs::copy(from.join(name), to.join(name)) {
+        Err(error) if error.kind() != ErrorKind::NotFound => Err(cannot("written", &to.join(name))(error)),
+        _ => Ok(()),
+    };
+    let (mut blocks, mut count, mut attributes) = (Vec::new(), 0, BTreeSet::new());
+    for BlockEntry { block, artefact, .. } in manifest.blocks {
+        let name = Path::new("blocks").join(block_file(block));
+        let (splats, artefact) = match changed.get(&block) {
+            None => {
+                copy(&name, &from, &folder)?;
+                (Cow::Owned(read_block(&folder, block)?), artefact)
+            }
+            Some(splats) => {
+                let bytes = frame::encode_splats(splats);
+                save(&folder.join(&name), &bytes)?;
+                (Cow::Borrowed(splats), ArtefactId::of(&bytes))
+            }
+        };
+        attributes.extend(splats.attribute_names());
+        count += leaves.keep(&splats, &plan.ground, block).len();
+        blocks.push(BlockEntry { block, artefact, splats: splats.len() as u64 });
+    }
+    let attributes: Vec<String> = attributes.into_iter().collect();
+    let bytes = write_merged(out, &folder, &plan, count, &attributes)?;
+    copy(Path::new(CAMERAS_FILE), outer, out)?;
+    [EXPOSURES_FILE, POSES_FILE].iter().try_for_each(|name| copy(Path::new(name), &from, &folder))?;
+    let objects = read_objects(&outer.join(OBJECTS_FOLDER))?;
+    if !objects.is_empty() {
+        let made = out.join(OBJECTS_FOLDER);
+        fs::create_dir_all(&made).map_err(cannot("made", &made))?;
+        let splats = objects.iter().map(|object| format!("{}.ply", object.about.id));
+        // Last: objects without their paths are none.
+        for name in splats.chain([PATHS_FILE.to_owned()]) {
+            copy(&Path::new(OBJECTS_FOLDER).join(name), outer, out)?;
+        }
+    }
+    let manifest = Manifest { splats: count as u64, blocks, ..manifest };
+    save_json(&folder.join(MANIFEST_FILE), &manifest)?;
+    Ok(bytes)
 }
 
 /// Writes `merged.ply`, exposures, poses and at last the manifest; returns the bytes of `merged.ply`.

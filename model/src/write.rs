@@ -87,19 +87,8 @@ pub fn write(
         count += owned(&splats, block).len();
     }
 
-    let mut order: Vec<BlockId> = blocks.iter().map(|entry| entry.block).collect();
-    order.sort_unstable();
-    let mut merged = AtomicFile::create(&out.join(MERGED_FILE))?;
     let attributes: Vec<String> = attributes.into_iter().collect();
-    let header = ply::header(count, sh_degree, &attributes, ply_comments(plan.settings.antialiased));
-    merged.write(&header)?;
-    let mut bytes = header.len() as u64;
-    for block in order {
-        let rows = ply::rows(&owned(&read_block(&folder, block)?, block).with_attributes(&attributes));
-        merged.write(&rows)?;
-        bytes += rows.len() as u64;
-    }
-    merged.commit()?;
+    let bytes = write_merged(out, &folder, plan, count, &attributes)?;
 
     let objects = objects_of(plan, results, store, capture)?;
     save_objects(out, &objects, plan.settings.antialiased)?;
@@ -129,6 +118,31 @@ pub fn write(
     };
     save_json(&folder.join(MANIFEST_FILE), &manifest)?;
     Ok(Written { splats: count as u64, bytes, objects: objects.len() })
+}
+
+/// Writes `merged.ply` of `count` splats from the block files in `folder`, one block in memory at a time. Returns its bytes.
+pub(crate) fn write_merged(
+    out: &Path,
+    folder: &Path,
+    plan: &Plan,
+    count: usize,
+    attributes: &[String],
+) -> Result<u64, ModelError> {
+    let (leaves, sh_degree) = (plan.leaves(), plan.settings.sh_degree);
+    let mut order: Vec<BlockId> = plan.tasks.iter().map(|task| task.block).collect();
+    order.sort_unstable();
+    let mut merged = AtomicFile::create(&out.join(MERGED_FILE))?;
+    let header = ply::header(count, sh_degree, attributes, ply_comments(plan.settings.antialiased));
+    merged.write(&header)?;
+    let mut bytes = header.len() as u64;
+    for block in order {
+        let owned = leaves.keep(&read_block(folder, block)?, &plan.ground, block).with_sh_degree(sh_degree);
+        let rows = ply::rows(&owned.with_attributes(attributes));
+        merged.write(&rows)?;
+        bytes += rows.len() as u64;
+    }
+    merged.commit()?;
+    Ok(bytes)
 }
 
 /// The objects that move, of a plan that trains some. Where a job was cut short before them, there are none.

@@ -32,8 +32,10 @@ mod status_page;
 mod testing;
 mod views;
 
+use std::future::Future;
 use std::net::SocketAddr;
 use std::path::PathBuf;
+use std::pin::Pin;
 use std::sync::Arc;
 
 use proto::{KeyPair, Token};
@@ -115,7 +117,16 @@ impl Serving {
 ///
 /// # Errors
 /// An address beyond the loopback without TLS and token, an invalid certificate, a folder that cannot be shown.
-pub async fn serve(listener: TcpListener, options: Options, source: Source) -> Result<Serving, BadInput> {
+pub fn serve(
+    listener: TcpListener,
+    options: Options,
+    source: Source,
+) -> Pin<Box<dyn Future<Output = Result<Serving, BadInput>> + Send>> {
+    // Behind a pointer, so that it is compiled once, in this crate; as `coordinator::serve`.
+    Box::pin(start(listener, options, source))
+}
+
+async fn start(listener: TcpListener, options: Options, source: Source) -> Result<Serving, BadInput> {
     let unusable =
         |error: std::io::Error| BadInput::new("the server", error.to_string(), "free disk space, or set TMPDIR");
     let address = listener.local_addr().map_err(unusable)?;

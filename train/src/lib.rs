@@ -3,6 +3,7 @@
 //! Architecture invariant: no files, no network, no clock. Pixels come through [`WindowSource`]. Random numbers are
 //! counter-based ([`random`]), so a job gives the same splats for any number of threads.
 
+pub mod changes;
 pub mod checkpoint;
 pub mod coarse_to_fine;
 mod depth_loss;

@@ -1,5 +1,7 @@
 //! The worker's main loop: lease a task, carry it out, lease the next one.
 
+use std::future::Future;
+use std::pin::Pin;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -19,7 +21,18 @@ const LEAVE_TIMEOUT: Duration = Duration::from_secs(2);
 ///
 /// # Errors
 /// [`WorkerError`].
-pub async fn greet(options: &Options, shutdown: &CancellationToken) -> Result<Option<proto::AboutReply>, WorkerError> {
+pub fn greet<'a>(
+    options: &'a Options,
+    shutdown: &'a CancellationToken,
+) -> Pin<Box<dyn Future<Output = Result<Option<proto::AboutReply>, WorkerError>> + Send + 'a>> {
+    // Behind a pointer, so that it is compiled once, in this crate; as `coordinator::serve`.
+    Box::pin(greet_until(options, shutdown))
+}
+
+async fn greet_until(
+    options: &Options,
+    shutdown: &CancellationToken,
+) -> Result<Option<proto::AboutReply>, WorkerError> {
     let mut link = CoordinatorLink::new(options)?;
     while !shutdown.is_cancelled() {
         let answer = tokio::select! {
@@ -40,7 +53,19 @@ pub async fn greet(options: &Options, shutdown: &CancellationToken) -> Result<Op
 ///
 /// # Errors
 /// [`WorkerError`].
-pub async fn run(options: Options, executor: Arc<dyn Execute>, shutdown: CancellationToken) -> Result<(), WorkerError> {
+pub fn run(
+    options: Options,
+    executor: Arc<dyn Execute>,
+    shutdown: CancellationToken,
+) -> Pin<Box<dyn Future<Output = Result<(), WorkerError>> + Send>> {
+    Box::pin(run_until(options, executor, shutdown))
+}
+
+async fn run_until(
+    options: Options,
+    executor: Arc<dyn Execute>,
+    shutdown: CancellationToken,
+) -> Result<(), WorkerError> {
     let mut link = CoordinatorLink::new(&options)?;
     // The lease reply that came with the answer to the last task's result.
     let mut next = None;

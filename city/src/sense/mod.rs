@@ -5,6 +5,7 @@
 //! | [`rig`] | [`Shot`]s of a car with six cameras along the streets |
 //! | [`drives`] | drives of such cars through whole streets, both directions, closely |
 //! | [`survey`] | [`Shot`]s of aerial blocks, surveillance cameras and free paths |
+//! | [`watch`] | [`Shot`]s of fixed cameras around a place |
 //! | [`lidar`] | lidar sweeps: true and noisy ranges, intensities |
 //! | [`radar`] | radar detections with radial velocities, and ghosts |
 //! | [`inertial`] | GPS fixes, gyro and accelerometer readings, and the drift of reported poses |
@@ -15,6 +16,7 @@ pub mod lidar;
 pub mod radar;
 pub mod rig;
 pub mod survey;
+pub mod watch;
 
 use glam::{DMat3, DQuat, DVec3};
 use scene::{Camera, Pinhole, Rigid};

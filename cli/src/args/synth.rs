@@ -8,7 +8,7 @@ use clap::{Args, ValueEnum};
 use dataset::synth::VoxelRegion;
 use glam::DVec3;
 
-use super::values::{Size, metres};
+use super::values::{Size, metres, numbers};
 
 /// Cameras of a car.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
@@ -60,6 +60,18 @@ pub(crate) struct SynthArgs {
     /// streets, and the cameras take turns
     #[arg(long, value_name = "METRES", value_parser = metres)]
     pub(crate) spacing: Option<f64>,
+    /// Take all photos of one place of a street, the nearest to this one, by fixed cameras on posts around it, one each
+    #[arg(
+        long,
+        value_name = "X,Y,RADIUS",
+        value_parser = watched,
+        allow_hyphen_values = true,
+        conflicts_with_all = ["aerial", "fixed", "spacing", "rig", "lidar", "radar", "nuscenes", "kitti_raw", "waymo"]
+    )]
+    pub(crate) watch: Option<[f64; 3]>,
+    /// Park a car at the watched place that the city does not have without it: a scene that has changed
+    #[arg(long, requires = "watch")]
+    pub(crate) parked: bool,
     /// Cameras of a car: six, or one that looks ahead
     #[arg(long, value_name = "RIG", value_enum, default_value_t = Rig::Six)]
     pub(crate) rig: Rig,
@@ -101,6 +113,12 @@ pub(crate) struct SynthArgs {
         allow_hyphen_values = true
     )]
     pub(crate) occupancy_around: Vec<VoxelRegion>,
+}
+
+fn watched(text: &str) -> Result<[f64; 3], String> {
+    numbers::<3>(text)
+        .filter(|[_, _, radius]| *radius > 0.0)
+        .ok_or("give it as 10,-20,8: metres, the last above 0".into())
 }
 
 fn around(text: &str) -> Result<VoxelRegion, String> {

@@ -43,6 +43,7 @@ pub(crate) fn measure(args: &EvalArgs, output: &Output) -> Result<Evaluated, Fai
         downscale: args.downscale,
         test_every: args.test_every,
         test_stretches: args.test_stretches,
+        ..PhotoOptions::default()
     };
     let depth = args.depth.then(|| TrueDepth::open(&args.capture)).transpose()?;
     let true_boxes = true_boxes(&detectors, &args.capture)?;

@@ -2,12 +2,13 @@
 
 use std::path::Path;
 
+use eval::WorldBox;
 use glam::{DQuat, DVec3};
 use model::{Garage, ModelObject, Vehicle, cut_out};
 use scene::{BadInput, MovingObject, PathPose, Rigid};
 use serde::Serialize;
 
-use crate::args::{GarageAddArgs, GarageListArgs, GaragePlaceArgs, Stand};
+use crate::args::{GarageAddArgs, GarageListArgs, GaragePlaceArgs, Stand, VehicleBox};
 use crate::commands::object_poses;
 use crate::failure::Failure;
 use crate::output::Output;
@@ -60,9 +61,7 @@ pub(crate) fn add(args: &GarageAddArgs, output: &Output) -> Result<(), Failure> 
         let (Some(area), Some(name)) = (args.area, args.name.clone()) else {
             return Err(BadInput::new("plat garage add", "has nothing to take", "give --object or --box").into());
         };
-        let half = 0.5 * area.size;
-        let (low, high) = (DVec3::new(-half.x, -half.y, 0.0), DVec3::new(half.x, half.y, area.size.z));
-        let world_from_box = standing(area.stand, model::ground_from_world(&args.model)?);
+        let WorldBox { world_from_box, low, high } = standing_box(&area, model::ground_from_world(&args.model)?);
         let splats = cut_out(&model.splats, &world_from_box, low, high);
         let (class, antialiased) = (args.class.clone(), model.antialiased);
         (Vehicle { name, class, low, high, antialiased, splats: splats.len() }, splats)
@@ -117,6 +116,13 @@ pub(crate) fn place(args: &GaragePlaceArgs, output: &Output) -> Result<(), Failu
         until: ends[1],
     };
     output.result(&placed, &text)
+}
+
+/// A box that stands on the ground, in its own axes the origin in the middle of its lower side.
+pub(super) fn standing_box(area: &VehicleBox, ground_from_world: DQuat) -> WorldBox {
+    let half = 0.5 * area.size;
+    let (low, high) = (DVec3::new(-half.x, -half.y, 0.0), DVec3::new(half.x, half.y, area.size.z));
+    WorldBox { world_from_box: standing(area.stand, ground_from_world), low, high }
 }
 
 /// The pose of a box that stands on the ground.

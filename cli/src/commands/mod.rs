@@ -25,4 +25,5 @@ pub(crate) mod stability;
 pub(crate) mod submit;
 pub(crate) mod synth;
 pub(crate) mod train;
+pub(crate) mod update;
 pub(crate) mod worker;

@@ -94,7 +94,7 @@ pub(super) fn photos(
     let PruneCapture { test_every, downscale, store, zones } = options;
     let from = captures::zone_source(&zones.finder, capture, &source)?;
     let options =
-        PhotoOptions { store: store.as_deref(), downscale: *downscale, test_every: *test_every, test_stretches: None };
+        PhotoOptions { store: store.as_deref(), downscale: *downscale, test_every: *test_every, ..Default::default() };
     let mut photos = captures::photos_of(model, &source, &options, output)?;
     if let Some(from) = from {
         let (found, _) = captures::find_zones(&photos.capture, &from, &photos.store, output)?;

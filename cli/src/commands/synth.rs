@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use city::CitySettings;
 use city::faults::Fault;
-use dataset::synth::{self, CarRig, Driven, Settings, Summary};
+use dataset::synth::{self, CarRig, Driven, Settings, Summary, Watched, WatchedPlace};
 use eval::write_png;
 use serde::Serialize;
 
@@ -48,7 +48,7 @@ pub(crate) fn run(args: &SynthArgs, output: &Output) -> Result<(), Failure> {
         summary.triangles,
         summary.points,
         summary.mean_track,
-        summary.driven.as_ref().map_or(String::new(), drives),
+        summary.driven.as_ref().map_or(String::new(), drives) + &summary.watched.map_or(String::new(), watched),
         out.display(),
         out.join("manifest.json").display(),
     );
@@ -72,6 +72,13 @@ fn drives(driven: &Driven) -> String {
         driven.stops,
         driven.spacing_metres
     )
+}
+
+/// Where the watched place is, in a line or two.
+fn watched(place: WatchedPlace) -> String {
+    let listed = |numbers: &[f64]| numbers.iter().map(ToString::to_string).collect::<Vec<_>>().join(",");
+    let parked = place.parked.map_or(String::new(), |car| format!("the parked car, as a --box {}\n", listed(&car)));
+    format!("the watched place   {}, the street's direction {} degrees\n{parked}", listed(&place.place), place.degrees)
 }
 
 fn settings(args: &SynthArgs) -> Settings {
@@ -103,5 +110,6 @@ fn settings(args: &SynthArgs) -> Settings {
             Rig::Six => CarRig::Six,
             Rig::Front => CarRig::Front,
         },
+        watched: args.watch.map(|[x, y, radius]| Watched { x, y, radius, parked: args.parked }),
     }
 }

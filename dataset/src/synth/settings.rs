@@ -57,10 +57,26 @@ pub struct Settings {
     /// Cameras of a car.
     #[serde(skip_serializing_if = "CarRig::is_default")]
     pub rig: CarRig,
+    /// Takes all photos of one place by fixed cameras around it, one each.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub watched: Option<Watched>,
 }
 
 fn is_unset(flag: &bool) -> bool {
     !flag
+}
+
+/// A place that fixed cameras around it watch: the place of a street that is nearest to this one.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Watched {
+    /// World metres.
+    pub x: f64,
+    /// World metres.
+    pub y: f64,
+    /// Distance of the cameras from it, metres, 2 to 200.
+    pub radius: f64,
+    /// Whether a car is parked there that other captures of the city do not have.
+    pub parked: bool,
 }
 
 /// Cameras of a car.
@@ -108,6 +124,7 @@ impl Default for Settings {
             around: Vec::new(),
             spacing: None,
             rig: CarRig::Six,
+            watched: None,
         }
     }
 }
@@ -141,6 +158,12 @@ impl Settings {
             }
             s if s.waymo && s.aerial + s.fixed >= 1.0 => {
                 refuse("the number of photos from cars, for Waymo,", "choose shares that sum to less than 1")
+            }
+            s if s.watched.is_some_and(|place| !place.x.is_finite() || !place.y.is_finite()) => {
+                refuse("the watched place", "give finite coordinates")
+            }
+            s if s.watched.is_some_and(|place| !(2.0..=200.0).contains(&place.radius)) => {
+                refuse("the radius around the watched place", "choose 2 to 200 metres")
             }
             s if s.around.len() > 1000 => refuse("the number of places to fill with voxels", "choose 1,000 at most"),
             s if s.faults.iter().any(|f| !f.is_valid()) => refuse("the strength of a fault", "choose 0 to 1"),
@@ -199,6 +222,21 @@ pub struct Summary {
     /// With [`Settings::spacing`]: what the cars drove.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub driven: Option<Driven>,
+    /// With [`Settings::watched`]: where that is.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub watched: Option<WatchedPlace>,
+}
+
+/// The place that fixed cameras watch.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct WatchedPlace {
+    /// On the road, world metres.
+    pub place: [f64; 3],
+    /// Direction of the street, degrees from x to y.
+    pub degrees: f64,
+    /// The box of the parked car: the middle of its lower side, its heading in degrees, its length, width and height in metres.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub parked: Option<[f64; 7]>,
 }
 
 /// What the cars of a capture with [`Settings::spacing`] drove.

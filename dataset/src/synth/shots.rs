@@ -6,12 +6,13 @@ use std::collections::BTreeMap;
 use city::sense::drives::{Drives, drives};
 use city::sense::rig::{Rig, drive, legs, shots_of};
 use city::sense::survey::{Fixed, Survey, fixed, survey};
+use city::sense::watch::{Watch, watch};
 use city::sense::{SenseError, Shot};
 use city::trace::World;
 use city::{City, Waypoint};
 use scene::BadInput;
 
-use super::settings::{Driven, Settings, unsupported};
+use super::settings::{Driven, Settings, Watched, unsupported};
 
 /// End of the city's traffic, seconds. Times of an aerial block that takes longer are compressed, as if several aircraft flew.
 const TRAFFIC_SECONDS: f64 = 600.0;
@@ -32,6 +33,9 @@ const MAX_MARGIN_SHARE: f64 = 0.25;
 const LANE_METRES: f64 = 0.6;
 /// Photos per fixed camera.
 const PHOTOS_PER_POST: u32 = 10;
+/// Height of the cameras around a watched place, metres, and their field of view, degrees.
+const WATCH_HEIGHT_METRES: f64 = 4.0;
+const WATCH_FIELD_DEGREES: f64 = 65.0;
 
 /// A position of a street car with kept photos, where its lidar and radar measure.
 pub(super) struct Station {
@@ -70,6 +74,10 @@ pub(super) struct PlannedShots {
 
 /// Plans the shots.
 pub(super) fn plan(world: &World, settings: &Settings) -> Result<PlannedShots, BadInput> {
+    if let Some(place) = settings.watched {
+        let shots = watched_shots(world, settings, place).map_err(|error| unsupported(&error))?;
+        return Ok(PlannedShots { shots, ..PlannedShots::default() });
+    }
     let views = f64::from(settings.views);
     let aerial = (views * settings.aerial).round() as usize;
     let posts = ((views * settings.fixed).round() as usize).min(settings.views as usize - aerial);
@@ -223,6 +231,21 @@ fn fixed_shots(world: &World, settings: &Settings, wanted: usize) -> Result<Vec<
     let mut shots = fixed(&world.at(posts.start_seconds), &posts)?;
     shots.truncate(wanted);
     Ok(shots)
+}
+
+/// Cameras around a place.
+fn watched_shots(world: &World, settings: &Settings, place: Watched) -> Result<Vec<Shot>, SenseError> {
+    let cameras = Watch {
+        at: glam::DVec2::new(place.x, place.y),
+        radius_metres: place.radius,
+        cameras: settings.views,
+        height_metres: WATCH_HEIGHT_METRES,
+        width: settings.width,
+        height: settings.height,
+        field_degrees: WATCH_FIELD_DEGREES,
+        seconds: 0.0,
+    };
+    watch(&world.at(cameras.seconds), &cameras)
 }
 
 /// Indices of the `wanted` shots to keep, spread evenly over the stops. `shots` counts all shots, `cameras` those of each stop.
