@@ -20,12 +20,16 @@ pub(crate) fn max_file_bytes(width: u32, height: u32) -> u64 {
     DECODER_BYTES + 16 * u64::from(width) * u64::from(height)
 }
 
+/// What images are decoded from. All decoders are compiled for each type of it, so there is one.
+trait Bytes: BufRead + Seek {}
+impl<T: BufRead + Seek> Bytes for T {}
+
 /// Width and height from an image's header. No pixel is decoded.
 ///
 /// # Errors
 /// Not an image, or one whose header needs too much memory.
-pub(crate) fn size(file: impl BufRead + Seek) -> ImageResult<(u32, u32)> {
-    let mut reader = ImageReader::new(file).with_guessed_format()?;
+pub(crate) fn size(mut file: impl BufRead + Seek) -> ImageResult<(u32, u32)> {
+    let mut reader = ImageReader::new(&mut file as &mut dyn Bytes).with_guessed_format()?;
     let mut limits = Limits::default();
     limits.max_alloc = Some(DECODER_BYTES);
     reader.limits(limits);
@@ -88,7 +92,9 @@ pub(crate) fn planes(rgb: &[u8]) -> Vec<u8> {
 pub(crate) fn open(bytes: &[u8], width: u32, height: u32) -> Result<DynamicImage, CodecError> {
     let mut limits = Limits::default();
     limits.max_alloc = Some(DECODER_BYTES + 8 * u64::from(width) * u64::from(height));
-    let mut reader = ImageReader::new(Cursor::new(bytes)).with_guessed_format().map_err(|e| damaged(&e))?;
+    let mut cursor = Cursor::new(bytes);
+    let reader = ImageReader::new(&mut cursor as &mut dyn Bytes).with_guessed_format();
+    let mut reader = reader.map_err(|e| damaged(&e))?;
     if reader.format().is_none() {
         return Err(CodecError::new("is not a JPEG, PNG, WebP or TIFF image"));
     }
