@@ -266,7 +266,7 @@ impl Area<'_> {
             EvaluationViews { views, context: Some(&context), antialiased, exposures: None, source: self.reader };
         let changes = Changes::find(&around, &initial)?;
         let wanted = (changes.pixels() / PIXELS_PER_SPLAT).ceil() as usize;
-        let surface = changes.surface(options.centre, options.radius, wanted);
+        let surface = changes.surface(&initial, options.centre, options.radius, wanted);
         let points = SparsePoints {
             positions: surface.iter().map(|at| at.place).collect(),
             colours: surface.iter().map(|at| at.colour).collect(),

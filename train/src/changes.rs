@@ -1,30 +1,36 @@
 //! Finds what changed between a model and new photos of it: pixels whose render differs, and the surface of what is there now.
 //!
-//! A place may be filled only if the photos that show it have changed there (the visual hull, Laurentini 1994). Of these, surface
-//! places whose colour differs between the photos that see them are carved away, as long as there are any (space carving, Kutulakos
-//! and Seitz 2000).
+//! A place may be filled only if the photos that show it have changed there (the visual hull, Laurentini 1994), and if the photos saw
+//! through it before: where something has left, nothing has to be added. Of these, surface places whose colour differs between
+//! the photos that see them are carved away, as long as there are any (space carving, Kutulakos and Seitz 2000).
 
-use glam::{DVec3, IVec3};
-use scene::{Camera, Pixels, Splats};
+use glam::{DVec3, IVec3, Quat, Vec3};
+use scene::{Camera, Pixels, Splats, column};
 
 use crate::error::TrainError;
 use crate::importance::EvaluationViews;
 
-/// Half of the side of the square that differences are averaged over, pixels: sharp texture that splats blur is no change.
+/// Half of the side of the square that colours are averaged over, pixels.
 const BLUR: usize = 2;
-/// A pixel has changed if it differs by more than this, and by more than so many times the median difference.
-const MIN_CHANGE: f32 = 0.08;
-const CHANGE_PER_MEDIAN: f32 = 4.0;
-/// It has not if it differs by less than this share of that.
-const SAME_SHARE: f32 = 0.5;
+/// A pixel has changed if a channel of the render is so far outside of what the photo has within so many pixels. Splats blur what is
+/// sharp: their colour is then between those around.
+const MIN_CHANGE: f32 = 0.05;
+const AROUND: usize = 9;
+/// It has not if no channel differs by more than this.
+const MAX_SAME_DIFFERENCE: f32 = 0.04;
 /// Voxels along a side of the cube around the area.
 const VOXELS: i32 = 80;
-/// Fewest photos that show a filled place as changed, of those that show it; where one photo is all, one.
-const MIN_PHOTOS: u32 = 2;
+/// Smallest share of all photos that show a filled place as changed: rays of a few that meet are chance.
+const MIN_PHOTOS: f64 = 0.5;
+/// Opacity from which a splat hides what is behind it, and how far it reaches, in standard deviations.
+const MIN_OPACITY: f32 = 0.3;
+const REACH: f32 = 1.5;
+/// Most points along an axis of a splat.
+const MAX_POINTS: usize = 32;
 /// A place is free where more of the photos have not changed.
 const MAX_SAME: f64 = 0.15;
 /// Largest standard deviation of a surface place's colour over the photos that see it, 0 to 1.
-const MAX_SPREAD: f64 = 0.16;
+const MAX_SPREAD: f64 = 0.12;
 /// Rounds of carving.
 const MAX_ROUNDS: usize = 12;
 
@@ -81,27 +87,19 @@ impl Changes {
     /// A window that cannot be read.
     pub fn find(views: &EvaluationViews, splats: &Splats) -> Result<Self, TrainError> {
         let mut cameras = views.views.iter().filter_map(|view| view.at(0).map(|(_, _, camera)| camera));
-        let mut compared: Vec<(Camera, Pixels, Vec<f32>)> = Vec::new();
+        let mut photos = Vec::new();
         views.pictures(splats, |_, photo, picture| {
             let camera = cameras.next().expect("a picture of each view");
-            compared.push((camera, photo.clone(), difference(photo, picture)));
+            let (width, height) = (photo.width as usize, photo.height as usize);
+            photos.push(ChangedPhoto {
+                camera,
+                width,
+                height,
+                rgb: photo.rgb.clone(),
+                changes: compare(photo, picture),
+            });
         })?;
-        let mut all: Vec<f32> = compared.iter().flat_map(|(.., difference)| difference.iter().copied()).collect();
-        let middle = all.len() / 2;
-        let median = if all.is_empty() { 0.0 } else { *all.select_nth_unstable_by(middle, f32::total_cmp).1 };
-        let threshold = MIN_CHANGE.max(CHANGE_PER_MEDIAN * median);
-        let photos = compared.into_iter().map(|(camera, photo, difference)| {
-            let is_masked = |i: usize| photo.mask.as_ref().is_some_and(|mask| mask[i] < 128);
-            let change = |(i, &difference): (usize, &f32)| match difference {
-                _ if is_masked(i) => Change::Unknown,
-                d if d > threshold => Change::Changed,
-                d if d < SAME_SHARE * threshold => Change::Same,
-                _ => Change::Unknown,
-            };
-            let changes = difference.iter().enumerate().map(change).collect();
-            ChangedPhoto { camera, width: photo.width as usize, height: photo.height as usize, rgb: photo.rgb, changes }
-        });
-        Ok(Self { photos: photos.collect() })
+        Ok(Self { photos })
     }
 
     /// Number of changed pixels, a mean over the photos.
@@ -110,14 +108,16 @@ impl Changes {
         self.photos.iter().map(changed).sum::<usize>() as f64 / self.photos.len().max(1) as f64
     }
 
-    /// The surface of what fills the changed pixels within a ball: at most `count` places, in a fixed order.
-    pub fn surface(&self, centre: DVec3, radius: f64, count: usize) -> Vec<SurfacePlace> {
+    /// The surface of what fills the changed pixels within a ball, and what the splats were before it: at most `count` places, in a fixed
+    /// order.
+    pub fn surface(&self, splats: &Splats, centre: DVec3, radius: f64, count: usize) -> Vec<SurfacePlace> {
         let edge = 2.0 * radius / f64::from(VOXELS);
+        let before = Voxels::of(splats, centre - radius, edge);
         let mut filled =
             Voxels { corner: centre - radius, edge, filled: vec![false; (VOXELS * VOXELS * VOXELS) as usize] };
         for voxel in Voxels::all() {
             let place = filled.place(voxel);
-            if place.distance(centre) <= radius && self.is_hull(place) {
+            if place.distance(centre) <= radius && self.is_hull(place) && self.was_free(&before, voxel) {
                 filled.set(voxel, true);
             }
         }
@@ -152,6 +152,18 @@ impl Changes {
         surface.into_iter().step_by(step).collect()
     }
 
+    /// Whether most of the cameras that show a voxel saw it before, and it was empty.
+    fn was_free(&self, before: &Voxels, voxel: IVec3) -> bool {
+        let place = before.place(voxel);
+        let showing = self.photos.iter().filter(|photo| photo.pixel(place).is_some());
+        let (mut seen, mut all) = (0u32, 0u32);
+        for photo in showing {
+            all += 1;
+            seen += u32::from(!before.hides(voxel, photo.camera.centre()));
+        }
+        !before.is_filled(voxel) && 2 * seen > all
+    }
+
     /// Whether photos show that a place is filled, or could be.
     fn is_hull(&self, place: DVec3) -> bool {
         let (mut changed, mut same) = (0u32, 0u32);
@@ -162,8 +174,8 @@ impl Changes {
                 _ => {}
             }
         }
-        let enough = MIN_PHOTOS.min(self.photos.len() as u32).max(1);
-        changed >= enough && f64::from(same) <= MAX_SAME * f64::from(changed + same)
+        let enough = (MIN_PHOTOS * self.photos.len() as f64).max(1.0);
+        f64::from(changed) >= enough && f64::from(same) <= MAX_SAME * f64::from(changed + same)
     }
 }
 
@@ -175,6 +187,30 @@ struct Voxels {
 }
 
 impl Voxels {
+    /// Those that opaque splats fill.
+    fn of(splats: &Splats, corner: DVec3, edge: f64) -> Self {
+        let mut voxels = Self { corner, edge, filled: vec![false; (VOXELS * VOXELS * VOXELS) as usize] };
+        let least = (MIN_OPACITY / (1.0 - MIN_OPACITY)).ln();
+        for i in (0..splats.len()).filter(|&i| splats.col(column::OPACITY)[i] >= least) {
+            let splat = splats.get(i);
+            let [w, x, y, z] = splat.quat;
+            let turn = Quat::from_xyzw(x, y, z, w).normalize();
+            let reach = splat.log_scale.to_array().map(|size| REACH * size.exp());
+            // Points no further apart than a voxel, unless the splat is very large.
+            let counts = reach.map(|reach| ((2.0 * reach / edge as f32).ceil() as usize).clamp(1, MAX_POINTS));
+            let at = |k: usize, axis: usize| reach[axis] * (2.0 * (k as f32 + 0.5) / counts[axis] as f32 - 1.0);
+            for point in 0..counts.iter().product() {
+                let (a, b, c) = (point % counts[0], point / counts[0] % counts[1], point / counts[0] / counts[1]);
+                let arm = Vec3::new(at(a, 0), at(b, 1), at(c, 2));
+                if (arm / Vec3::from(reach)).length_squared() <= 1.0 {
+                    let place = (splat.mean + turn * arm).as_dvec3();
+                    voxels.set(((place - corner) / edge).floor().as_ivec3(), true);
+                }
+            }
+        }
+        voxels
+    }
+
     fn all() -> impl Iterator<Item = IVec3> {
         (0..VOXELS).flat_map(|z| (0..VOXELS).flat_map(move |y| (0..VOXELS).map(move |x| IVec3::new(x, y, z))))
     }
@@ -213,40 +249,56 @@ impl Voxels {
     }
 }
 
-/// The largest difference of a channel between a photo and a render (three planes), each averaged over a square; 0 to 1.
-fn difference(photo: &Pixels, picture: &[f32]) -> Vec<f32> {
+/// What each pixel of a photo says beside a render (three planes).
+fn compare(photo: &Pixels, picture: &[f32]) -> Vec<Change> {
     let (width, height, area) = (photo.width as usize, photo.height as usize, photo.area());
-    let mut largest = vec![0.0f32; area];
+    let (mut outside, mut differs) = (vec![0.0f32; area], vec![0.0f32; area]);
     for channel in 0..3 {
         let plane = channel * area..(channel + 1) * area;
-        let pairs = picture[plane.clone()].iter().zip(&photo.rgb[plane]);
-        let signed: Vec<f32> = pairs.map(|(a, b)| a.clamp(0.0, 1.0) - f32::from(*b) / 255.0).collect();
-        let rows = averaged(&signed, width, height, 1, width);
-        let both = averaged(&rows, height, width, width, 1);
-        largest.iter_mut().zip(both).for_each(|(largest, now)| *largest = largest.max(now.abs()));
-    }
-    largest
-}
-
-/// Averages along lines of `length` values, `step` apart; lines begin `next` apart. At the ends over the values that exist.
-fn averaged(values: &[f32], length: usize, lines: usize, step: usize, next: usize) -> Vec<f32> {
-    let mut out = vec![0.0; values.len()];
-    for line in 0..lines {
-        let at = |i: usize| line * next + i * step;
-        for i in 0..length {
-            let around = i.saturating_sub(BLUR)..(i + BLUR + 1).min(length);
-            let count = around.len() as f32;
-            out[at(i)] = around.map(|k| values[at(k)]).sum::<f32>() / count;
+        let shown: Vec<f32> = picture[plane.clone()].iter().map(|colour| colour.clamp(0.0, 1.0)).collect();
+        let taken: Vec<f32> = photo.rgb[plane].iter().map(|level| f32::from(*level) / 255.0).collect();
+        let mean = |values: &[f32]| values.iter().sum::<f32>() / values.len() as f32;
+        let [shown, taken] = [shown, taken].map(|values| filtered(&values, width, height, BLUR, &mean));
+        let least = filtered(&taken, width, height, AROUND, &|values| values.iter().copied().fold(f32::MAX, f32::min));
+        let most = filtered(&taken, width, height, AROUND, &|values| values.iter().copied().fold(f32::MIN, f32::max));
+        for i in 0..area {
+            outside[i] = outside[i].max(least[i] - shown[i]).max(shown[i] - most[i]);
+            differs[i] = differs[i].max((shown[i] - taken[i]).abs());
         }
     }
-    out
+    let is_masked = |i: usize| photo.mask.as_ref().is_some_and(|mask| mask[i] < 128);
+    let change = |i: usize| match (outside[i], differs[i]) {
+        _ if is_masked(i) => Change::Unknown,
+        (outside, _) if outside > MIN_CHANGE => Change::Changed,
+        (_, differs) if differs < MAX_SAME_DIFFERENCE => Change::Same,
+        _ => Change::Unknown,
+    };
+    (0..area).map(change).collect()
+}
+
+/// A function of the values within `reach` pixels along rows, then of these along columns; at the edges of those that exist.
+fn filtered(values: &[f32], width: usize, height: usize, reach: usize, of: &dyn Fn(&[f32]) -> f32) -> Vec<f32> {
+    let along = |values: &[f32], length: usize, transposed: &mut Vec<f32>| {
+        transposed.resize(values.len(), 0.0);
+        let lines = values.len() / length.max(1);
+        for (line, values) in values.chunks_exact(length).enumerate() {
+            for i in 0..length {
+                let around = &values[i.saturating_sub(reach)..(i + reach + 1).min(length)];
+                transposed[i * lines + line] = of(around);
+            }
+        }
+    };
+    let (mut columns, mut rows) = (Vec::new(), Vec::new());
+    along(values, width, &mut columns);
+    along(&columns, height, &mut rows);
+    rows
 }
 
 #[cfg(test)]
 mod tests {
     use std::sync::Arc;
 
-    use glam::{DQuat, Vec3};
+    use glam::DQuat;
     use scene::{Pinhole, Rect, Rigid, Splat};
 
     use super::*;
@@ -312,7 +364,7 @@ mod tests {
         // The disk of 1 m radius at 8.9 m.
         let disk = std::f64::consts::PI * (110.0f64 / 80f64.sqrt()).powi(2);
         assert!((changes.pixels() / disk - 1.0).abs() < 0.25, "{} of {disk}", changes.pixels());
-        let surface = changes.surface(DVec3::ZERO, 2.0, 100_000);
+        let surface = changes.surface(&grey(), DVec3::ZERO, 2.0, 100_000);
         assert!(surface.len() > 500, "{}", surface.len());
         for at in &surface {
             // The hull of eight views from above ends in a point below.
@@ -320,10 +372,24 @@ mod tests {
             assert!(outside < 0.35 || at.place.z < 0.0, "{} is {outside} m outside", at.place);
             assert!(at.colour[0] > 120 && at.colour[1] < 80, "{:?}", at.colour);
         }
-        let few = changes.surface(DVec3::ZERO, 2.0, 100);
+        let few = changes.surface(&grey(), DVec3::ZERO, 2.0, 100);
         assert!((50..=100).contains(&few.len()), "{}", few.len());
         // Far from the change, and where nothing has changed, nothing is.
-        assert_eq!(changes.surface(DVec3::new(0.0, 0.0, -30.0), 1.0, 100), []);
+        assert_eq!(changes.surface(&grey(), DVec3::new(0.0, 0.0, -30.0), 1.0, 100), []);
+    }
+
+    #[test]
+    fn what_hides_a_place_was_not_seen_through() {
+        let mut ball = grey();
+        ball.push(&Splat::round(Vec3::ZERO, 0.0, Vec3::ONE, 0.99));
+        let views = views(8);
+        let source = Ball(views.clone());
+        let around =
+            EvaluationViews { views: &views, context: None, antialiased: false, exposures: None, source: &source };
+        let changes = Changes::find(&around, &ball).unwrap();
+        assert!(changes.pixels() > 100.0);
+        // A white ball that is larger became a red one.
+        assert_eq!(changes.surface(&ball, DVec3::ZERO, 1.2, 1000), []);
     }
 
     #[test]
@@ -340,6 +406,6 @@ mod tests {
             EvaluationViews { views: &views, context: None, antialiased: false, exposures: None, source: &Grey };
         let changes = Changes::find(&around, &grey()).unwrap();
         assert_eq!(changes.pixels(), 0.0);
-        assert_eq!(changes.surface(DVec3::ZERO, 2.0, 100), []);
+        assert_eq!(changes.surface(&grey(), DVec3::ZERO, 2.0, 100), []);
     }
 }
