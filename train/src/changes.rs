@@ -25,8 +25,8 @@ const MIN_PHOTOS: f64 = 0.5;
 /// Opacity from which a splat hides what is behind it, and how far it reaches, in standard deviations.
 const MIN_OPACITY: f32 = 0.3;
 const REACH: f32 = 1.5;
-/// Most points along an axis of a splat.
-const MAX_POINTS: usize = 32;
+/// The least that it reaches, in edges of a voxel.
+const THIN: f32 = 0.6;
 /// A place is free where more of the photos have not changed.
 const MAX_SAME: f64 = 0.15;
 /// Largest standard deviation of a surface place's colour over the photos that see it, 0 to 1.
@@ -194,17 +194,22 @@ impl Voxels {
         for i in (0..splats.len()).filter(|&i| splats.col(column::OPACITY)[i] >= least) {
             let splat = splats.get(i);
             let [w, x, y, z] = splat.quat;
-            let turn = Quat::from_xyzw(x, y, z, w).normalize();
-            let reach = splat.log_scale.to_array().map(|size| REACH * size.exp());
-            // Points no further apart than a voxel, unless the splat is very large.
-            let counts = reach.map(|reach| ((2.0 * reach / edge as f32).ceil() as usize).clamp(1, MAX_POINTS));
-            let at = |k: usize, axis: usize| reach[axis] * (2.0 * (k as f32 + 0.5) / counts[axis] as f32 - 1.0);
-            for point in 0..counts.iter().product() {
-                let (a, b, c) = (point % counts[0], point / counts[0] % counts[1], point / counts[0] / counts[1]);
-                let arm = Vec3::new(at(a, 0), at(b, 1), at(c, 2));
-                if (arm / Vec3::from(reach)).length_squared() <= 1.0 {
-                    let place = (splat.mean + turn * arm).as_dvec3();
-                    voxels.set(((place - corner) / edge).floor().as_ivec3(), true);
+            let own_from_world = Quat::from_xyzw(x, y, z, w).normalize().inverse();
+            // A thin one fills the voxels that it passes.
+            let reach = splat.log_scale.to_array().map(|size| (REACH * size.exp()).max(THIN * edge as f32));
+            let reach = Vec3::from(reach);
+            let bound = |place: Vec3| (((place.as_dvec3() - corner) / edge).floor()).as_ivec3();
+            let [low, high] = [-1.0, 1.0].map(|side| bound(splat.mean + Vec3::splat(side * reach.max_element())));
+            let [low, high] = [low, high].map(|voxel| voxel.clamp(IVec3::ZERO, IVec3::splat(VOXELS - 1)));
+            for z in low.z..=high.z {
+                for y in low.y..=high.y {
+                    for x in low.x..=high.x {
+                        let voxel = IVec3::new(x, y, z);
+                        let arm = own_from_world * (voxels.place(voxel).as_vec3() - splat.mean);
+                        if (arm / reach).length_squared() <= 1.0 {
+                            voxels.set(voxel, true);
+                        }
+                    }
                 }
             }
         }
@@ -304,7 +309,9 @@ mod tests {
     use super::*;
     use crate::{TrainView, WindowSource};
 
-    const SIDE: u32 = 96;
+    const SIDE: u32 = 256;
+    const FOCAL: f64 = 400.0;
+    const MIDDLE: f64 = 128.0;
 
     /// A camera 8 m from the origin and 4 m up, that looks at it.
     fn camera(angle: f64) -> Camera {
@@ -312,7 +319,7 @@ mod tests {
         let back = DQuat::from_rotation_z(angle) * DQuat::from_rotation_x(-std::f64::consts::FRAC_PI_2) * down;
         let eye = back * DVec3::new(0.0, 0.0, -80f64.sqrt());
         let rotation = back.inverse();
-        let pinhole = Pinhole { width: SIDE, height: SIDE, fx: 110.0, fy: 110.0, cx: 48.0, cy: 48.0 };
+        let pinhole = Pinhole { width: SIDE, height: SIDE, fx: FOCAL, fy: FOCAL, cx: MIDDLE, cy: MIDDLE };
         Camera { pinhole, camera_from_world: Rigid { rotation, translation: -(rotation * eye) } }
     }
 
@@ -334,7 +341,7 @@ mod tests {
             let area = rect.area() as usize;
             let is_red = |i: usize| {
                 let (x, y) = ((i % SIDE as usize) as f64 + 0.5, (i / SIDE as usize) as f64 + 0.5);
-                let ray = DVec3::new((x - 48.0) / 110.0, (y - 48.0) / 110.0, 1.0).normalize();
+                let ray = DVec3::new((x - MIDDLE) / FOCAL, (y - MIDDLE) / FOCAL, 1.0).normalize();
                 (centre - ray * centre.dot(ray)).length() < 1.0
             };
             let rgb = (0..3 * area).map(|i| if is_red(i % area) { [200, 30, 30][i / area] } else { 128 }).collect();
@@ -361,9 +368,10 @@ mod tests {
         let around =
             EvaluationViews { views: &views, context: None, antialiased: false, exposures: None, source: &source };
         let changes = Changes::find(&around, &grey()).unwrap();
-        // The disk of 1 m radius at 8.9 m.
-        let disk = std::f64::consts::PI * (110.0f64 / 80f64.sqrt()).powi(2);
-        assert!((changes.pixels() / disk - 1.0).abs() < 0.25, "{} of {disk}", changes.pixels());
+        // The ball's disk without its rim, where the photo has grey within AROUND pixels (a square).
+        let radius = FOCAL / 80f64.sqrt();
+        let [least, most] = [radius - 1.5 * AROUND as f64, radius].map(|r| std::f64::consts::PI * r * r);
+        assert!((least..most).contains(&changes.pixels()), "{} of {least} to {most}", changes.pixels());
         let surface = changes.surface(&grey(), DVec3::ZERO, 2.0, 100_000);
         assert!(surface.len() > 500, "{}", surface.len());
         for at in &surface {
@@ -389,7 +397,7 @@ mod tests {
         let changes = Changes::find(&around, &ball).unwrap();
         assert!(changes.pixels() > 100.0);
         // A white ball that is larger became a red one.
-        assert_eq!(changes.surface(&ball, DVec3::ZERO, 1.2, 1000), []);
+        assert!(changes.surface(&ball, DVec3::ZERO, 1.2, 1000).is_empty());
     }
 
     #[test]
