@@ -40,5 +40,5 @@ print(json.dumps({"kind": "update", "case": case, "commit": commit} | {key: said
 ' "$case" "$(git rev-parse --short=12 HEAD)" | tee -a "$results/plat.jsonl"
 }
 update parked model new_photos 200
-update parked model new_photos 400
-update left parked old_photos 400
+update parked model new_photos 300
+update left parked old_photos 300

@@ -23,7 +23,7 @@ pub(crate) struct UpdateArgs {
     #[arg(long, value_name = "PATH")]
     pub(crate) out: PathBuf,
     /// Training steps, counted in photos; coarser levels of the model get half of the next finer one's
-    #[arg(long, value_name = "N", default_value_t = 400, value_parser = clap::value_parser!(u32).range(1..=100_000))]
+    #[arg(long, value_name = "N", default_value_t = 300, value_parser = clap::value_parser!(u32).range(1..=100_000))]
     pub(crate) steps: u32,
     /// Hold out every K-th photo, and measure on these too; by default none
     #[arg(long, value_name = "K", value_parser = clap::value_parser!(u32).range(2..))]
