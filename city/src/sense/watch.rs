@@ -111,8 +111,11 @@ mod tests {
         }
         // The house hides the street from posts in and behind it: those come nearer, or are left out.
         let near_house = watch(&world.at(0.0), &Watch { at: DVec2::new(19.0, 0.0), radius_metres: 12.0, ..settings });
-        let near_house = near_house.unwrap();
-        assert!(near_house.len() < 6 || near_house.iter().any(|s| s.camera.centre().y.abs() < 6.0));
+        let places: Vec<DVec3> = near_house.unwrap().iter().map(|shot| shot.camera.centre()).collect();
+        let is_far = |place: &&DVec3| ((place.truncate() - DVec2::new(19.0, 0.0)).length() - 12.0).abs() < 1e-6;
+        assert!(places.len() >= 3 && places.iter().filter(is_far).count() < 6, "{places:?}");
+        let is_in_house = |place: &DVec3| (14.01..23.99).contains(&place.x) && (6.01..17.99).contains(&place.y);
+        assert!(!places.iter().any(is_in_house), "{places:?}");
         for wrong in [
             Watch { radius_metres: f64::NAN, ..settings },
             Watch { at: DVec2::NAN, ..settings },

@@ -12,7 +12,7 @@ use city::trace::World;
 use city::{City, Waypoint};
 use scene::BadInput;
 
-use super::settings::{Driven, Settings, Watched, unsupported};
+use super::settings::{Driven, SUBJECT, Settings, Watched, unsupported};
 
 /// End of the city's traffic, seconds. Times of an aerial block that takes longer are compressed, as if several aircraft flew.
 const TRAFFIC_SECONDS: f64 = 600.0;
@@ -76,6 +76,10 @@ pub(super) struct PlannedShots {
 pub(super) fn plan(world: &World, settings: &Settings) -> Result<PlannedShots, BadInput> {
     if let Some(place) = settings.watched {
         let shots = watched_shots(world, settings, place).map_err(|error| unsupported(&error))?;
+        if shots.is_empty() {
+            let problem = "has no place for a camera that sees the watched place";
+            return Err(BadInput::new(SUBJECT, problem, "choose another place or radius"));
+        }
         return Ok(PlannedShots { shots, ..PlannedShots::default() });
     }
     let views = f64::from(settings.views);
