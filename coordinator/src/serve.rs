@@ -39,7 +39,7 @@ pub async fn serve(
 }
 
 /// The server behind a pointer. The body of an `async fn` is compiled in each crate that awaits it, and of this one that is a database, TLS
-/// and HTTP: the tests of this workspace took six minutes of compilation for it.
+/// and HTTP, once more for each test program.
 fn compiled_here<'a>(
     listener: TcpListener,
     options: Options,

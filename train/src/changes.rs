@@ -86,6 +86,7 @@ impl Changes {
     /// # Errors
     /// A window that cannot be read.
     pub fn find(views: &EvaluationViews, splats: &Splats) -> Result<Self, TrainError> {
+        // `at(0)` is always Some, so there is one for each picture.
         let mut cameras = views.views.iter().filter_map(|view| view.at(0).map(|(_, _, camera)| camera));
         let mut photos = Vec::new();
         views.pictures(splats, |_, photo, picture| {
