@@ -203,11 +203,8 @@ fn area_windows(photos: &Photos, part: Part, options: &UpdateOptions) -> Vec<Tra
 /// The pixels that a ball may cover: those of the cube around it.
 fn ball_window(camera: &Camera, centre: DVec3, radius: f64) -> Option<Rect> {
     let (width, height) = (f64::from(camera.pinhole.width), f64::from(camera.pinhole.height));
-    let corners = [0, 1, 2, 3, 4, 5, 6, 7].map(|bits| {
-        let side = |bit: u32| if bits >> bit & 1 == 1 { radius } else { -radius };
-        camera.camera_from_world.apply(centre + DVec3::new(side(0), side(1), side(2)))
-    });
-    let outline = camera.pinhole.outline(&corners);
+    let cube = corners(centre - radius, centre + radius).map(|corner| camera.camera_from_world.apply(corner));
+    let outline = camera.pinhole.outline(&cube);
     let fold =
         |start: f64, pick: fn(f64, f64) -> f64, of: fn(&glam::DVec2) -> f64| outline.iter().map(of).fold(start, pick);
     let [left, top] = [fold(width, f64::min, |p| p.x), fold(height, f64::min, |p| p.y)].map(|low| low.floor().max(0.0));
@@ -219,6 +216,14 @@ fn ball_window(camera: &Camera, centre: DVec3, radius: f64) -> Option<Rect> {
         y: top as u32,
         width: (right - left) as u32,
         height: (bottom - top) as u32,
+    })
+}
+
+/// The corners of a box, numbered by the bits of their sides.
+fn corners(low: DVec3, high: DVec3) -> [DVec3; 8] {
+    [0, 1, 2, 3, 4, 5, 6, 7].map(|bits: u32| {
+        let side = |axis: usize| if bits >> axis & 1 == 1 { high[axis] } else { low[axis] };
+        DVec3::new(side(0), side(1), side(2))
     })
 }
 
@@ -345,10 +350,7 @@ impl BoxPixels<'_> {
     /// The pixels of a window that show the box.
     fn mask(&self, camera: &Camera) -> Vec<u8> {
         let WorldBox { world_from_box, low, high } = self.of;
-        let corners = [0, 1, 2, 3, 4, 5, 6, 7].map(|bits: u32| {
-            let side = |bit: usize| if bits >> bit & 1 == 1 { high[bit] } else { low[bit] };
-            camera.camera_from_world.apply(world_from_box.apply(DVec3::new(side(0), side(1), side(2))))
-        });
+        let corners = corners(low, high).map(|corner| camera.camera_from_world.apply(world_from_box.apply(corner)));
         let k = &camera.pinhole;
         let mut mask = vec![0; k.width as usize * k.height as usize];
         for (row, columns) in covered(&corners, k) {
