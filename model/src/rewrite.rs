@@ -3,7 +3,6 @@
 use std::borrow::Cow;
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
-use std::io::ErrorKind;
 use std::path::Path;
 
 use scene::{ArtefactId, BadInput, BlockId, Splats, frame};
@@ -100,9 +99,8 @@ pub fn replace_blocks(path: &Path, out: &Path, changed: &BTreeMap<BlockId, Splat
     let outer = from.parent().filter(|_| from.ends_with("model")).unwrap_or(&from);
     let leaves = plan.leaves();
     let folder = begin(out, &plan)?;
-    let copy = |name: &Path, from: &Path, to: &Path| match fs::copy(from.join(name), to.join(name)) {
-        Err(error) if error.kind() != ErrorKind::NotFound => Err(cannot("written", &to.join(name))(error)),
-        _ => Ok(()),
+    let copy = |name: &Path, from: &Path, to: &Path| -> Result<(), ModelError> {
+        fs::copy(from.join(name), to.join(name)).map(|_| ()).map_err(cannot("copied", &from.join(name)))
     };
     let (mut blocks, mut count, mut attributes) = (Vec::new(), 0, BTreeSet::new());
     for BlockEntry { block, artefact, .. } in manifest.blocks {
@@ -124,8 +122,14 @@ pub fn replace_blocks(path: &Path, out: &Path, changed: &BTreeMap<BlockId, Splat
     }
     let attributes: Vec<String> = attributes.into_iter().collect();
     let bytes = write_merged(out, &folder, &plan, count, &attributes)?;
-    copy(Path::new(CAMERAS_FILE), outer, out)?;
-    [EXPOSURES_FILE, POSES_FILE].iter().try_for_each(|name| copy(Path::new(name), &from, &folder))?;
+    if outer.join(CAMERAS_FILE).exists() {
+        copy(Path::new(CAMERAS_FILE), outer, out)?;
+    }
+    for (name, about) in [(EXPOSURES_FILE, manifest.exposures), (POSES_FILE, manifest.poses)] {
+        if about.is_some() {
+            copy(Path::new(name), &from, &folder)?;
+        }
+    }
     let objects = read_objects(&outer.join(OBJECTS_FOLDER))?;
     if !objects.is_empty() {
         let made = out.join(OBJECTS_FOLDER);
