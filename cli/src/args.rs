@@ -4,6 +4,7 @@ mod bench;
 mod cluster;
 mod garage;
 mod model;
+mod objects;
 mod plan;
 #[cfg(test)]
 mod reference;
@@ -31,9 +32,8 @@ pub(crate) use cluster::{
     TaskName, TelemetryArgs, WorkerArgs,
 };
 pub(crate) use garage::{GarageAddArgs, GarageCommand, GarageListArgs, GaragePlaceArgs, Stand, VehicleBox};
-pub(crate) use model::{
-    EvalArgs, ExportArgs, Format, ImportArgs, ObjectsCommand, PoseArgs, PruneArgs, PruneCapture, RenderArgs,
-};
+pub(crate) use model::{EvalArgs, ExportArgs, Format, ImportArgs, PruneArgs, PruneCapture, RenderArgs};
+pub(crate) use objects::{ObjectsCommand, PoseArgs, TrackArgs};
 pub(crate) use plan::{BLOCK_MEMORY_MIB, Blocks, DepthKind, PlanOptions, RESIDUAL};
 pub(crate) use sweep::Named;
 pub(crate) use synth::{Rig, SynthArgs};

@@ -76,7 +76,8 @@ fn depth_maps(options: &PlanOptions) -> Result<Option<DepthMapOptions>, BadInput
     Ok((!options.no_depths).then_some(maps))
 }
 
-fn open_with(path: &Path, options: &OpenOptions, output: &Output) -> Result<Source, BadInput> {
+/// Opens a capture with these options, and notes the images that are left out.
+pub(crate) fn open_with(path: &Path, options: &OpenOptions, output: &Output) -> Result<Source, BadInput> {
     let source = dataset::open::open(path, options)?;
     for (name, reason) in source.left_out.iter().take(MAX_LEFT_OUT) {
         output.note(format!("left out {name}: {reason}"));

@@ -27,6 +27,7 @@ mod signals;
 mod stability_cases;
 mod stability_table;
 mod telemetry_setup;
+mod track_map;
 
 use std::process::ExitCode;
 
@@ -66,6 +67,7 @@ fn main() -> ExitCode {
         Command::Garage(GarageCommand::List(args)) => commands::garage::list(args, &output),
         Command::Garage(GarageCommand::Place(args)) => commands::garage::place(args, &output),
         Command::Objects(ObjectsCommand::Pose(args)) => commands::object_poses::run(args, &output),
+        Command::Objects(ObjectsCommand::Track(args)) => commands::object_tracks::run(args, &output),
         Command::Coordinator(args) => commands::coordinator::run(args, &output),
         Command::Worker(args) => commands::worker::run(args, &output),
         Command::Submit(args) => commands::submit::run(args, &output),

@@ -12,6 +12,7 @@ pub mod ingest;
 pub mod lidar;
 pub mod mip_tiles;
 pub mod mips;
+pub mod moving;
 pub mod networks;
 mod observations;
 pub mod open;

@@ -4,7 +4,9 @@
 //! compares the detections on a photo with those on a render of the same view. [`network`] runs graphs of others so
 //! that they cannot crash the program.
 //!
-//! Architecture invariant: functions of bytes and pixels; no files, no network, no clock. The caller reads the files.
+//! [`moving_points`] finds what moves in the sweeps of a lidar, [`seen_boxes`] where detections are, and [`tracking`] follows both.
+//!
+//! Architecture invariant: functions of bytes, pixels and points; no files, no network, no clock. The caller reads the files.
 
 pub mod agreement;
 pub mod aligned;
@@ -15,11 +17,14 @@ mod detector;
 pub mod gradient;
 mod heads;
 mod masked;
+pub mod moving_points;
 pub mod network;
 mod placed;
 pub mod precision;
+pub mod seen_boxes;
 #[cfg(test)]
 mod testing;
+pub mod tracking;
 
 pub use agreement::{Agreement, Counts, agreement, kept};
 pub use boxes::{Detection, iou};

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use clap::{Args, Subcommand, ValueEnum};
+use clap::{Args, ValueEnum};
 use eval::Levels;
 
 use super::values::{Backend, ObjectMove, Size, clock_seconds, decibels, levels, metres, share, share_from_zero};
@@ -227,27 +227,4 @@ pub(crate) struct ImportArgs {
     /// File to write: .ply, or .spz, which rounds
     #[arg(long, value_name = "FILE")]
     pub(crate) out: PathBuf,
-}
-
-#[derive(Debug, Subcommand)]
-pub(crate) enum ObjectsCommand {
-    /// Find the rotations and heights of vehicles from their positions: they head where they go, and their wheels touch the road
-    Pose(PoseArgs),
-}
-
-/// Beside a capture, tracks.json is what plat train --objects takes.
-#[derive(Debug, Clone, Args)]
-pub(crate) struct PoseArgs {
-    /// The static scene: a folder that `plat train` wrote, or a model as PLY, SPZ, SOG, streamed SOG, RAD or 3D Tiles, whose z is up
-    pub(crate) model: PathBuf,
-    /// Objects with their boxes and positions: a JSON file as tracks.json, in which "positions": [[seconds, [x, y, z]], ...] stand for
-    /// "poses". Of poses the first one's heading is used, as a vehicle may drive backwards
-    #[arg(long, value_name = "FILE")]
-    pub(crate) positions: PathBuf,
-    /// Where the paths go, as tracks.json
-    #[arg(long, value_name = "FILE")]
-    pub(crate) out: PathBuf,
-    /// Also measure the poses against the true ones in this tracks.json
-    #[arg(long, value_name = "FILE")]
-    pub(crate) against: Option<PathBuf>,
 }

@@ -14,6 +14,7 @@ mod inspect_objects;
 pub(crate) mod jobs;
 pub(crate) mod kernels;
 pub(crate) mod object_poses;
+pub(crate) mod object_tracks;
 pub(crate) mod pareto;
 pub(crate) mod plan;
 pub(crate) mod prune;

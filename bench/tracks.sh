@@ -1,0 +1,31 @@
+#!/usr/bin/env bash
+# Lines of bench/results/tracks: the paths of traffic that plat objects track finds in generated streets, against the true ones: from the
+# lidar, with YOLOX-nano on the photos as well, and from photos alone. Takes the folder of the captures and detectors. RESULTS is the folder of
+# the lines. Makes the streets in out/tracks if they are not there. Half an hour of one core, the photos mostly.
+set -euo pipefail
+repository=$(realpath "$(dirname "${BASH_SOURCE[0]}")/..")
+data=$(realpath --relative-to="$repository" "${1:?the folder of the detectors}")
+cd "$repository"
+plat=${PLAT:-target/release/plat}
+results=${RESULTS:-bench/results/tracks}
+mkdir -p "$results"
+while read -r street options; do
+    at=out/tracks/$street
+    # shellcheck disable=SC2086 # several options
+    grep -qs '"complete": *true' "$at/manifest.json" || "$plat" --quiet synth $options --aerial 0 --spacing 2 --lidar --out "$at" </dev/null
+    for from in "" "--detector $data/detectors/yolox_nano_416.onnx" "--detector $data/detectors/yolox_nano_416.onnx --no-lidar"; do
+        # shellcheck disable=SC2086 # several options
+        said=$("$plat" --quiet objects track "$at" --store "$at/../store-$street" --out "out/tracks/$street.json" --svg "out/tracks/$street.svg" \
+            --against "$at/tracks.json" $from --json </dev/null)
+        python3 - "$street" "$(git rev-parse --short=12 HEAD)" "$from" "$said" <<'PYTHON' | tee -a "$results/plat.jsonl"
+import json, sys
+street, commit, options, said = sys.argv[1:]
+line = json.loads(said)
+line.pop("out")
+print(json.dumps({"kind": "object tracks", "commit": commit, "street": street, "options": options} | line))
+PYTHON
+    done
+done <<'STREETS'
+medium --area-km2 0.02 --views 480 --traffic medium --size 640x360
+heavy --area-km2 0.05 --seed 3 --layout grid --views 720 --traffic heavy --size 960x540
+STREETS
