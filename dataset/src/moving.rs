@@ -24,6 +24,8 @@ const APART_SECONDS: f64 = 0.6;
 const NEAR_METRES: f64 = 25.0;
 /// Sweeps that are read at once.
 const CHUNK: usize = 16;
+/// Points of a sweep that are used at most: a turn of a scanner with 128 beams.
+const MAX_RETURNS: usize = 250_000;
 /// Sweeps and photos of one time, seconds.
 const SAME_SECONDS: f64 = 1e-3;
 /// Side of a cell of the ground, metres: from sweeps, and from the capture's points.
@@ -144,8 +146,10 @@ impl Looking<'_> {
         instants
     }
 
-    fn turned(&self, returns: Vec<Return>) -> Vec<DVec3> {
-        returns.into_iter().map(|of| self.ground_from_world * of.place).collect()
+    /// The points of a sweep in ground axes; of a large one some, as a window of sweeps is in memory.
+    fn turned(&self, returns: &[Return]) -> Vec<DVec3> {
+        let every = returns.len().div_ceil(MAX_RETURNS).max(1);
+        returns.iter().step_by(every).map(|of| self.ground_from_world * of.place).collect()
     }
 
     fn ground(&self, progress: &dyn Fn(usize)) -> Result<GroundHeights, BadInput> {
@@ -161,7 +165,7 @@ impl Looking<'_> {
         for chunk in sweeps.chunks(CHUNK) {
             let read: Vec<_> = chunk.par_iter().map(Sweep::read).collect();
             for returns in read {
-                ground.add(&self.turned(returns?));
+                ground.add(&self.turned(&returns?));
                 done += 1;
                 progress(done);
             }
@@ -172,7 +176,7 @@ impl Looking<'_> {
     fn scan(&self, instant: &Instant) -> Result<Option<(Scan, RangeImage)>, BadInput> {
         let Some(sweep) = instant.sweep else { return Ok(None) };
         let sensor = self.ground_from_world * sweep.world_from_sensor.translation;
-        let scan = Scan { seconds: instant.seconds, sensor, points: self.turned(sweep.read()?) };
+        let scan = Scan { seconds: instant.seconds, sensor, points: self.turned(&sweep.read()?) };
         let image = RangeImage::of(&scan);
         Ok(Some((scan, image)))
     }

@@ -99,3 +99,46 @@ fn height_in(camera: &Camera, object: &MovingObject, seconds: f64) -> f64 {
     let rows = [object.low.z, object.high.z].map(|z| camera.project(pose.apply(across.extend(z))).0.y);
     (rows[0] - rows[1]).abs()
 }
+
+#[cfg(test)]
+mod tests {
+    use glam::{DMat3, DVec3};
+    use scene::{PathPose, Pinhole, Rigid};
+
+    use super::*;
+
+    /// Looks along x from 1.5 m above the ground.
+    fn view(name: &str, seconds: f64) -> View {
+        let axes = DMat3::from_cols(-DVec3::Y, -DVec3::Z, DVec3::X);
+        let world_from_camera = Rigid { rotation: DQuat::from_mat3(&axes), translation: DVec3::new(0.0, 0.0, 1.5) };
+        let pinhole = Pinhole { width: 400, height: 300, fx: 200.0, fy: 200.0, cx: 200.0, cy: 150.0 };
+        let camera = Camera { pinhole, camera_from_world: world_from_camera.inverse() };
+        View { name: name.into(), camera, mips: Vec::new(), masked: false, depth: None, seconds: Some(seconds) }
+    }
+
+    /// Stands ahead of the camera.
+    fn object(id: &str, class: &str, ahead: f64, left: f64) -> MovingObject {
+        let world_from_object = Rigid { translation: DVec3::new(ahead, left, 0.0), ..Rigid::IDENTITY };
+        let path = [0.0, 5.0].map(|seconds| PathPose { seconds, world_from_object }).to_vec();
+        let (low, high) = (DVec3::new(-1.0, -1.0, 0.0), DVec3::new(1.0, 1.0, 1.5));
+        MovingObject { id: id.into(), class: class.into(), low, high, path }
+    }
+
+    #[test]
+    fn objects_count_where_photos_show_them_high_enough() {
+        let views = [view("a", 1.0), view("b", 1.01), view("c", 2.0)];
+        // 30 pixels high, 10 pixels high, behind the camera, and a person.
+        let truth = [
+            object("1", "car", 10.0, 1.0),
+            object("2", "car", 30.0, 0.0),
+            object("3", "car", -10.0, 0.0),
+            object("4", "person", 8.0, -3.0),
+        ];
+        let found = [object("a", "car", 10.5, 1.0), object("b", "car", 9.0, 6.0), object("c", "car", 40.0, 9.0)];
+        let figures = track_figures(&views, (&found, &truth), None, DQuat::IDENTITY);
+        assert_eq!(figures.times, 2);
+        let of = |score: &Score| [score.objects, score.misses, score.extra, score.switches];
+        assert_eq!([of(&figures.all), of(&figures.vehicles)], [[4, 2, 2, 0], [2, 0, 2, 0]]);
+        assert!((figures.vehicles.median_metres.unwrap() - 0.5).abs() < 1e-9);
+    }
+}
