@@ -13,9 +13,10 @@ while read -r street options; do
     at=out/tracks/$street
     # shellcheck disable=SC2086 # several options
     grep -qs '"complete": *true' "$at/manifest.json" || "$plat" --quiet synth $options --aerial 0 --spacing 2 --lidar --out "$at" </dev/null
-    for from in "" "--detector $data/detectors/yolox_nano_416.onnx" "--detector $data/detectors/yolox_nano_416.onnx --no-lidar"; do
+    photos="--detector $data/detectors/yolox_nano_416.onnx --store out/tracks/store-$street"
+    for from in "" "$photos" "$photos --no-lidar"; do
         # shellcheck disable=SC2086 # several options
-        said=$("$plat" --quiet objects track "$at" --store "$at/../store-$street" --out "out/tracks/$street.json" --svg "out/tracks/$street.svg" \
+        said=$("$plat" --quiet objects track "$at" --out "out/tracks/$street.json" --svg "out/tracks/$street.svg" \
             --against "$at/tracks.json" $from --json </dev/null)
         python3 - "$street" "$(git rev-parse --short=12 HEAD)" "$from" "$said" <<'PYTHON' | tee -a "$results/plat.jsonl"
 import json, sys

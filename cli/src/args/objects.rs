@@ -53,6 +53,6 @@ pub(crate) struct TrackArgs {
     #[arg(long, value_name = "FILE")]
     pub(crate) svg: Option<PathBuf>,
     /// Store for the photos at all sizes and what is found on them; a temporary one by default
-    #[arg(long, value_name = "URL")]
+    #[arg(long, value_name = "URL", requires = "zone_source")]
     pub(crate) store: Option<String>,
 }
