@@ -80,8 +80,6 @@ pub struct Track {
     pub size: DVec3,
     /// Where the middle of its lower side was, at each moment from the first to the last that it was seen.
     pub path: Vec<TrackPose>,
-    /// How often it was seen.
-    pub seen: usize,
 }
 
 /// Where a track was.
@@ -315,17 +313,16 @@ fn finished(
         nearest.map_or(0.0, |seen| sighting(seen).ground)
     };
     let pose = |(now, motion): (usize, &Motion)| {
-        let height = |place: DVec2| ground(place);
-        let z = height(motion.middle).unwrap_or_else(|| beside(now));
+        let z = ground(motion.middle).unwrap_or_else(|| beside(now));
         let half = 0.5 * SLOPE_METRES * DVec2::from_angle(motion.heading);
-        let slope = match (height(motion.middle - half), height(motion.middle + half)) {
+        let slope = match (ground(motion.middle - half), ground(motion.middle + half)) {
             (Some(behind), Some(ahead)) => ((ahead - behind) / SLOPE_METRES).atan().clamp(-MAX_SLOPE, MAX_SLOPE),
             _ => 0.0,
         };
         TrackPose { seconds: moments[now].seconds, place: motion.middle.extend(z), heading: motion.heading, slope }
     };
     let path = (from..).zip(&motions).map(pose).collect();
-    Some(Track { kind, size, path, seen: of.seen.len() })
+    Some(Track { kind, size, path })
 }
 
 /// The value that comes most often, the larger one of two.
