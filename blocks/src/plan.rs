@@ -15,7 +15,7 @@ use crate::lod::{Cut, training_order};
 use crate::task::{DetectTask, EvalTask, ObjectTask, Task, ViewUse, tasks_of_views};
 
 /// The format version of [`Plan`] that this program reads and writes.
-pub const VERSION: u32 = 12;
+pub const VERSION: u32 = 13;
 /// The frame kind of a plan.
 pub const PLAN: Kind = Kind(*b"plan", VERSION);
 /// The maximum depth of a plan: 65,536 blocks a side.
@@ -98,6 +98,8 @@ pub struct PlanSettings {
     pub test_stretches: f64,
     /// Whether the root refines the poses of the training views, which all other blocks reuse unchanged.
     pub refine_poses: bool,
+    /// Whether the root refines the mounts and clocks of the sensors that took the photos; all other blocks reuse the poses.
+    pub refine_sensors: bool,
     /// Whether tasks of the job train the capture's objects that move.
     pub objects: bool,
 }
@@ -126,6 +128,7 @@ impl Default for PlanSettings {
             evaluate: false,
             test_stretches: 0.0,
             refine_poses: false,
+            refine_sensors: false,
             objects: false,
         }
     }

@@ -202,6 +202,10 @@ fn check(settings: &PlanSettings) -> Result<(), PlanError> {
         let problem = "flat blocks have no root that refines the poses";
         return bad("--refine-poses", problem.into(), "omit it, or use --blocks tree or whole");
     }
+    if settings.refine_sensors && settings.mode == Mode::Flat {
+        let problem = "flat blocks have no root that refines the sensors";
+        return bad("--refine-sensors", problem.into(), "omit it, or use --blocks tree or whole");
+    }
     if settings.objects && settings.mode == Mode::Flat {
         let problem = "flat blocks are no scene that objects could be trained in";
         return bad("--objects", problem.into(), "omit it, or use --blocks tree or whole");

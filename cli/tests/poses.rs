@@ -49,6 +49,7 @@ fn poses_come_from_the_root_and_do_not_change() {
     assert_eq!(cameras.frames.len(), trained.len());
     let mut moved = 0;
     for (camera, (_, pose)) in cameras.frames.iter().zip(poses.iter()) {
+        let pose = pose.camera_from_world;
         assert!((camera.camera_from_world.translation - pose.translation).length() < 1e-9);
         let given = given.frames.iter().find(|frame| frame.file_path.ends_with(&camera.file_path)).unwrap();
         let change = (given.camera_from_world.inverse().translation - pose.inverse().translation).length();

@@ -131,6 +131,7 @@ impl<'a> Pruner<'a> {
             exposures: self.exposures,
             trains_exposures: false,
             trains_poses: false,
+            sensors: None,
             recipe: &recipe,
             source: &self.weighted,
             picture_loss: None,

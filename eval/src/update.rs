@@ -301,6 +301,7 @@ impl Area<'_> {
             exposures: None,
             trains_exposures: false,
             trains_poses: false,
+            sensors: None,
             recipe: &recipe,
             source: self.reader,
             picture_loss: None,

@@ -12,6 +12,8 @@ pub(crate) const PLAN_FILE: &str = "plan.plat";
 pub(crate) const EXPOSURES_FILE: &str = "exposures.plat";
 pub(crate) const POSES_FILE: &str = "poses.plat";
 pub(crate) const CAMERAS_FILE: &str = "cameras.json";
+/// What was found of each sensor.
+pub(crate) const SENSORS_FILE: &str = "sensors.json";
 pub(crate) const MERGED_FILE: &str = "merged.ply";
 pub(crate) const OBJECTS_FOLDER: &str = "objects";
 pub(crate) const PATHS_FILE: &str = "paths.json";

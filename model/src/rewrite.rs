@@ -10,8 +10,8 @@ use store::file::save;
 
 use crate::error::{ModelError, cannot};
 use crate::files::{
-    CAMERAS_FILE, EXPOSURES_FILE, MANIFEST_FILE, MERGED_FILE, OBJECTS_FOLDER, PATHS_FILE, POSES_FILE, block_file,
-    save_json,
+    CAMERAS_FILE, EXPOSURES_FILE, MANIFEST_FILE, MERGED_FILE, OBJECTS_FOLDER, PATHS_FILE, POSES_FILE, SENSORS_FILE,
+    block_file, save_json,
 };
 use crate::import::{Kind, kind};
 use crate::read::{Opened, Tree, open, read_block, read_objects, read_tree};
@@ -122,8 +122,8 @@ pub fn replace_blocks(path: &Path, out: &Path, changed: &BTreeMap<BlockId, Splat
     }
     let attributes: Vec<String> = attributes.into_iter().collect();
     let bytes = write_merged(out, &folder, &plan, count, &attributes)?;
-    if outer.join(CAMERAS_FILE).exists() {
-        copy(Path::new(CAMERAS_FILE), outer, out)?;
+    for file in [CAMERAS_FILE, SENSORS_FILE].into_iter().filter(|file| outer.join(file).exists()) {
+        copy(Path::new(file), outer, out)?;
     }
     for (name, about) in [(EXPOSURES_FILE, manifest.exposures), (POSES_FILE, manifest.poses)] {
         if about.is_some() {

@@ -6,15 +6,18 @@ use std::path::{Path, PathBuf};
 
 use blocks::{ObjectTask, Plan};
 use scene::objects::{self, Tracks};
+use scene::poses::SensorError;
+use scene::sensors::Sensors;
 use scene::transforms::{self, Frame, Intrinsics, Transforms};
-use scene::{ArtefactId, BlockId, CameraModel, Capture, Poses, Splats, frame, ply};
+use scene::{ArtefactId, BlockId, Camera, CameraModel, Capture, Poses, Splats, frame, ply};
+use serde::Serialize;
 use store::BlockingStore;
 use store::file::{AtomicFile, save};
 
 use crate::error::{ModelError, cannot};
 use crate::files::{
     CAMERAS_FILE, EXPOSURES_FILE, MANIFEST_FILE, MERGED_FILE, OBJECTS_FOLDER, PATHS_FILE, PLAN_FILE, POSES_FILE,
-    block_file, save_json,
+    SENSORS_FILE, block_file, save_json,
 };
 use crate::manifest::{BlockEntry, Manifest, VERSION};
 use crate::read::read_block;
@@ -27,8 +30,8 @@ pub(crate) fn begin(out: &Path, plan: &Plan) -> Result<PathBuf, ModelError> {
     if folder.join(MANIFEST_FILE).exists() {
         fs::remove_dir_all(&folder).map_err(cannot("replaced", &folder))?;
     }
-    for file in
-        [MERGED_FILE, CAMERAS_FILE, "report.json", "eval/report.json", "eval/sheet.png"].map(|name| out.join(name))
+    for file in [MERGED_FILE, CAMERAS_FILE, SENSORS_FILE, "report.json", "eval/report.json", "eval/sheet.png"]
+        .map(|name| out.join(name))
     {
         if file.exists() {
             fs::remove_file(&file).map_err(cannot("replaced", &file))?;
@@ -100,6 +103,9 @@ pub fn write(
         let decoded = Poses::from_frame(&bytes).map_err(ModelError::DamagedPoses)?;
         save(&folder.join(POSES_FILE), &bytes)?;
         save(&out.join(CAMERAS_FILE), &cameras(capture, &decoded))?;
+        if !decoded.sensors.is_empty() {
+            save_json(&out.join(SENSORS_FILE), &sensors(capture, &decoded))?;
+        }
     }
     let manifest = Manifest {
         version: VERSION,
@@ -178,11 +184,42 @@ pub(crate) fn save_objects(out: &Path, objects: &[ModelObject], antialiased: boo
     Ok(())
 }
 
-/// A `transforms.json` of the views that have a refined pose, with the names of the capture's views as paths.
+/// What was found of each sensor, as people read it.
+fn sensors(capture: &Capture, poses: &Poses) -> Vec<FoundSensor> {
+    let Sensors { names, of_views } = scene::sensors::sensors(&capture.views);
+    let found = |error: &SensorError| FoundSensor {
+        sensor: names.get(error.sensor as usize).cloned().unwrap_or_default(),
+        photos: of_views.iter().filter(|taken| taken.sensor == error.sensor).count(),
+        clock_seconds: error.clock_seconds,
+        shift_metres: error.shift.to_array(),
+        turn_degrees: error.turn.to_array().map(f64::to_degrees),
+        focal_factor: error.focal_factor,
+    };
+    poses.sensors.iter().map(found).collect()
+}
+
+/// An entry of `sensors.json`.
+#[derive(Debug, Serialize)]
+struct FoundSensor {
+    /// What the names of its photos have in common.
+    sensor: String,
+    /// Number of its photos.
+    photos: usize,
+    /// Seconds that the photos were taken after the times of their poses.
+    clock_seconds: f64,
+    /// Where the camera is in the axes of the given one (x right, y down, z ahead).
+    shift_metres: [f64; 3],
+    /// Rotation vector of the camera in the axes of the given one.
+    turn_degrees: [f64; 3],
+    /// What the given focal lengths are multiplied by.
+    focal_factor: f64,
+}
+
+/// A `transforms.json` of the views that have a refined camera, with the names of the capture's views as paths.
 fn cameras(capture: &Capture, poses: &Poses) -> Vec<u8> {
-    let frame = |(view, &camera_from_world): (u32, _)| {
-        let view = capture.views.get(view as usize)?;
-        let k = view.camera.pinhole;
+    let frame = |(number, _): (u32, _)| {
+        let view = capture.views.get(number as usize)?;
+        let Camera { pinhole: k, camera_from_world } = poses.apply(number, view.camera);
         let lens = CameraModel::Pinhole([k.fx, k.fy, k.cx, k.cy]);
         let intrinsics = Intrinsics::from_model(&lens, Some((k.width, k.height)));
         Some(Frame {

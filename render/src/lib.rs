@@ -146,6 +146,8 @@ pub struct Gradients {
     pub weight: Vec<f32>,
     /// dL/dξ for `camera_from_world ← exp(ξ)·camera_from_world`, ξ = (ρ metres, ω radians).
     pub pose: [f32; 6],
+    /// dL/d ln(focal length), of both focal lengths together.
+    pub focal: f32,
 }
 
 /// Contribution of each trainable splat to a view; sums over pixels, each times its weight. Zero where a splat is not

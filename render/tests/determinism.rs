@@ -45,7 +45,7 @@ fn bits(isa: Isa, threads: usize, antialiased: bool) -> Vec<u32> {
             for column in gradients.columns.iter().chain(extra) {
                 all.extend(column.iter().map(|v| v.to_bits()));
             }
-            all.extend(gradients.pose.iter().map(|v| v.to_bits()));
+            all.extend(gradients.pose.iter().chain([&gradients.focal]).map(|v| v.to_bits()));
             all.extend(gradients.seen.iter().map(|&v| u32::from(v)));
         }
         let (first, second) = all.split_at(all.len() / 2);

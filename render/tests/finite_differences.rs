@@ -150,6 +150,14 @@ fn pose_slopes(scene: &Scene, upstream: &Upstream) -> Vec<f64> {
         .collect()
 }
 
+/// Central difference of the logarithm of both focal lengths.
+fn focal_slope(scene: &Scene, upstream: &Upstream) -> f64 {
+    slope(scene, upstream, &|s, x| {
+        s.camera.pinhole.fx *= x.exp();
+        s.camera.pinhole.fy *= x.exp();
+    })
+}
+
 fn analytic(isa: Isa, s: &Smooth, upstream: &Upstream) -> (Frame, Gradients) {
     let mut renderer = Renderer::new(isa);
     let part = s.context.as_ref().map(Part::beside);
@@ -157,9 +165,10 @@ fn analytic(isa: Isa, s: &Smooth, upstream: &Upstream) -> (Frame, Gradients) {
     (frame, renderer.backward(&s.splats, upstream).clone())
 }
 
-/// All parameters and the pose, on every instruction set.
+/// All parameters, the pose and the focal length, on every instruction set.
 fn check(name: &str, s: &Smooth, upstream: &Upstream, tolerance: f64) {
     let (columns, pose) = (column_slopes(&s.scene, upstream), pose_slopes(&s.scene, upstream));
+    let focal = focal_slope(&s.scene, upstream);
     for isa in Isa::available() {
         let (_, gradients) = analytic(isa, s, upstream);
         for (class, from, to) in classes(s.options.sh_degree) {
@@ -174,6 +183,7 @@ fn check(name: &str, s: &Smooth, upstream: &Upstream, tolerance: f64) {
             }
         }
         assert_agrees(&format!("{name} {} pose", isa.name()), &gradients.pose, &pose, tolerance);
+        assert_agrees(&format!("{name} {} focal length", isa.name()), &[gradients.focal], &[focal], tolerance);
     }
 }
 

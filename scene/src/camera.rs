@@ -85,6 +85,12 @@ pub struct Pinhole {
 const NEAR_METRES: f64 = 0.1;
 
 impl Pinhole {
+    /// The same pinhole with both focal lengths multiplied.
+    #[must_use]
+    pub fn with_focal_factor(self, factor: f64) -> Self {
+        Self { fx: self.fx * factor, fy: self.fy * factor, ..self }
+    }
+
     /// Pixels whose convex hull is the picture of a box: of its part before the camera. `corners` are in the camera's axes, numbered by
     /// the bits of their signs along the three sides. Empty for a box behind the camera.
     pub fn outline(&self, corners: &[DVec3; 8]) -> Vec<DVec2> {

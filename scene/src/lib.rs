@@ -29,6 +29,7 @@ pub mod ply;
 pub mod poses;
 pub mod rad;
 pub mod random;
+pub mod sensors;
 pub mod similarity;
 pub mod sog;
 pub mod splat_glb;

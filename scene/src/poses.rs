@@ -1,7 +1,8 @@
-//! Refined poses of training views.
+//! Refined cameras of training views, and the errors of sensors that were found.
 //!
-//! Structure from motion and satellite navigation leave errors in the poses of a capture. Training can refine them
-//! together with the splats. A refined pose replaces that of the capture; the intrinsics stay.
+//! Structure from motion and satellite navigation leave errors in the poses of a capture, and a rig has errors of its
+//! clocks, mounts and focal lengths. Training can refine them together with the splats. A refined pose replaces that of the
+//! capture, and the focal lengths are multiplied by a factor.
 
 use std::collections::BTreeMap;
 
@@ -12,73 +13,107 @@ use crate::camera::{Camera, Rigid};
 use crate::error::CodecError;
 use crate::frame::{self, Kind};
 
-/// Poses. The header is their number. The bulk has, for each view in ascending order, the view (u32) and
-/// camera_from_world as seven f64: the unit quaternion xyzw and the translation in metres; little endian.
-pub const POSES: Kind = Kind(*b"pose", 1);
+/// Poses. The header is their number and the errors of sensors. The bulk has, for each view in ascending order, the view
+/// (u32), camera_from_world as seven f64 (the unit quaternion xyzw and the translation in metres), and the factor of the
+/// focal lengths (f64); little endian.
+pub const POSES: Kind = Kind(*b"pose", 2);
 
-const BYTES: usize = 4 + 7 * 8;
+const BYTES: usize = 4 + 8 * 8;
 
-/// Poses (camera_from_world) by view of the capture. Views without one keep the capture's.
+/// Refined cameras by view of the capture. Views without one keep the capture's.
 #[derive(Debug, Clone, PartialEq, Default)]
-pub struct Poses(BTreeMap<u32, Rigid>);
+pub struct Poses {
+    of_views: BTreeMap<u32, RefinedCamera>,
+    /// What was found of each sensor, where sensors were refined. The cameras have it already.
+    pub sensors: Vec<SensorError>,
+}
 
-impl FromIterator<(u32, Rigid)> for Poses {
-    fn from_iter<T: IntoIterator<Item = (u32, Rigid)>>(of_views: T) -> Self {
-        Self(of_views.into_iter().collect())
+/// What training found of a view's camera.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct RefinedCamera {
+    /// Its pose.
+    pub camera_from_world: Rigid,
+    /// What the focal lengths of the capture are multiplied by.
+    pub focal_factor: f64,
+}
+
+/// What training found of a sensor. The correct camera is the given one moved by this in its own axes.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct SensorError {
+    /// Number of the sensor, as [`crate::sensors`] counts them.
+    pub sensor: u32,
+    /// Translation of the mount, metres.
+    pub shift: DVec3,
+    /// Rotation vector of the mount, radians.
+    pub turn: DVec3,
+    /// What the focal lengths are multiplied by.
+    pub focal_factor: f64,
+    /// Seconds that the photos were taken after the times of their poses.
+    pub clock_seconds: f64,
+}
+
+impl SensorError {
+    fn is_sane(&self) -> bool {
+        let numbers = [self.shift.length(), self.turn.length(), self.clock_seconds];
+        numbers.iter().all(|number| number.is_finite()) && is_factor(self.focal_factor)
+    }
+}
+
+/// Whether focal lengths can be multiplied by this.
+fn is_factor(factor: f64) -> bool {
+    factor.is_finite() && factor > 0.0
+}
+
+impl FromIterator<(u32, RefinedCamera)> for Poses {
+    fn from_iter<T: IntoIterator<Item = (u32, RefinedCamera)>>(of_views: T) -> Self {
+        Self { of_views: of_views.into_iter().collect(), sensors: Vec::new() }
     }
 }
 
 #[derive(Serialize, Deserialize)]
 struct Header {
     count: u64,
+    sensors: Vec<SensorError>,
 }
 
 impl Poses {
-    /// The pose of a view, if it has one.
-    pub fn of(&self, view: u32) -> Option<&Rigid> {
-        self.0.get(&view)
-    }
-
-    /// The camera of a view with its pose, or unchanged if the view has none.
+    /// The refined camera of a view, or the given one if the view has none.
     pub fn apply(&self, view: u32, camera: Camera) -> Camera {
-        self.of(view).map_or(camera, |&camera_from_world| Camera { camera_from_world, ..camera })
+        let Some(&RefinedCamera { camera_from_world, focal_factor }) = self.of_views.get(&view) else { return camera };
+        let pinhole = camera.pinhole.with_focal_factor(focal_factor);
+        Camera { camera_from_world, pinhole }
     }
 
-    /// Views with their poses, ascending.
-    pub fn iter(&self) -> impl Iterator<Item = (u32, &Rigid)> {
-        self.0.iter().map(|(&view, pose)| (view, pose))
-    }
-
-    /// Number of views with a pose.
-    pub fn len(&self) -> usize {
-        self.0.len()
-    }
-
-    /// True if no view has a pose.
-    pub fn is_empty(&self) -> bool {
-        self.0.is_empty()
+    /// Views with their refined cameras, ascending.
+    pub fn iter(&self) -> impl Iterator<Item = (u32, &RefinedCamera)> {
+        self.of_views.iter().map(|(&view, refined)| (view, refined))
     }
 
     /// Encodes a frame.
     pub fn to_frame(&self) -> Vec<u8> {
-        let mut bulk = Vec::with_capacity(BYTES * self.0.len());
-        for (view, pose) in &self.0 {
+        let mut bulk = Vec::with_capacity(BYTES * self.of_views.len());
+        for (view, RefinedCamera { camera_from_world: pose, focal_factor }) in &self.of_views {
             bulk.extend(view.to_le_bytes());
-            let numbers = pose.rotation.to_array().into_iter().chain(pose.translation.to_array());
+            let numbers =
+                pose.rotation.to_array().into_iter().chain(pose.translation.to_array()).chain([*focal_factor]);
             bulk.extend(numbers.flat_map(f64::to_le_bytes));
         }
-        frame::encode(POSES, &Header { count: self.0.len() as u64 }, &bulk)
+        let header = Header { count: self.of_views.len() as u64, sensors: self.sensors.clone() };
+        frame::encode(POSES, &header, &bulk)
     }
 
     /// Decodes a frame.
     ///
     /// # Errors
-    /// As [`frame::decode`]; a bulk that does not match the header, views out of order, or a pose that is not
-    /// [sane](Rigid::is_sane).
+    /// As [`frame::decode`]; a bulk that does not match the header, views out of order, a pose that is not
+    /// [sane](Rigid::is_sane), or numbers that are not finite.
     pub fn from_frame(bytes: &[u8]) -> Result<Self, CodecError> {
         let (header, bulk): (Header, _) = frame::decode(POSES, bytes)?;
         if header.count.checked_mul(BYTES as u64) != Some(bulk.len() as u64) {
             return Err(CodecError::new("poses do not match their header"));
+        }
+        if !header.sensors.iter().all(SensorError::is_sane) {
+            return Err(CodecError::new("an error of a sensor is not finite"));
         }
         let mut poses = BTreeMap::new();
         for row in bulk.chunks_exact(BYTES) {
@@ -93,9 +128,13 @@ impl Poses {
             if poses.last_key_value().is_some_and(|(&last, _)| last >= view) {
                 return Err(CodecError::new("poses are not in ascending order of their views"));
             }
-            poses.insert(view, pose);
+            let focal_factor = number(7);
+            if !is_factor(focal_factor) {
+                return Err(CodecError::new(format!("the focal length of view {view} is not a positive number")));
+            }
+            poses.insert(view, RefinedCamera { camera_from_world: pose, focal_factor });
         }
-        Ok(Self(poses))
+        Ok(Self { of_views: poses, sensors: header.sensors })
     }
 }
 
@@ -106,9 +145,17 @@ mod tests {
     fn some() -> Poses {
         let pose = |view: u32| {
             let angle = 0.1 * f64::from(view % 7);
-            (view, Rigid { rotation: DQuat::from_rotation_x(angle), translation: DVec3::new(angle, 2.0, -3.0) })
+            let rotation = DQuat::from_rotation_x(angle);
+            let camera_from_world = Rigid { rotation, translation: DVec3::new(angle, 2.0, -3.0) };
+            (view, RefinedCamera { camera_from_world, focal_factor: 1.0 + angle })
         };
-        [0, 3, 7, u32::MAX].map(pose).into_iter().collect()
+        let poses: Poses = [0, 3, 7, u32::MAX].map(pose).into_iter().collect();
+        Poses { sensors: vec![error(0.02)], ..poses }
+    }
+
+    fn error(clock_seconds: f64) -> SensorError {
+        let (shift, turn) = (DVec3::X, DVec3::new(0.0, 0.1, -0.2));
+        SensorError { sensor: 3, shift, turn, focal_factor: 0.99, clock_seconds }
     }
 
     #[test]
@@ -126,11 +173,16 @@ mod tests {
 
     #[test]
     fn inconsistent_frames_with_a_valid_checksum_are_refused() {
-        let forged = |count: u64, bulk: &[u8]| Poses::from_frame(&frame::encode(POSES, &Header { count }, bulk));
+        let of_sensors = |count: u64, bulk: &[u8], clock_seconds: f64| {
+            let header = Header { count, sensors: vec![error(clock_seconds)] };
+            Poses::from_frame(&frame::encode(POSES, &header, bulk))
+        };
+        let forged = |count: u64, bulk: &[u8]| of_sensors(count, bulk, 0.02);
         let frame = some().to_frame();
         let good = &frame[frame.len() - 4 * BYTES..];
         assert_eq!(forged(4, good).unwrap(), some());
         assert!(forged(u64::MAX, good).is_err() && forged(3, good).is_err());
+        assert!(of_sensors(4, good, f64::NAN).unwrap_err().0.contains("sensor"));
         let mut repeated = good.to_vec();
         repeated[BYTES..BYTES + 4].fill(0);
         assert!(forged(4, &repeated).unwrap_err().0.contains("order"));
@@ -138,6 +190,9 @@ mod tests {
             let mut insane = good.to_vec();
             insane[4..12].copy_from_slice(&wrong.to_le_bytes());
             assert!(forged(4, &insane).unwrap_err().0.contains("not a rotation"));
+            insane = good.to_vec();
+            insane[60..68].copy_from_slice(&(-wrong).to_le_bytes());
+            assert!(forged(4, &insane).unwrap_err().0.contains("focal length"));
         }
     }
 }

@@ -36,8 +36,14 @@ pub const REARRANGE: Stage =
 /// `pose.wgsl`
 pub const POSE: Stage =
     Stage::new("pose", &[VIEW, TRAIN, SUM, POWER, include_str!("../wgsl/pose.wgsl")], &["pose_step"]);
+/// `sensor.wgsl`
+pub const SENSOR: Stage = Stage::new(
+    "sensor",
+    &[VIEW, TRAIN, POWER, include_str!("../wgsl/sensor.wgsl")],
+    &["sensor_step", "sum_displacements"],
+);
 /// Every stage of training.
-pub const STAGES: &[Stage] = &[LOSS, ADAM, EXPOSURE, POSE, DENSIFICATION_STATS, REARRANGE];
+pub const STAGES: &[Stage] = &[LOSS, ADAM, EXPOSURE, POSE, SENSOR, DENSIFICATION_STATS, REARRANGE];
 
 /// Counters and losses that stay on the device between steps.
 ///
@@ -182,6 +188,57 @@ pub struct PoseConstants {
     /// Padding.
     pub padding: [u32; 2],
     /// Number of the displacement of each view of the step, from 1; 0: it has none.
+    pub row: [u32; MAX_VIEWS],
+}
+
+/// The errors of a sensor, with their Adam state.
+#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
+#[repr(C)]
+pub struct Sensor {
+    /// A motion of its cameras in their axes (translation in metres, rotation vector in radians), what ln(focal length) is
+    /// greater by, and seconds of its clock.
+    pub values: [f32; 8],
+    /// First moments.
+    pub first: [f32; 8],
+    /// Second moments.
+    pub second: [f32; 8],
+    /// Learning rates, of which that of a rotation is the share.
+    pub rates: [f32; 8],
+    /// One over the number of its photos.
+    pub share: f32,
+    /// Adam steps.
+    pub steps: u32,
+    /// Padding.
+    pub padding: [u32; 2],
+}
+
+/// How the sensor of a camera displaces it.
+#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
+#[repr(C)]
+pub struct SensorCamera {
+    /// Translation in a second of the sensor's clock, metres, in the camera's axes.
+    pub shift_per_second: [f32; 3],
+    /// Number of the sensor, from 1; 0: none.
+    pub sensor: u32,
+    /// Rotation vector in a second of the sensor's clock, radians, in the camera's axes.
+    pub turn_per_second: [f32; 3],
+    /// Padding.
+    pub padding: u32,
+}
+
+/// Constants of a step of the sensors. Uniform.
+#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
+#[repr(C)]
+pub struct SensorConstants {
+    /// Learning rate of rotations, radians, times the number of photos.
+    pub rate: f32,
+    /// Share of the errors that is taken back, times the number of photos.
+    pub decay: f32,
+    /// Number of cameras.
+    pub cameras: u32,
+    /// Views of the step.
+    pub views: u32,
+    /// Number of the camera of each view of the step, from 1; 0: it has none.
     pub row: [u32; MAX_VIEWS],
 }
 

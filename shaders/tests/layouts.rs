@@ -6,7 +6,8 @@ use std::mem::offset_of;
 use naga::valid::{Capabilities, ValidationFlags, Validator};
 use naga::{Module, TypeInner};
 use shaders::train::{
-    self, AdamConstants, ExposureConstants, GivenPose, OptimiserState, Photo, Photos, PoseConstants, RearrangeConstants,
+    self, AdamConstants, ExposureConstants, GivenPose, OptimiserState, Photo, Photos, PoseConstants,
+    RearrangeConstants, Sensor, SensorCamera, SensorConstants,
 };
 use shaders::{
     HALF, PassConstants, RASTERIZE_BACKWARD_ATOMICS, STAGES, SUBGROUPS, SplatSet, Stage, Status, UpstreamPlanes, View,
@@ -41,6 +42,9 @@ fn rust_layouts() -> BTreeMap<&'static str, Layout> {
         layout!(ExposureConstants: rows, rate, padding),
         layout!(GivenPose: rows, translation_rate, padding),
         layout!(PoseConstants: rate, decay, spread, cameras, views, is_anchored, padding, row),
+        layout!(Sensor: values, first, second, rates, share, steps, padding),
+        layout!(SensorCamera: shift_per_second, sensor, turn_per_second, padding),
+        layout!(SensorConstants: rate, decay, cameras, views, row),
         layout!(AdamConstants: mean, log_scale, quat, opacity, sh_dc, sh_rest, beta2, opacity_reg, needle_reg, log_scale_min,
             log_scale_max, columns, stride, views, padding),
     ]

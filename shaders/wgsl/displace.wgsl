@@ -1,8 +1,8 @@
 // Stage `displace`: moves the cameras of the views by rigid motions in their own axes (translation in metres, rotation
-// vector in radians); one thread per view. Without a motion a camera keeps its bits.
+// vector in radians) and multiplies their focal lengths; one thread per view. Zeros keep a camera's bits.
 
 @group(0) @binding(0) var<storage, read_write> views: Views;
-// Six numbers per displacement.
+// Eight numbers per displacement: the motion, ln of the factor of the focal length, padding.
 @group(0) @binding(1) var<storage, read> displacements: array<f32>;
 
 @compute @workgroup_size(256)
@@ -10,7 +10,7 @@ fn displace(@builtin(local_invocation_index) local: u32) {
     if local >= views.count || views.view[local].displacement == 0u {
         return;
     }
-    let at = 6u * (views.view[local].displacement - 1u);
+    let at = 8u * (views.view[local].displacement - 1u);
     let shift = vec3<f32>(displacements[at], displacements[at + 1u], displacements[at + 2u]);
     let turn = vec3<f32>(displacements[at + 3u], displacements[at + 4u], displacements[at + 5u]);
     let rows = views.view[local].rows;
@@ -33,4 +33,12 @@ fn displace(@builtin(local_invocation_index) local: u32) {
     }
     let in_world = rows[0].xyz * shift.x + rows[1].xyz * shift.y + rows[2].xyz * shift.z;
     views.view[local].centre += vec4<f32>(in_world, 0.0);
+    // The exponential as a series, as WGSL's is inexact: 2 ulp up to a tenth.
+    let f = displacements[at + 6u];
+    let factor = 1.0 + f * (1.0 + f / 2.0 * (1.0 + f / 3.0 * (1.0 + f / 4.0 * (1.0 + f / 5.0))));
+    if factor != 1.0 {
+        views.view[local].focal *= factor;
+        views.view[local].cone_min /= factor;
+        views.view[local].cone_max /= factor;
+    }
 }

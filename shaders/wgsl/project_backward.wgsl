@@ -12,7 +12,7 @@
 @group(0) @binding(12) var<storage, read_write> out_d: array<f32>;
 // For each visible trainable entry: norm of the mean's gradient in pixels, the same with absolute values summed, sum of
 // alpha T, pixels of the view. After one of these per trainable entry, two vectors for each visible trainable entry of a
-// view with a displacement: the six terms of the gradient of its pose.
+// view with a displacement: the six terms of the gradient of its pose, and that of its focal length.
 @group(0) @binding(13) var<storage, read_write> statistics: array<vec4<f32>>;
 
 // Whether an earlier view has written the gradient, so that this view adds to it.
@@ -163,6 +163,8 @@ fn splat_gradient(i: u32, visible_at: u32) {
     if views.extras == INVERSE_DEPTH {
         d_p.z *= -e.inv_z * e.inv_z;
     }
+    // Of ln(focal length): the projected centre and J are proportional to it, but for a clamped ratio, which is inversely so.
+    var d_focal = 0.0;
     let third = view.rows[2].xyz;
     let d_t = array<vec3<f32>, 2>(d_t0, d_t1);
     for (var r = 0u; r < 2u; r++) {
@@ -170,6 +172,8 @@ fn splat_gradient(i: u32, visible_at: u32) {
         let d_j0 = dot3(d_t[r], view.rows[r].xyz);
         let d_j2 = dot3(d_t[r], third);
         d_p.z += f_z * e.inv_z * (e.u[r] * d_j2 - d_j0);
+        d_focal += f_z * (d_j0 - select(0.0, e.u[r] * d_j2, e.free[r]));
+        d_focal += f_z * d_mean[r] * p[r];
         // Gradient of the ratio p_r / z: of the centre and, unless clamped, of the Jacobian.
         let d_ratio = select(0.0, -(f_z * d_j2), e.free[r]) + view.focal[r] * d_mean[r];
         d_p[r] = d_ratio * e.inv_z;
@@ -241,6 +245,6 @@ fn splat_gradient(i: u32, visible_at: u32) {
         }
         let to = views.trainable_entries + 2u * visible_at;
         statistics[to] = vec4<f32>(shift, turn.x);
-        statistics[to + 1u] = vec4<f32>(turn.yz, 0.0, 0.0);
+        statistics[to + 1u] = vec4<f32>(turn.yz, d_focal, 0.0);
     }
 }

@@ -1,10 +1,10 @@
-// Stage `reduce_pose`: sums the terms of the pose gradient of the visible trainable entries of each view, in a fixed
+// Stage `reduce_pose`: sums the terms of the gradients of the pose and the focal length of the visible trainable entries of each view, in a fixed
 // order: POSE_BLOCKS workgroups per view, then one for all.
 
 @group(0) @binding(0) var<uniform> views: Views;
 @group(0) @binding(1) var<storage, read> status: Status;
 @group(0) @binding(2) var<storage, read> visible: array<u32>;
-// After one vector per trainable entry, two per visible trainable entry: the six terms of its pose gradient.
+// After one vector per trainable entry, two per visible trainable entry: the seven terms.
 @group(0) @binding(3) var<storage, read> statistics: array<vec4<f32>>;
 // Two vectors per workgroup of a view.
 @group(0) @binding(4) var<storage, read_write> partials: array<vec4<f32>>;

@@ -129,6 +129,42 @@ struct PoseConstants {
     row: array<vec4<u32>, 4>,
 }
 
+// The errors of a sensor, with their Adam state.
+struct Sensor {
+    // A motion of its cameras (metres, radians, in their axes), what ln(focal length) is greater by, seconds of its clock.
+    values: array<f32, 8>,
+    first: array<f32, 8>,
+    second: array<f32, 8>,
+    // Learning rates, of which that of a rotation is the share.
+    rates: array<f32, 8>,
+    // One over the number of its photos.
+    share: f32,
+    // Adam steps.
+    steps: u32,
+    padding: vec2<u32>,
+}
+
+// How the sensor of a camera displaces it.
+struct SensorCamera {
+    // Translation and rotation vector in a second of its clock.
+    shift_per_second: vec3<f32>,
+    // Number of the sensor, from 1; 0: none.
+    sensor: u32,
+    turn_per_second: vec3<f32>,
+    padding: u32,
+}
+
+// Constants of a step of the sensors.
+struct SensorConstants {
+    rate: f32,
+    decay: f32,
+    cameras: u32,
+    // Views of the step.
+    views: u32,
+    // Number of the camera of each view, from 1; 0: it has none.
+    row: array<vec4<u32>, 4>,
+}
+
 // SSIM's 11-tap window: exp(-d^2 / (2 1.5^2)) for d = 0, 1, .. 5, normalised to a sum of one over the eleven taps.
 const TAPS = array<f32, 6>(0.26601172, 0.21300554, 0.10936069, 0.036000773, 0.007598758, 0.00102838);
 const RADIUS: u32 = 5u;

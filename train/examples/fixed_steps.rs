@@ -57,6 +57,7 @@ fn steps() -> Splats {
         exposures: None,
         trains_exposures: false,
         trains_poses: false,
+        sensors: None,
         recipe: &recipe,
         source: &photos,
         picture_loss: None,

@@ -10,6 +10,7 @@ use crate::exposure::ExposureTraining;
 use crate::growth::DensificationStats;
 use crate::optimiser::Adam;
 use crate::pose::PoseTraining;
+use crate::pose::sensors::{NUMBERS, SensorTraining};
 
 /// A checkpoint. The header is [`Header`]. The bulk holds, little endian:
 /// - all columns of the splats, of the first and of the second Adam moments (f32);
@@ -17,7 +18,7 @@ use crate::pose::PoseTraining;
 /// - per trained exposure: view, steps (u32), then value, first and second moment (twelve f32 each);
 /// - per trained pose: view, steps (u32), then displacement, first and second moment (six f32 each);
 /// - all attributes of the splats (u32).
-const CHECKPOINT: Kind = Kind(*b"ckpt", 6);
+const CHECKPOINT: Kind = Kind(*b"ckpt", 7);
 
 /// Everything that a training step depends on besides its job.
 #[derive(Debug, Clone)]
@@ -55,6 +56,8 @@ struct Header {
     exposure_count: Option<u64>,
     /// Number of poses, where they are trained.
     pose_count: Option<u64>,
+    /// Number of sensors, where their errors are trained with the poses.
+    sensor_count: Option<u64>,
     /// Names of the splats' attributes.
     attributes: Vec<String>,
 }
@@ -63,11 +66,17 @@ struct Header {
 const EXPOSURE_WORDS: usize = 2 + 3 * 12;
 /// 32-bit words of a pose in a checkpoint.
 const POSE_WORDS: usize = 2 + 3 * 6;
+/// 32-bit words of a sensor in a checkpoint.
+const SENSOR_WORDS: usize = 1 + 3 * NUMBERS;
 
 impl State {
     /// Steps done.
     pub fn step(&self) -> u32 {
         self.step
+    }
+
+    fn sensors(&self) -> Option<&SensorTraining> {
+        self.poses.as_ref()?.sensors.as_ref()
     }
 
     /// Encodes a checkpoint.
@@ -84,6 +93,7 @@ impl State {
             stats_count: self.densification.error.len() as u64,
             exposure_count: self.exposures.as_ref().map(|exposures| exposures.views.len() as u64),
             pose_count: self.poses.as_ref().map(|poses| poses.views.len() as u64),
+            sensor_count: self.sensors().map(|sensors| sensors.steps.len() as u64),
             attributes: self.splats.attribute_names(),
         };
         let columns = self.splats.columns().iter().chain(first).chain(second);
@@ -92,8 +102,11 @@ impl State {
         if let Some(ExposureTraining { views, steps, values }) = &self.exposures {
             write_rows(&mut bulk, views, steps, values);
         }
-        if let Some(PoseTraining { views, steps, values }) = &self.poses {
+        if let Some(PoseTraining { views, steps, values, .. }) = &self.poses {
             write_rows(&mut bulk, views, steps, values);
+        }
+        if let Some(SensorTraining { steps, values }) = self.sensors() {
+            write_rows(&mut bulk, &[], steps, values);
         }
         let attributes = self.splats.attributes().iter().flat_map(|attribute| &attribute.values);
         bulk.extend(attributes.flat_map(|value| value.to_le_bytes()));
@@ -118,6 +131,8 @@ impl State {
         let words = words.and_then(|words| words.checked_add(exposed.checked_mul(EXPOSURE_WORDS as u64)?));
         let posed = header.pose_count.unwrap_or(0);
         let words = words.and_then(|words| words.checked_add(posed.checked_mul(POSE_WORDS as u64)?));
+        let sensed = header.sensor_count.unwrap_or(0);
+        let words = words.and_then(|words| words.checked_add(sensed.checked_mul(SENSOR_WORDS as u64)?));
         let attribute_words = (header.attributes.len() as u64).checked_mul(header.count);
         let words = words.and_then(|words| words.checked_add(attribute_words?));
         if words.and_then(|words| words.checked_mul(4)) != Some(bulk.len() as u64)
@@ -130,7 +145,8 @@ impl State {
         let (columns_bytes, rest) = bulk.split_at(4 * count * 3 * columns);
         let (stats_bytes, rest) = rest.split_at(4 * stats_count);
         let (exposure_bytes, rest) = rest.split_at(4 * EXPOSURE_WORDS * exposed as usize);
-        let (pose_bytes, attribute_bytes) = rest.split_at(4 * POSE_WORDS * posed as usize);
+        let (pose_bytes, rest) = rest.split_at(4 * POSE_WORDS * posed as usize);
+        let (sensor_bytes, attribute_bytes) = rest.split_at(4 * SENSOR_WORDS * sensed as usize);
         let mut all = columns_bytes.chunks_exact(4 * count).map(floats);
         let splats = Splats::from_columns(all.by_ref().take(columns).collect()).ok_or_else(wrong)?;
         let splats = frame::with_attributes(splats, &header.attributes, attribute_bytes)?;
@@ -142,7 +158,11 @@ impl State {
         };
         let poses = || {
             let (views, steps, values) = read_rows(pose_bytes, posed as usize);
-            PoseTraining { views, steps, values }
+            let sensors = header.sensor_count.map(|count| {
+                let (steps, values) = read_values(sensor_bytes, count as usize);
+                SensorTraining { steps, values }
+            });
+            PoseTraining { views, steps, values, sensors }
         };
         Ok(Self {
             step: header.step,
@@ -171,10 +191,16 @@ type Rows<const N: usize> = (Vec<u32>, Vec<u32>, [Vec<[f32; N]>; 3]);
 /// The inverse of [`write_rows`], for so many views. `chunks_exact` gives rows of N numbers only.
 fn read_rows<const N: usize>(bytes: &[u8], count: usize) -> Rows<N> {
     let (views, rest) = bytes.split_at(4 * count);
-    let (steps, rest) = rest.split_at(4 * count);
+    let (steps, values) = read_values(rest, count);
+    (integers(views), steps, values)
+}
+
+/// Adam steps, and rows of values and moments, of so many.
+fn read_values<const N: usize>(bytes: &[u8], count: usize) -> (Vec<u32>, [Vec<[f32; N]>; 3]) {
+    let (steps, rest) = bytes.split_at(4 * count);
     let rows: Vec<[f32; N]> = floats(rest).chunks_exact(N).map(|row| row.try_into().expect("N numbers")).collect();
     let part = |n: usize| rows[n * count..(n + 1) * count].to_vec();
-    (integers(views), integers(steps), [part(0), part(1), part(2)])
+    (integers(steps), [part(0), part(1), part(2)])
 }
 
 /// Words of four bytes; `chunks_exact` gives no others.
@@ -223,6 +249,10 @@ mod tests {
                 views: vec![1, 3, 8],
                 steps: vec![7, 0, 2],
                 values: [1.0, 0.5, 0.25].map(|v| vec![[v; 6], [2.0 * v; 6], [3.0 * v; 6]]),
+                sensors: Some(SensorTraining {
+                    steps: vec![5, 9],
+                    values: [1.0, 0.5, 0.25].map(|v| vec![[v; NUMBERS], [4.0 * v; NUMBERS]]),
+                }),
             });
             let state = State {
                 step,
@@ -247,12 +277,14 @@ mod tests {
             assert!(State::from_frame(&[]).is_err());
         }
         // A header that announces more than the bulk holds.
-        for (count, exposure_count, pose_count) in [
-            (u64::MAX / 3, None, None),
-            (1, Some(u64::MAX / 38), None),
-            (1, Some(1), None),
-            (1, None, Some(u64::MAX / 20)),
-            (1, None, Some(1)),
+        for (count, exposure_count, pose_count, sensor_count) in [
+            (u64::MAX / 3, None, None, None),
+            (1, Some(u64::MAX / 38), None, None),
+            (1, Some(1), None, None),
+            (1, None, Some(u64::MAX / 20), None),
+            (1, None, Some(1), None),
+            (1, None, None, Some(u64::MAX / 22)),
+            (1, None, None, Some(1)),
         ] {
             let header = Header {
                 step: 1,
@@ -265,6 +297,7 @@ mod tests {
                 stats_count: 0,
                 exposure_count,
                 pose_count,
+                sensor_count,
                 attributes: Vec::new(),
             };
             assert!(State::from_frame(&frame::encode(CHECKPOINT, &header, &[0; 64])).is_err());

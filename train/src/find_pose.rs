@@ -16,7 +16,7 @@ use crate::device::step::{StatePart, Step, TrainDevice, ViewSample};
 use crate::error::TrainError;
 use crate::growth::DensificationStats;
 use crate::optimiser::Adam;
-use crate::pose::{GivenPoses, PoseRates, PoseTraining};
+use crate::pose::{GivenPoses, PoseRates, PoseTraining, Rates};
 use crate::recipe::Recipe;
 use crate::source::WindowSource;
 use crate::view::TrainView;
@@ -33,6 +33,7 @@ const LAST_RATE_PIXELS: f32 = 0.02;
 /// Finds poses of views against one model.
 pub struct PoseFinder<'a> {
     device: Box<dyn TrainDevice + 'a>,
+    given: Arc<GivenPoses>,
     state: State,
     antialiased: bool,
     source: &'a dyn WindowSource,
@@ -49,7 +50,7 @@ impl<'a> PoseFinder<'a> {
         views: &[TrainView],
         source: &'a dyn WindowSource,
     ) -> Result<Self, TrainError> {
-        let given = Arc::new(GivenPoses::of(views, splats, false));
+        let given = Arc::new(GivenPoses::of(views, splats, false, None));
         let isa = Isa::detect();
         let state = State {
             step: 0,
@@ -65,7 +66,7 @@ impl<'a> PoseFinder<'a> {
             loss: f64::NAN,
         };
         let device = Backend::Cpu.open(&state, Recipe::default().lambda, None, None, &given)?;
-        Ok(Self { device, state, antialiased, source })
+        Ok(Self { device, given, state, antialiased, source })
     }
 
     /// The pose that brings the render of a view closest to its photo, starting from the view's own.
@@ -110,8 +111,8 @@ impl<'a> PoseFinder<'a> {
                     picture_weight: 0.0,
                     exposure_rate: 0.0,
                     pose_rates: Some(PoseRates {
-                        rate: FIRST_RATE * (last_rate / FIRST_RATE).powf(progress),
-                        decay: 0.0,
+                        views: Some(Rates { rate: FIRST_RATE * (last_rate / FIRST_RATE).powf(progress), decay: 0.0 }),
+                        sensors: None,
                     }),
                 };
                 self.device.step(&mut self.state, step)?;
@@ -119,7 +120,7 @@ impl<'a> PoseFinder<'a> {
             }
         }
         self.device.download(&mut self.state, StatePart::Tally)?;
-        let poses = self.state.poses.as_ref().map(|poses| poses.apply(view.view, &view.camera));
+        let poses = self.state.poses.as_ref().map(|poses| poses.apply(&self.given, view.view, &view.camera));
         Ok(poses.unwrap_or(view.camera).camera_from_world)
     }
 }

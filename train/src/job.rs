@@ -1,6 +1,7 @@
 //! The description of a training job: splats, views, limits and recipe.
 
 use glam::Vec3;
+use scene::sensors::Taken;
 use scene::{Exposures, Splats};
 
 use crate::device::Backend;
@@ -40,6 +41,8 @@ pub struct Job<'a> {
     pub trains_exposures: bool,
     /// Refines the poses of the views' cameras, which are the start.
     pub trains_poses: bool,
+    /// The sensor of each view of the capture, whose mounts and clocks are refined; `None`: they are not.
+    pub sensors: Option<&'a [Taken]>,
     /// Hyperparameters.
     pub recipe: &'a Recipe,
     /// Photos.

@@ -14,9 +14,15 @@
 //! As exposures, poses are trained once, in the block that covers the whole scene, and stay fixed in all others.
 
 use glam::{DMat3, DQuat, DVec3};
-use scene::{Camera, Poses, Rigid, Splats};
+use scene::poses::{Poses, RefinedCamera};
+use scene::sensors::Taken;
+use scene::{Camera, Rigid, Splats};
+
+use self::sensors::{GivenSensors, SensorTraining};
 
 use crate::view::TrainView;
+
+pub(crate) mod sensors;
 
 const BETA1: f32 = 0.9;
 /// Adam's usual 0.999 remembers longer than a view is drawn.
@@ -41,11 +47,13 @@ pub(crate) struct GivenPoses {
     pub(crate) offsets: Vec<DVec3>,
     /// Whether the seven freedoms are removed; not where the splats are frozen.
     pub(crate) is_anchored: bool,
+    /// What errors of sensors do, where those are refined.
+    pub(crate) sensors: Option<GivenSensors>,
 }
 
 impl GivenPoses {
     /// The cameras of these views. `splats` are those at the start of training.
-    pub(crate) fn of(views: &[TrainView], splats: &Splats, is_anchored: bool) -> Self {
+    pub(crate) fn of(views: &[TrainView], splats: &Splats, is_anchored: bool, taken: Option<&[Taken]>) -> Self {
         let mut windows: Vec<&TrainView> = views.iter().collect();
         windows.sort_by_key(|view| view.view);
         windows.dedup_by_key(|view| view.view);
@@ -54,10 +62,13 @@ impl GivenPoses {
         let typical = median(&mut known).unwrap_or(1.0);
         let centres: Vec<DVec3> = windows.iter().map(|view| view.camera.centre()).collect();
         let mean = centres.iter().sum::<DVec3>() / centres.len().max(1) as f64;
+        let views: Vec<u32> = windows.iter().map(|view| view.view).collect();
+        let depths: Vec<f32> = depths.into_iter().map(|depth| depth.unwrap_or(typical)).collect();
         Self {
-            views: windows.iter().map(|view| view.view).collect(),
             poses: windows.iter().map(|view| view.camera.camera_from_world).collect(),
-            depths: depths.into_iter().map(|depth| depth.unwrap_or(typical)).collect(),
+            sensors: taken.map(|taken| GivenSensors::of(&views, &depths, taken)),
+            views,
+            depths,
             offsets: centres.into_iter().map(|centre| centre - mean).collect(),
             is_anchored,
         }
@@ -106,9 +117,18 @@ fn joined([translation, rotation]: [DVec3; 2]) -> [f32; 6] {
     [x, y, z, a, b, c].map(|value| value as f32)
 }
 
-/// Rates of one step.
+/// Rates of one step, of what is refined.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct PoseRates {
+    /// Of each camera by itself.
+    pub(crate) views: Option<Rates>,
+    /// Of all cameras of a sensor; the step of one photo is a share of it.
+    pub(crate) sensors: Option<Rates>,
+}
+
+/// Rates of one step.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Rates {
     /// Learning rate of rotations in radians; that of translations follows from the depth.
     pub(crate) rate: f32,
     /// Share of every displacement of a view in the step that is taken back.
@@ -125,42 +145,70 @@ pub(crate) struct PoseTraining {
     pub(crate) steps: Vec<u32>,
     /// Displacement, first and second moment of each view.
     pub(crate) values: [Vec<[f32; 6]>; 3],
+    /// Where errors of sensors are refined.
+    pub(crate) sensors: Option<SensorTraining>,
 }
 
 impl PoseTraining {
     /// No displacement of any view.
     pub(crate) fn new(given: &GivenPoses) -> Self {
         let zeros = || vec![[0.0; 6]; given.views.len()];
-        Self { views: given.views.clone(), steps: vec![0; given.views.len()], values: [zeros(), zeros(), zeros()] }
+        Self {
+            views: given.views.clone(),
+            steps: vec![0; given.views.len()],
+            values: [zeros(), zeros(), zeros()],
+            sensors: given.sensors.as_ref().map(SensorTraining::new),
+        }
     }
 
-    /// A view's camera, displaced.
-    pub(crate) fn apply(&self, view: u32, camera: &Camera) -> Camera {
-        let displacement = self.views.binary_search(&view).ok().and_then(|at| self.values[0].get(at));
-        displacement.map_or(*camera, |displacement| Camera {
-            camera_from_world: displaced(&camera.camera_from_world, displacement),
-            ..*camera
-        })
+    /// A view's camera, refined.
+    pub(crate) fn apply(&self, given: &GivenPoses, view: u32, camera: &Camera) -> Camera {
+        let Ok(at) = self.views.binary_search(&view) else { return *camera };
+        let RefinedCamera { camera_from_world, focal_factor } = self.refined(given, at, &camera.camera_from_world);
+        Camera { camera_from_world, pinhole: camera.pinhole.with_focal_factor(focal_factor) }
+    }
+
+    /// The camera in a row, from its given pose.
+    fn refined(&self, given: &GivenPoses, at: usize, pose: &Rigid) -> RefinedCamera {
+        let [motion @ .., focal] = self.displacement(given, at);
+        RefinedCamera { camera_from_world: displaced(pose, &motion), focal_factor: f64::from(focal).exp() }
+    }
+
+    /// The displacement of the camera in a row: its own, and that by its sensor; and what ln(focal length) is greater by.
+    fn displacement(&self, given: &GivenPoses, at: usize) -> [f32; 7] {
+        let [x, y, z, a, b, c] = self.values[0][at];
+        let mut sum = [x, y, z, a, b, c, 0.0];
+        if let (Some(sensors), Some(given)) = (&self.sensors, &given.sensors) {
+            sum.iter_mut().zip(sensors.displacement(given, at)).for_each(|(sum, by_sensor)| *sum += by_sensor);
+        }
+        sum
     }
 
     /// The refined poses.
     pub(crate) fn poses(&self, given: &GivenPoses) -> Poses {
-        let rows = given.views.iter().zip(&given.poses).zip(&self.values[0]);
-        rows.map(|((&view, pose), displacement)| (view, displaced(pose, displacement))).collect()
+        let rows = given.views.iter().zip(&given.poses).enumerate();
+        let mut poses: Poses = rows.map(|(at, (&view, pose))| (view, self.refined(given, at, pose))).collect();
+        let sensors = self.sensors.as_ref().zip(given.sensors.as_ref());
+        poses.sensors = sensors.map_or(Vec::new(), |(sensors, given)| sensors.errors(given));
+        poses
     }
 
-    /// One Adam step on the displacement of one view, from the renderer's gradient of its pose ([`render::Gradients`]).
-    /// Then removes the common motion of all cameras.
-    pub(crate) fn step(&mut self, given: &GivenPoses, view: u32, gradient: &[f32; 6], rates: &PoseRates) {
+    /// One Adam step of what is refined, from the renderer's gradients of a view's pose and focal length
+    /// ([`render::Gradients`]). Then removes the common motion of all cameras, where they move by themselves.
+    pub(crate) fn step(&mut self, given: &GivenPoses, view: u32, gradient: &[f32; 7], rates: &PoseRates) {
         let (Ok(at), true) = (self.views.binary_search(&view), gradient.iter().all(|value| value.is_finite())) else {
             return;
         };
+        if let (Some(sensors), Some(given), Some(rates)) = (&mut self.sensors, &given.sensors, &rates.sensors) {
+            sensors.step(given, at, gradient, rates);
+        }
+        let Some(rates) = &rates.views else { return };
         let depth = given.depths.get(at).copied().unwrap_or(1.0);
         self.steps[at] = self.steps[at].saturating_add(1);
         let age = self.steps[at].min(1 << 20) as i32;
         let ages = [1.0 - BETA1.powi(age), 1.0 - BETA2.powi(age)];
         let [values, first, second] = &mut self.values;
-        for (k, gradient) in gradient.iter().enumerate() {
+        for (k, gradient) in gradient[..6].iter().enumerate() {
             let rate = if k < 3 { TRANSLATION_RATE * rates.rate * depth } else { rates.rate };
             let (m, v) = (&mut first[at][k], &mut second[at][k]);
             *m = BETA1 * *m - (1.0 - BETA1) * gradient;
@@ -249,7 +297,7 @@ mod tests {
 
     #[test]
     fn a_common_motion_of_all_cameras_is_removed_and_nothing_else() {
-        let given = GivenPoses::of(&views(9), &Splats::new(0), true);
+        let given = GivenPoses::of(&views(9), &Splats::new(0), true, None);
         assert_eq!(given.views, (0..9).map(|view| 2 * view).collect::<Vec<u32>>());
         let axes: Vec<DMat3> = given.poses.iter().map(|pose| DMat3::from_quat(pose.rotation)).collect();
         let own = |of: &dyn Fn(usize) -> [DVec3; 2]| -> Vec<[f32; 6]> {
@@ -272,14 +320,14 @@ mod tests {
 
     #[test]
     fn gradients_that_are_not_finite_or_of_unknown_views_change_nothing() {
-        let given = GivenPoses::of(&views(3), &Splats::new(0), true);
+        let given = GivenPoses::of(&views(3), &Splats::new(0), true, None);
         let mut training = PoseTraining::new(&given);
         let before = training.clone();
-        let rates = PoseRates { rate: 0.1, decay: 0.0 };
-        training.step(&given, 2, &[f32::NAN, 0.0, 0.0, 0.0, 0.0, 0.0], &rates);
-        training.step(&given, 3, &[1.0; 6], &rates);
+        let rates = PoseRates { views: Some(Rates { rate: 0.1, decay: 0.0 }), sensors: None };
+        training.step(&given, 2, &[f32::NAN, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0], &rates);
+        training.step(&given, 3, &[1.0; 7], &rates);
         assert_eq!(training, before);
-        training.step(&given, 2, &[1.0; 6], &rates);
+        training.step(&given, 2, &[1.0; 7], &rates);
         assert_ne!(training, before);
     }
 }

@@ -311,7 +311,7 @@ impl<'a> Pruner<'a> {
         let splats = mem::replace(&mut job.initial, Splats::new(0));
         let pruning = pruning.fitted(job.steps);
         job.steps = pruning.round_steps(job.steps);
-        (job.trains_exposures, job.trains_poses) = (false, false);
+        (job.trains_exposures, job.trains_poses, job.sensors) = (false, false, None);
         let Job { views, context, antialiased, exposures, source, .. } = job;
         let all = EvaluationViews { views, context, antialiased, exposures, source };
         let [judging, healing] = apart(views);

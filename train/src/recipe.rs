@@ -76,6 +76,12 @@ pub struct Recipe {
     /// Weight decay of poses: the share of a displacement that all steps together take back where no gradient holds it.
     #[serde(default)]
     pub pose_decay: f32,
+    /// As `pose`, of the mounts and clocks of sensors.
+    #[serde(default)]
+    pub sensor: [f32; 2],
+    /// As `pose_decay`, of mounts and clocks.
+    #[serde(default)]
+    pub sensor_decay: f32,
 }
 
 impl Default for Recipe {
@@ -106,6 +112,8 @@ impl Default for Recipe {
             pose: [0.1, 0.004],
             pose_from: 0.05,
             pose_decay: 0.1,
+            sensor: [0.4, 0.01],
+            sensor_decay: 0.1,
         }
     }
 }
@@ -144,6 +152,7 @@ impl Recipe {
             sh_dc: scaled(self.sh_dc),
             exposure: scaled(self.exposure),
             pose: scaled(self.pose),
+            sensor: scaled(self.sensor),
             ..self
         }
     }

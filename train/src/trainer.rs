@@ -20,7 +20,7 @@ use crate::exposure::ExposureTraining;
 use crate::growth::{self, DensificationStats};
 use crate::job::{Flow, Job};
 use crate::optimiser::{Adam, LearningRates};
-use crate::pose::{GivenPoses, PoseRates, PoseTraining};
+use crate::pose::{GivenPoses, PoseRates, PoseTraining, Rates};
 use crate::random;
 use crate::recipe::Recipe;
 use crate::size_limit::SizeLimit;
@@ -157,8 +157,9 @@ impl<'a> Trainer<'a> {
     fn new(mut job: Job<'a>, from: Option<State>) -> Result<Self, TrainError> {
         let Job { context, views, counts, steps, recipe, .. } = job;
         let initial = std::mem::replace(&mut job.initial, Splats::new(0));
-        let posed = if job.trains_poses { views } else { &[] };
-        let given = Arc::new(GivenPoses::of(posed, &initial, true));
+        let refines = job.trains_poses || job.sensors.is_some();
+        let posed = if refines { views } else { &[] };
+        let given = Arc::new(GivenPoses::of(posed, &initial, true, job.sensors));
         let state = from.unwrap_or_else(|| State {
             step: 0,
             skipped: 0,
@@ -167,7 +168,7 @@ impl<'a> Trainer<'a> {
             adam: Adam::new(Isa::detect(), &initial),
             densification: DensificationStats::default(),
             exposures: job.trains_exposures.then(|| ExposureTraining::new(views)),
-            poses: job.trains_poses.then(|| PoseTraining::new(&given)),
+            poses: refines.then(|| PoseTraining::new(&given)),
             splats: initial,
             loss: f64::NAN,
         });
@@ -236,9 +237,15 @@ impl<'a> Trainer<'a> {
             silhouette_weight,
             picture_weight: if is_due { recipe.picture_weight } else { 0.0 },
             exposure_rate: geometric(recipe.exposure, progress) / visits,
-            pose_rates: (self.job.trains_poses && progress >= recipe.pose_from).then(|| PoseRates {
-                rate: geometric(recipe.pose, progress) / visits,
-                decay: recipe.pose_decay / visits,
+            pose_rates: (progress >= recipe.pose_from).then(|| PoseRates {
+                views: self.job.trains_poses.then(|| Rates {
+                    rate: geometric(recipe.pose, progress) / visits,
+                    decay: recipe.pose_decay / visits,
+                }),
+                sensors: self.job.sensors.map(|_| Rates {
+                    rate: geometric(recipe.sensor, progress) / visits,
+                    decay: recipe.sensor_decay / visits,
+                }),
             }),
         };
         self.device.step(&mut self.state, inputs)?;

@@ -4,6 +4,7 @@ mod common;
 
 use common::*;
 use glam::{DQuat, DVec3};
+use scene::sensors::{Motion, Taken};
 use scene::{Camera, Exposure, Exposures, Pixels, Rigid, Splats};
 use train::{Backend, Flow, State, TrainView, metrics, random};
 
@@ -166,10 +167,63 @@ fn disturbed_poses_are_refined_with_the_splats() {
     }
 }
 
+/// Two sensors, whose photos are the even and the odd views, and how they move.
+fn rig() -> Vec<Taken> {
+    let motion = |view: u64| {
+        let velocity = DVec3::new(1.0, f64::from(random::uniform(62, view)) - 0.5, 0.2);
+        Some(Motion { velocity, spin: DVec3::ZERO })
+    };
+    (0..12).map(|view| Taken { sensor: view as u32 % 2, motion: motion(view) }).collect()
+}
+
+/// The views as a rig with errors has them: the clock of the odd ones is off by 0.15 s, the even ones are turned by 1.1°, and
+/// their focal length is 3 % too small.
+fn of_wrong_sensors(views: &[TrainView], rig: &[Taken]) -> Vec<TrainView> {
+    let wrong = |view: &TrainView| {
+        let taken = &rig[view.view as usize];
+        let (mut camera, odd) = (view.camera, taken.sensor == 1);
+        let error = match taken.motion {
+            Some(motion) if odd => Rigid { rotation: DQuat::IDENTITY, translation: -0.15 * motion.velocity },
+            _ => Rigid { rotation: DQuat::from_rotation_x(-0.02), translation: DVec3::ZERO },
+        };
+        camera.camera_from_world = error.inverse().after(&camera.camera_from_world);
+        camera.pinhole = camera.pinhole.with_focal_factor(if odd { 1.0 } else { 0.97 });
+        TrainView { camera, ..*view }
+    };
+    views.iter().map(wrong).collect()
+}
+
+#[test]
+fn errors_of_sensors_are_found_with_the_splats() {
+    let ground_truth = cloud(15, 200, 0.8);
+    let (photos, truth, rig) = (photos(&ground_truth), views(), rig());
+    let given = of_wrong_sensors(&truth, &rig);
+    for backend in backends() {
+        let setup = Setup {
+            sensors: Some(&rig),
+            steps: 1200,
+            views: given.clone(),
+            backend: backend.clone(),
+            ..Setup::new(perturbed(&ground_truth), &photos)
+        };
+        let poses = setup.try_run_on(None, &|_| true, &mut |_| Flow::Continue).unwrap().poses.unwrap();
+        let refined: Vec<TrainView> =
+            given.iter().map(|view| TrainView { camera: poses.apply(view.view, view.camera), ..*view }).collect();
+        let [before, after] = [&given, &refined].map(|views| pixel_error(views, &truth));
+        println!("{}: {before:.2} pixels off before, {after:.2} after; {:?}", backend.name(), poses.sensors);
+        let [even, odd] = &poses.sensors[..] else { panic!("{:?}", poses.sensors) };
+        assert!(before > 0.7 && after < 0.5 * before, "{before} {after}");
+        assert!(
+            (odd.clock_seconds - 0.15).abs() < 0.06
+                && (even.focal_factor / odd.focal_factor - 1.0 / 0.97).abs() < 0.012
+        );
+    }
+}
+
 #[test]
 fn poses_do_not_depend_on_threads_or_interruptions() {
     let ground_truth = cloud(14, 120, 0.8);
-    let photos = photos(&ground_truth);
+    let (photos, rig) = (photos(&ground_truth), rig());
     let run = |backend: &Backend, threads: usize, from: Option<State>, until: u32| {
         let mut left = None;
         let mut report = |mut now: train::Progress| {
@@ -179,6 +233,7 @@ fn poses_do_not_depend_on_threads_or_interruptions() {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
         let setup = Setup {
             trains_poses: true,
+            sensors: Some(&rig),
             steps: 120,
             backend: backend.clone(),
             views: disturbed(&views()),

@@ -116,6 +116,7 @@ fn with_job<R>(
         exposures: None,
         trains_exposures: false,
         trains_poses: false,
+        sensors: None,
         recipe: &recipe,
         source: photos,
         picture_loss: None,

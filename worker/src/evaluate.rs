@@ -38,7 +38,8 @@ pub(crate) fn evaluate(
     let Evaluation { plan, task, model, objects, reader, backend } = evaluation;
     let options =
         Options { antialiased: plan.settings.antialiased, sh_degree: model.sh_degree(), ..Options::default() };
-    let fits = Fits { pose: plan.settings.refine_poses, exposure: plan.settings.exposure };
+    let fits =
+        Fits { pose: plan.settings.refine_poses || plan.settings.refine_sensors, exposure: plan.settings.exposure };
     let steps = task.views.len() as u64;
     let mut overrun = None;
     let goes_on = |done: usize| {

@@ -89,6 +89,7 @@ impl ObjectTraining<'_> {
             exposures: self.exposures,
             trains_exposures: false,
             trains_poses: false,
+            sensors: None,
             recipe: &recipe,
             source: &silhouettes,
             picture_loss: None,

@@ -138,6 +138,7 @@ impl OneBlockTraining<'_> {
             exposures: None,
             trains_exposures: false,
             trains_poses: false,
+            sensors: None,
             recipe: &recipe,
             source: &reader,
             picture_loss: None,

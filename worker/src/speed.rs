@@ -56,6 +56,7 @@ fn step_seconds() -> f64 {
         exposures: None,
         trains_exposures: false,
         trains_poses: false,
+        sensors: None,
         recipe: &recipe,
         source: &Photo,
         picture_loss: None,

@@ -65,6 +65,8 @@ impl Block<'_> {
         let keeps = |p: Vec3| self.trains(&cut, p.as_dvec3());
         let free_space = self.free_space(&views);
         let size_bounds_metres = self.size_bounds_metres(&views);
+        let refines_sensors = plan.settings.refine_sensors && task.parent.is_none();
+        let sensors = refines_sensors.then(|| scene::sensors::sensors(&self.capture.views));
         let job_of = |initial, steps, views| Job {
             initial,
             context: context.as_ref(),
@@ -80,6 +82,7 @@ impl Block<'_> {
             exposures: self.given_exposures,
             trains_exposures: plan.settings.exposure && task.parent.is_none(),
             trains_poses: plan.settings.refine_poses && task.parent.is_none(),
+            sensors: sensors.as_ref().map(|sensors| &sensors.of_views[..]),
             recipe: &recipe,
             source: self.reader,
             picture_loss: self.aligned.map(|aligned| aligned as &dyn PictureLoss),

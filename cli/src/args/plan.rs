@@ -86,6 +86,10 @@ pub(crate) struct PlanOptions {
     /// with errors of some pixels; not with --blocks flat. The refined cameras go to OUT/cameras.json
     #[arg(long)]
     pub(crate) refine_poses: bool,
+    /// Refine the mount and the clock of each sensor with the splats: errors that all its photos share. For rigs of which the clocks
+    /// differ or the calibration is wrong; not with --blocks flat. The refined cameras go to OUT/cameras.json
+    #[arg(long)]
+    pub(crate) refine_sensors: bool,
     /// Also model what moves: each object that the capture has a box and a path for gets splats of its own, in tasks of the job, which
     /// go to OUT/objects. Its pixels are left out of the static scene, and `plat render` draws it where it is at a time; not with
     /// --blocks flat
@@ -167,6 +171,7 @@ impl PlanOptions {
             antialiased: self.antialiased,
             exposure: self.exposure,
             refine_poses: self.refine_poses,
+            refine_sensors: self.refine_sensors,
             objects: self.objects,
             label_blocks: self.label_blocks,
             depth_weight: self.depth_weight,

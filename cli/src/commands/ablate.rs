@@ -136,6 +136,7 @@ fn plan_options(args: &AblateArgs, seed: u64) -> PlanOptions {
         antialiased: false,
         exposure: false,
         refine_poses: false,
+        refine_sensors: false,
         objects: false,
         label_blocks: false,
         depth_weight: 0.0,

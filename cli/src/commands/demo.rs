@@ -142,6 +142,7 @@ pub(crate) fn settings(args: &DemoArgs) -> (Settings, TrainArgs) {
             antialiased: false,
             exposure: false,
             refine_poses: false,
+            refine_sensors: false,
             objects: false,
             label_blocks: false,
             depth_weight: 0.0,

@@ -374,7 +374,7 @@ impl Renderer {
             }
         }
         let (isa, seen, sums, rank) = (self.isa, &self.seen, &self.sums, &self.rank);
-        let poses: Vec<[f32; 6]> = (chunks.par_iter_mut().enumerate().with_max_len(1))
+        let cameras: Vec<[f32; 7]> = (chunks.par_iter_mut().enumerate().with_max_len(1))
             .map(|(n_chunk, chunk)| {
                 let first = n_chunk * CHUNK;
                 let rank = &rank[first..(first + CHUNK).min(n)];
@@ -382,11 +382,10 @@ impl Renderer {
                 project_backward::project_backward(isa, splats, first, view, options, seen, rank, sums, chunk)
             })
             .collect();
-        out.pose = [0.0; 6];
-        for pose in poses {
-            for (total, part) in out.pose.iter_mut().zip(pose) {
-                *total += part;
-            }
+        (out.pose, out.focal) = ([0.0; 6], 0.0);
+        for [pose @ .., focal] in cameras {
+            out.pose.iter_mut().zip(pose).for_each(|(total, part)| *total += part);
+            out.focal += focal;
         }
     }
 }

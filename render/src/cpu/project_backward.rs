@@ -22,11 +22,11 @@ pub(crate) struct GradientChunk<'a> {
 
 kernel!(
     /// Gradients of splats `first ..` from their moments `sums`, which are in depth order (`rank`). Returns the chunk's
-    /// part of the pose gradient, (ρ, ω).
+    /// part of the gradients of the pose, (ρ, ω), and of the focal length.
     pub(crate) fn project_backward(
         splats: &Splats, first: usize, view: &View, options: &Options, seen: &[u16], rank: &[u32], sums: &[Moments],
         out: &mut GradientChunk,
-    ) -> [f32; 6] = project_backward_lanes
+    ) -> [f32; 7] = project_backward_lanes
 );
 
 #[inline(always)]
@@ -39,8 +39,8 @@ fn project_backward_lanes<L: Lanes>(
     rank: &[u32],
     sums: &[Moments],
     out: &mut GradientChunk,
-) -> [f32; 6] {
-    let mut pose = [L::zero(); 16];
+) -> [f32; 7] {
+    let mut camera = [L::zero(); 16];
     for (group, (ranks, &seen)) in rank.chunks(LANES).zip(seen).enumerate() {
         let at = group * LANES;
         // The rank of an invisible splat is undefined, hence `get`.
@@ -57,9 +57,9 @@ fn project_backward_lanes<L: Lanes>(
             }
             continue;
         }
-        backward_group::<L>(splats, first + at, at, view, options, seen, ranks, sums, out, &mut pose);
+        backward_group::<L>(splats, first + at, at, view, options, seen, ranks, sums, out, &mut camera);
     }
-    L::sums(&pose).to_array()[..6].try_into().expect("the first six lanes")
+    L::sums(&camera).to_array()[..7].try_into().expect("the first seven lanes")
 }
 
 #[inline(always)]
@@ -73,7 +73,7 @@ fn backward_group<L: Lanes>(
     ranks: &[u32],
     sums: &[Moments],
     out: &mut GradientChunk,
-    pose: &mut [L; 16],
+    camera: &mut [L; 16],
 ) {
     let (half, one, two) = (L::splat(0.5), L::splat(1.0), L::splat(2.0));
     let mut lanes = [[0.0; 16]; 16];
@@ -158,12 +158,16 @@ fn backward_group<L: Lanes>(
     let rows = unroll!(r in [0, 1, 2] => unroll!(c in [0, 1, 2] => L::splat(view.rotation[r][c])));
     let d_depth = if options.inverse_depth { -(s[moment::Z] * inv_z * inv_z) } else { s[moment::Z] };
     let mut d_p = [L::zero(), L::zero(), d_depth];
+    // Of ln(focal length): the projected centre and J are proportional to it, but for a clamped ratio, which is inversely so.
+    let mut d_focal = L::zero();
     for r in 0..2 {
         let f_z = L::splat(view.focal[r]) * inv_z;
         let d_j0 = dot(d_t[r], rows[r]);
         let d_j2 = dot(d_t[r], rows[2]);
         let d_ratio = L::select(unclamped[r], -(f_z * d_j2), L::zero());
         d_p[2] = d_p[2] + f_z * inv_z * (u[r] * d_j2 - d_j0);
+        d_focal = d_focal + f_z * (d_j0 - L::select(unclamped[r], u[r] * d_j2, L::zero()));
+        d_focal = d_focal + f_z * d_mean[r] * p[r];
         // Gradient of the ratio p_r / z: of the centre and, unless clamped, of the Jacobian.
         let d_ratio = d_ratio + L::splat(view.focal[r]) * d_mean[r];
         d_p[r] = d_ratio * inv_z;
@@ -213,8 +217,8 @@ fn backward_group<L: Lanes>(
     // W.
     let turn = cross(p, d_p);
     for r in 0..3 {
-        pose[r] = pose[r] + L::select(seen, d_p[r] + dot(rows[r], d_direction), L::zero());
-        pose[3 + r] = pose[3 + r] + L::select(seen, turn[r], L::zero());
+        camera[r] = camera[r] + L::select(seen, d_p[r] + dot(rows[r], d_direction), L::zero());
+        camera[3 + r] = camera[3 + r] + L::select(seen, turn[r], L::zero());
     }
     for c in 0..3 {
         let column = [rows[0][c], rows[1][c], rows[2][c]];
@@ -223,9 +227,10 @@ fn backward_group<L: Lanes>(
         let d_column = [j[0], j[1], -(u[0] * j[0] + u[1] * j[1])];
         let turn = cross(column, d_column);
         for r in 0..3 {
-            pose[3 + r] = pose[3 + r] + L::select(seen, turn[r], L::zero());
+            camera[3 + r] = camera[3 + r] + L::select(seen, turn[r], L::zero());
         }
     }
+    camera[6] = camera[6] + L::select(seen, d_focal, L::zero());
 }
 
 trait Keep: Lanes {

@@ -124,8 +124,8 @@ impl GpuRenderer {
     }
 
     /// Waits for all submitted work and reads the gradients in the CPU backend's form, summed over the views; zero
-    /// where no view sees a splat. The pose gradient is zero; see
-    /// [`pose_gradients`](Self::pose_gradients).
+    /// where no view sees a splat. The gradients of the camera are zero;
+    /// see [`pose_gradients`](Self::pose_gradients).
     ///
     /// # Errors
     /// Any error of the submitted work, or no forward pass before.
@@ -149,6 +149,6 @@ impl GpuRenderer {
             unseen.for_each(|(_, value)| *value = 0.0);
         }
         let [screen_gradient, screen_gradient_abs, weight] = sums;
-        Ok(Gradients { columns, seen, screen_gradient, screen_gradient_abs, weight, pose: [0.0; 6] })
+        Ok(Gradients { columns, seen, screen_gradient, screen_gradient_abs, weight, pose: [0.0; 6], focal: 0.0 })
     }
 }

@@ -24,10 +24,11 @@ pub struct UpstreamPlanes {
     pub depth: bool,
 }
 
-/// Rigid motions of the cameras of a forward pass, on the device.
+/// Rigid motions and focal lengths of the cameras of a forward pass, on the device.
 #[derive(Debug, Clone, Copy)]
 pub struct Displacements<'a> {
-    /// Rows of six floats: translation in metres and rotation vector in radians, in the camera's axes.
+    /// Rows of eight floats: translation in metres and rotation vector in radians, in the camera's axes; what ln(focal
+    /// length) is greater by; padding.
     pub rows: &'a wgpu::Buffer,
     /// Row of each camera; `None` leaves it where it is.
     pub of_camera: &'a [Option<u32>],
@@ -210,8 +211,8 @@ impl GpuRenderer {
         &self.statistics
     }
 
-    /// For each view of the last [`forward_displaced`](Self::forward_displaced) eight floats: the gradient of its pose as
-    /// in [`Gradients`](crate::Gradients), at the displaced camera, and padding. Zero for a view without a displacement.
+    /// For each view of the last [`forward_displaced`](Self::forward_displaced) eight floats: the gradients of its pose
+    /// and its focal length as in [`Gradients`](crate::Gradients), at the displaced camera, and padding. Zero for a view without a displacement.
     pub fn pose_gradients(&self) -> &wgpu::Buffer {
         &self.pose_gradients
     }

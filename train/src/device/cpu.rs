@@ -72,7 +72,7 @@ impl TrainDevice for CpuDevice<'_> {
         let (mut by_exposure, mut by_pose) = (Vec::new(), Vec::new());
         for sample in &samples {
             let &ViewSample { view, ref photo, ref camera, camera_from_context, exposure, .. } = sample;
-            let camera = state.poses.as_ref().map_or(*camera, |poses| poses.apply(view, camera));
+            let camera = state.poses.as_ref().map_or(*camera, |poses| poses.apply(&self.given, view, camera));
             let context = self.context.map(|splats| Part { splats, camera_from_part: camera_from_context });
             let frame = self.renderer.forward(&state.splats, context.as_slice(), &camera, &options);
             pixel_weights(frame, photo, self.context.is_some(), &mut self.weights);
@@ -112,7 +112,8 @@ impl TrainDevice for CpuDevice<'_> {
                 by_exposure.push((view, expose_backward(exposure, &frame.colour, &mut self.upstream.colour)));
             }
             let gradients = self.renderer.backward(&state.splats, &self.upstream);
-            by_pose.push((view, gradients.pose));
+            let [x, y, z, a, b, c] = gradients.pose;
+            by_pose.push((view, [x, y, z, a, b, c, gradients.focal]));
             if rates.is_some() {
                 state.densification.add(gradients, photo.area() as f32);
             }

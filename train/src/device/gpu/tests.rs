@@ -2,6 +2,7 @@
 
 use glam::{DQuat, DVec3, Vec3};
 use render::{Options, Upstream};
+use scene::sensors::{Motion, Taken};
 use scene::{Camera, Exposure, Pinhole, Pixels, Rect, Rigid, Splat};
 
 use super::*;
@@ -10,7 +11,8 @@ use crate::depth_loss::depth_loss;
 use crate::exposure::ExposureTraining;
 use crate::loss::PhotometricLoss;
 use crate::picture_loss::tests::Cubes;
-use crate::pose::{PoseRates, PoseTraining};
+use crate::pose::sensors::SensorTraining;
+use crate::pose::{PoseRates, PoseTraining, Rates};
 use crate::random::{bits, uniform};
 use crate::view::TrainView;
 
@@ -94,7 +96,7 @@ fn with_weights_and_depth(mut sample: ViewSample, key: u64) -> ViewSample {
 
 /// Poses of no view.
 fn none() -> Arc<GivenPoses> {
-    Arc::new(GivenPoses::of(&[], &Splats::new(0), true))
+    Arc::new(GivenPoses::of(&[], &Splats::new(0), true, None))
 }
 
 fn new_state(splats: Splats) -> State {
@@ -377,8 +379,8 @@ fn trained_exposures_agree_with_the_cpu() {
     assert_eq!((on_gpu.skipped, on_gpu.exposures), (1, before));
 }
 
-/// After each of three steps the poses in training, and their Adam state, are the CPU's but for rounding. The first step
-/// has displaced cameras already.
+/// After each of three steps the poses and the sensors in training, and their Adam state, are the CPU's but for rounding. The
+/// first step has displaced cameras already. View 3 has a sensor of too few photos.
 #[test]
 fn trained_poses_agree_with_the_cpu() {
     let Some(gpu) = gpu() else { return };
@@ -392,18 +394,34 @@ fn trained_poses_agree_with_the_cpu() {
     aside.view = 4;
     aside.camera.camera_from_world.rotation = DQuat::from_rotation_y(0.7);
     views.push(aside);
-    let given = Arc::new(GivenPoses::of(&views, &cpu.splats, true));
+    let motion = |view: u64| Motion {
+        velocity: DVec3::new(f64::from(uniform(54, view)), 0.3, 2.0),
+        spin: DVec3::new(0.0, f64::from(uniform(55, view)), 0.1),
+    };
+    let taken: Vec<Taken> =
+        (0..10).map(|view| Taken { sensor: u32::from(view == 3), motion: (view != 2).then(|| motion(view)) }).collect();
+    let given = Arc::new(GivenPoses::of(&views, &cpu.splats, true, Some(&taken)));
     let rows = |key: u64, size: f32| -> Vec<[f32; 6]> {
         let number = |view: &u32, k: u64| size * (uniform(key, 6 * u64::from(*view) + k) - 0.5);
         given.views.iter().map(|view| [0, 1, 2, 3, 4, 5].map(|k| number(view, k))).collect()
     };
     let second = rows(53, 1e-4).into_iter().map(|row| row.map(f32::abs)).collect();
     let values = [rows(51, 0.04), rows(52, 1e-2), second];
-    cpu.poses = Some(PoseTraining { views: given.views.clone(), steps: vec![7, 0, 1, 3, 2], values });
+    let sensors = SensorTraining {
+        steps: vec![4],
+        values: [
+            vec![[0.01, -0.02, 0.0, 0.004, 0.0, -0.003, 0.02, 0.01]],
+            vec![[1e-3, 0.0, 2e-3, 0.0, 0.0, 1e-3, 0.0, -1e-3]],
+            vec![[1e-5; 8]],
+        ],
+    };
+    let (views, steps) = (given.views.clone(), vec![7, 0, 1, 3, 2]);
+    cpu.poses = Some(PoseTraining { views, steps, values, sensors: Some(sensors) });
     let mut on_gpu = cpu.clone();
     let mut cpu_device = super::super::cpu::CpuDevice::new(0.2, None, None, &given);
     let mut device = GpuDevice::new(&gpu, &cpu, 0.2, None, None, &given).unwrap();
-    let pose_rates = Some(PoseRates { rate: 2e-3, decay: 0.01 });
+    let rates = Some(Rates { rate: 2e-3, decay: 0.01 });
+    let pose_rates = Some(PoseRates { views: rates, sensors: rates });
     for n in 0..3 {
         let samples: Vec<ViewSample> = samples_of_views().into_iter().skip(n).collect();
         let step = Step { samples, pose_rates, ..step(false, false, 1) };
@@ -415,6 +433,15 @@ fn trained_poses_agree_with_the_cpu() {
         assert_eq!((&found.views, &found.steps), (&expected.views, &expected.steps));
         let parts = found.values.iter().zip(&expected.values);
         let by_part: Vec<f32> = parts.map(|(a, b)| off(a.as_flattened(), b.as_flattened())).collect();
+        let [by_sensor, of_sensor] = [found, expected].map(|poses| poses.sensors.as_ref().unwrap());
+        assert_eq!(by_sensor.steps, of_sensor.steps);
+        let parts = by_sensor.values.iter().zip(&of_sensor.values);
+        let of_sensors: Vec<f32> = parts.map(|(a, b)| off(a.as_flattened(), b.as_flattened())).collect();
+        println!(
+            "step {n}: numbers of sensors {:.1e}, moments {:.1e}, {:.1e}",
+            of_sensors[0], of_sensors[1], of_sensors[2]
+        );
+        assert!(of_sensors[0] < 1e-4 && of_sensors[1] < 1e-4 && of_sensors[2] < 1e-4);
         let moved = off(before.values[0].as_flattened(), expected.values[0].as_flattened());
         let loss_off = (on_gpu.loss - cpu.loss).abs() / cpu.loss;
         println!(
