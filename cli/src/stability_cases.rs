@@ -71,6 +71,8 @@ const LIDAR: Counter = Counter::Options("lidar: initial points and depths");
 const LIDAR_TRAIN: [&str; 2] = ["--no-lidar", "--depth-weight 0.1"];
 const POSES: Counter = Counter::Options("poses refined");
 const POSES_TRAIN: [&str; 2] = ["", "--refine-poses"];
+const SENSORS: Counter = Counter::Options("sensors refined");
+const SENSORS_TRAIN: [&str; 2] = ["", "--refine-sensors"];
 
 /// A layout of streets, or a fault of light, that depths help with.
 const fn depths(name: &'static str, about: &'static str, synth: &'static str) -> Case {
@@ -81,6 +83,12 @@ const fn depths(name: &'static str, about: &'static str, synth: &'static str) ->
 /// A fault of cameras, measured with the true ones.
 const fn cameras(name: &'static str, about: &'static str, synth: &'static str) -> Case {
     let (counter, train, photos) = (POSES, POSES_TRAIN, MeasuredOn::Clean);
+    Case { name, about, synth, counter, train, eval: "", photos }
+}
+
+/// A fault that all photos of a sensor share, measured with the true cameras.
+const fn sensors(name: &'static str, about: &'static str, synth: &'static str) -> Case {
+    let (counter, train, photos) = (SENSORS, SENSORS_TRAIN, MeasuredOn::Clean);
     Case { name, about, synth, counter, train, eval: "", photos }
 }
 
@@ -120,8 +128,8 @@ pub(crate) const CASES: [Case; 22] = [
         photos: MeasuredOn::Clean,
     },
     cameras("pose-noise", "poses off by 5 cm and 0.2°", "--fault pose-noise=0.1"),
-    cameras("clock-skew", "cameras' clocks differ by 50 ms", "--fault clock-skew=0.5"),
-    cameras(
+    sensors("clock-skew", "cameras' clocks differ by 50 ms", "--fault clock-skew=0.5"),
+    sensors(
         "wrong-calibration",
         "focal lengths off by 0.5 %, mounts by 1 cm and 0.1°",
         "--fault wrong-calibration=0.25",

@@ -70,3 +70,50 @@ fn poses_come_from_the_root_and_do_not_change() {
 
     refused(at, &["train", "city", "--out", "flat", "--blocks", "flat", "--refine-poses"], "--refine-poses");
 }
+
+#[test]
+fn errors_of_sensors_are_written_and_do_not_depend_on_workers() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    let faults = vec![Fault { kind: FaultKind::ClockSkew, strength: 0.5, seed: 0 }];
+    let settings = Settings { faults, aerial: 0.2, ..common::small(48, 80, 60) };
+    synth::write(&at.join("city"), &settings, &|_, _, _| ()).unwrap();
+    train(at, "on", &["--levels", "1", "--refine-sensors", "--threads", "1"]);
+    train(at, "again", &["--levels", "1", "--refine-sensors", "--threads", "1", "--workers", "2"]);
+    let bytes = |path: &str| std::fs::read(at.join(path)).unwrap();
+    for file in ["merged.ply", "cameras.json", "sensors.json", "model/poses.plat"] {
+        let same = bytes(&format!("on/{file}")) == bytes(&format!("again/{file}"));
+        assert!(same, "{file} depends on the number of workers");
+    }
+
+    let sensors: Vec<Value> = serde_json::from_slice(&bytes("on/sensors.json")).unwrap();
+    let poses = Poses::from_frame(&bytes("on/model/poses.plat")).unwrap();
+    assert_eq!(sensors.len(), poses.sensors.len());
+    assert!(sensors.iter().any(|sensor| sensor["sensor"].as_str().unwrap().contains("street")), "{sensors:?}");
+    let moved = |sensor: &&Value| sensor["clock_seconds"].as_f64().unwrap().abs() > 1e-3;
+    assert!(sensors.iter().filter(moved).count() > sensors.len() / 2, "{sensors:?}");
+    // A focal length belongs to all photos of a sensor, in the cameras that other programs read as well.
+    let frames = |path: &str| -> Vec<Value> {
+        let Value::Array(frames) = serde_json::from_slice::<Value>(&bytes(path)).unwrap()["frames"].take() else {
+            panic!("{path}");
+        };
+        frames
+    };
+    let given = frames("city/transforms.json");
+    for camera in frames("on/cameras.json") {
+        let path = camera["file_path"].as_str().unwrap();
+        let before = given.iter().find(|frame| frame["file_path"].as_str().unwrap().ends_with(path)).unwrap();
+        let factor = camera["fl_x"].as_f64().unwrap() / before["fl_x"].as_f64().unwrap();
+        let of_sensor = |sensor: &&Value| {
+            path.contains(&format!("/{}-", sensor["sensor"].as_str().unwrap()))
+                || path.starts_with(&format!("{}-", sensor["sensor"].as_str().unwrap()))
+        };
+        let found = sensors.iter().find(of_sensor).map_or(1.0, |sensor| sensor["focal_factor"].as_f64().unwrap());
+        assert!((factor / found - 1.0).abs() < 1e-9, "{path}: {factor}, {found} in sensors.json");
+    }
+
+    // Pruning keeps what was found.
+    done(at, &["prune", "on", "--out", "pruned", "--keep", "0.5"]);
+    assert_eq!(bytes("on/sensors.json"), bytes("pruned/sensors.json"));
+    refused(at, &["train", "city", "--out", "flat", "--blocks", "flat", "--refine-sensors"], "--refine-sensors");
+}

@@ -76,12 +76,9 @@ pub struct Recipe {
     /// Weight decay of poses: the share of a displacement that all steps together take back where no gradient holds it.
     #[serde(default)]
     pub pose_decay: f32,
-    /// As `pose`, of the mounts and clocks of sensors.
+    /// As `pose`, of sensors: every photo of a sensor is a step of its numbers, so they may move further than one camera's.
     #[serde(default)]
     pub sensor: [f32; 2],
-    /// As `pose_decay`, of mounts and clocks.
-    #[serde(default)]
-    pub sensor_decay: f32,
 }
 
 impl Default for Recipe {
@@ -113,7 +110,6 @@ impl Default for Recipe {
             pose_from: 0.05,
             pose_decay: 0.1,
             sensor: [0.4, 0.01],
-            sensor_decay: 0.1,
         }
     }
 }

@@ -244,7 +244,7 @@ impl<'a> Trainer<'a> {
                 }),
                 sensors: self.job.sensors.map(|_| Rates {
                     rate: geometric(recipe.sensor, progress) / visits,
-                    decay: recipe.sensor_decay / visits,
+                    decay: recipe.pose_decay / visits,
                 }),
             }),
         };

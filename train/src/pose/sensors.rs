@@ -21,11 +21,6 @@ const CLOCK: usize = 7;
 const MIN_PHOTOS: usize = 3;
 /// Below this speed a clock cannot be told from a mount, metres per second.
 const MIN_SPEED: f32 = 0.1;
-/// Learning rate of a mount's translation, relative to that of a single camera: mounts are measured in millimetres, and on a
-/// straight road a clock explains the same.
-const MOUNT_RATE: f32 = 0.3;
-/// Learning rate of ln(focal length) relative to that of rotations: either moves a point at the picture's edge as far.
-const FOCAL_RATE: f32 = 1.0;
 
 /// What the numbers of sensors do to the cameras of a job.
 #[derive(Debug, Clone, PartialEq)]
@@ -67,9 +62,9 @@ impl GivenSensors {
                 speeds.retain(Option::is_some);
                 let mut speeds: Vec<f32> = speeds.into_iter().flatten().collect();
                 let speed = super::median(&mut speeds).unwrap_or(0.0);
-                let across = MOUNT_RATE * TRANSLATION_RATE * depth;
+                let across = TRANSLATION_RATE * depth;
                 let clock = if speed > MIN_SPEED { depth / speed } else { 0.0 };
-                let rates = [across, across, across, 1.0, 1.0, 1.0, FOCAL_RATE, clock];
+                let rates = [across, across, across, 1.0, 1.0, 1.0, 1.0, clock];
                 let share = 1.0 / photos.len() as f32;
                 GivenSensor { number: photos[0], share, rates: rates.map(|rate| share * rate) }
             })
