@@ -62,6 +62,9 @@ pub fn rewrite(path: &Path, out: &Path, model: Model, splats: Splats) -> Result<
         save(out, &bytes)?;
         return Ok(bytes.len() as u64);
     };
+    let Opened::Trained { folder: from, .. } = open(path)? else {
+        return Err(BadInput::new(path.display().to_string(), "is no folder any more", "train again").into());
+    };
     let Tree { plan, mut results, antialiased } = read_tree(path)?;
     let leaves = plan.leaves();
     for (&block, result) in &mut results {
@@ -80,6 +83,7 @@ pub fn rewrite(path: &Path, out: &Path, model: Model, splats: Splats) -> Result<
     blocks.sort_by_key(|b| (b.block.level, b.block.y, b.block.x));
     let splats = Tree { plan, results, antialiased }.merged(&leaves);
     let manifest = Manifest { splats: splats.len() as u64, blocks, ..manifest.clone() };
+    copy_cameras(outer(&from), out)?;
     finish(out, &folder, &manifest, &Model { splats, trained: None, ..model })
 }
 
@@ -96,12 +100,9 @@ pub fn replace_blocks(path: &Path, out: &Path, changed: &BTreeMap<BlockId, Splat
             return Err(BadInput::new(path.display().to_string(), "is one file, which has no blocks", advice).into());
         }
     };
-    let outer = from.parent().filter(|_| from.ends_with("model")).unwrap_or(&from);
+    let outer = outer(&from);
     let leaves = plan.leaves();
     let folder = begin(out, &plan)?;
-    let copy = |name: &Path, from: &Path, to: &Path| -> Result<(), ModelError> {
-        fs::copy(from.join(name), to.join(name)).map(|_| ()).map_err(cannot("copied", &from.join(name)))
-    };
     let (mut blocks, mut count, mut attributes) = (Vec::new(), 0, BTreeSet::new());
     for BlockEntry { block, artefact, .. } in manifest.blocks {
         let name = Path::new("blocks").join(block_file(block));
@@ -122,9 +123,7 @@ pub fn replace_blocks(path: &Path, out: &Path, changed: &BTreeMap<BlockId, Splat
     }
     let attributes: Vec<String> = attributes.into_iter().collect();
     let bytes = write_merged(out, &folder, &plan, count, &attributes)?;
-    for file in [CAMERAS_FILE, SENSORS_FILE].into_iter().filter(|file| outer.join(file).exists()) {
-        copy(Path::new(file), outer, out)?;
-    }
+    copy_cameras(outer, out)?;
     for (name, about) in [(EXPOSURES_FILE, manifest.exposures), (POSES_FILE, manifest.poses)] {
         if about.is_some() {
             copy(Path::new(name), &from, &folder)?;
@@ -143,6 +142,21 @@ pub fn replace_blocks(path: &Path, out: &Path, changed: &BTreeMap<BlockId, Splat
     let manifest = Manifest { splats: count as u64, blocks, ..manifest };
     save_json(&folder.join(MANIFEST_FILE), &manifest)?;
     Ok(bytes)
+}
+
+/// The folder of a job, given the one of its model.
+fn outer(folder: &Path) -> &Path {
+    folder.parent().filter(|_| folder.ends_with("model")).unwrap_or(folder)
+}
+
+/// Copies the refined cameras and what was found of sensors, where there are any.
+fn copy_cameras(from: &Path, to: &Path) -> Result<(), ModelError> {
+    let names = [CAMERAS_FILE, SENSORS_FILE].into_iter().filter(|name| from.join(name).exists());
+    names.map(Path::new).try_for_each(|name| copy(name, from, to))
+}
+
+fn copy(name: &Path, from: &Path, to: &Path) -> Result<(), ModelError> {
+    fs::copy(from.join(name), to.join(name)).map(|_| ()).map_err(cannot("copied", &from.join(name)))
 }
 
 /// Writes `merged.ply`, exposures, poses and at last the manifest; returns the bytes of `merged.ply`.

@@ -217,7 +217,7 @@ async fn a_job_looks_for_objects_before_it_trains() {
     (plan.detector, plan.detect_tasks) = (Some(ArtefactId([2; 32])), vec![detect(0), detect(2)]);
     let mut setup = setup_of(plan).await;
     let at = setup.address;
-    let job = until(at, "/api/snapshot", |all| all["jobs"][0]["id"] == 1).await["jobs"][0].clone();
+    let job = until(at, "/api/snapshot", |all| all["jobs"][0]["counts"]["ready"] == 2).await["jobs"][0].clone();
     assert_eq!((&job["phase"], &job["blocks"], &job["detections"]), (&"detect".into(), &1.into(), &2.into()));
     assert_eq!((&job["photos_done"], &job["photos_all"], &job["counts"]["ready"]), (&0.into(), &4.into(), &2.into()));
     assert_eq!(json(at, "/api/jobs/1/plan").await["detections"], 2);

@@ -18,20 +18,14 @@ use scene::poses::{Poses, RefinedCamera};
 use scene::sensors::Taken;
 use scene::{Camera, Rigid, Splats};
 
+pub(crate) use self::adam::{Rates, TRANSLATION_RATE};
+use self::adam::{joined, median};
 use self::sensors::{GivenSensors, SensorTraining};
-
 use crate::view::TrainView;
 
+mod adam;
 pub(crate) mod sensors;
 
-const BETA1: f32 = 0.9;
-/// Adam's usual 0.999 remembers longer than a view is drawn.
-const BETA2: f32 = 0.99;
-const EPSILON: f32 = 1e-15;
-/// Learning rate of translations in units of the depth, relative to that of rotations. Either explains nearly the same
-/// motion of an image, and the error of a measured translation is the smaller one seen from a distance. At 1 the
-/// translations of a city with errors of 0.15 m and 0.6° got twice as wrong; at 0.2 they stayed as they were.
-pub(crate) const TRANSLATION_RATE: f32 = 0.3;
 /// Splats whose depths a view's median is taken of.
 const SAMPLED_SPLATS: usize = 4096;
 
@@ -94,11 +88,6 @@ fn median_depth(view: &TrainView, splats: &Splats) -> Option<f32> {
     median(&mut depths)
 }
 
-fn median(values: &mut [f32]) -> Option<f32> {
-    let middle = values.len() / 2;
-    (!values.is_empty()).then(|| *values.select_nth_unstable_by(middle, f32::total_cmp).1)
-}
-
 /// A camera pose after a displacement in its own axes.
 pub(crate) fn displaced(camera_from_world: &Rigid, displacement: &[f32; 6]) -> Rigid {
     let [translation, rotation] = parts(displacement);
@@ -111,12 +100,6 @@ fn parts(displacement: &[f32; 6]) -> [DVec3; 2] {
     [DVec3::new(x, y, z), DVec3::new(a, b, c)]
 }
 
-/// The inverse of [`parts`].
-fn joined([translation, rotation]: [DVec3; 2]) -> [f32; 6] {
-    let ([x, y, z], [a, b, c]) = (translation.to_array(), rotation.to_array());
-    [x, y, z, a, b, c].map(|value| value as f32)
-}
-
 /// Rates of one step, of what is refined.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct PoseRates {
@@ -124,15 +107,6 @@ pub(crate) struct PoseRates {
     pub(crate) views: Option<Rates>,
     /// Of all cameras of a sensor; the step of one photo is a share of it.
     pub(crate) sensors: Option<Rates>,
-}
-
-/// Rates of one step.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct Rates {
-    /// Learning rate of rotations in radians; that of translations follows from the depth.
-    pub(crate) rate: f32,
-    /// Share of every displacement of a view in the step that is taken back.
-    pub(crate) decay: f32,
 }
 
 /// Displacements in training, each with its own Adam state. A view's step count is the number of times that it was
@@ -205,16 +179,12 @@ impl PoseTraining {
         let Some(rates) = &rates.views else { return };
         let depth = given.depths.get(at).copied().unwrap_or(1.0);
         self.steps[at] = self.steps[at].saturating_add(1);
-        let age = self.steps[at].min(1 << 20) as i32;
-        let ages = [1.0 - BETA1.powi(age), 1.0 - BETA2.powi(age)];
+        let bias = adam::bias(self.steps[at]);
         let [values, first, second] = &mut self.values;
         for (k, gradient) in gradient[..6].iter().enumerate() {
             let rate = if k < 3 { TRANSLATION_RATE * rates.rate * depth } else { rates.rate };
-            let (m, v) = (&mut first[at][k], &mut second[at][k]);
-            *m = BETA1 * *m - (1.0 - BETA1) * gradient;
-            *v = BETA2 * *v + (1.0 - BETA2) * gradient * gradient;
-            values[at][k] =
-                (1.0 - rates.decay) * values[at][k] - rate * (*m / ages[0]) / ((*v / ages[1]).sqrt() + EPSILON);
+            let step = adam::step([&mut first[at][k], &mut second[at][k]], -gradient, bias);
+            values[at][k] = (1.0 - rates.decay) * values[at][k] - rate * step;
         }
         if given.is_anchored {
             remove_common_motion(values, given);

@@ -86,8 +86,8 @@ pub(crate) struct PlanOptions {
     /// with errors of some pixels; not with --blocks flat. The refined cameras go to OUT/cameras.json
     #[arg(long)]
     pub(crate) refine_poses: bool,
-    /// Refine the mount and the clock of each sensor with the splats: errors that all its photos share. For rigs of which the clocks
-    /// differ or the calibration is wrong; not with --blocks flat. The refined cameras go to OUT/cameras.json
+    /// Refine the mount, the focal length and the clock of each sensor with the splats: errors that all its photos share. For rigs of
+    /// which the clocks differ or the calibration is wrong; not with --blocks flat. The refined cameras go to OUT/cameras.json
     #[arg(long)]
     pub(crate) refine_sensors: bool,
     /// Also model what moves: each object that the capture has a box and a path for gets splats of its own, in tasks of the job, which

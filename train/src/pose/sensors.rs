@@ -9,7 +9,7 @@ use glam::DVec3;
 use scene::poses::SensorError;
 use scene::sensors::{Motion, Taken};
 
-use super::{BETA1, BETA2, EPSILON, Rates, TRANSLATION_RATE};
+use super::adam::{self, Rates, TRANSLATION_RATE, joined, median};
 
 /// A rigid motion (metres, radians), what ln(focal length) is greater by, and the clock (seconds).
 pub(crate) const NUMBERS: usize = 8;
@@ -58,10 +58,10 @@ impl GivenSensors {
                 let (mut depths, mut speeds): (Vec<f32>, Vec<Option<f32>>) = rows
                     .map(|(taken, depth)| (depth, taken.motion.map(|motion| motion.velocity.length() as f32)))
                     .unzip();
-                let depth = super::median(&mut depths).unwrap_or(1.0);
+                let depth = median(&mut depths).unwrap_or(1.0);
                 speeds.retain(Option::is_some);
                 let mut speeds: Vec<f32> = speeds.into_iter().flatten().collect();
-                let speed = super::median(&mut speeds).unwrap_or(0.0);
+                let speed = median(&mut speeds).unwrap_or(0.0);
                 let across = TRANSLATION_RATE * depth;
                 let clock = if speed > MIN_SPEED { depth / speed } else { 0.0 };
                 let rates = [across, across, across, 1.0, 1.0, 1.0, 1.0, clock];
@@ -76,7 +76,7 @@ impl GivenSensors {
         let per_second = |view: &u32| {
             let still = Motion { velocity: DVec3::ZERO, spin: DVec3::ZERO };
             let Motion { velocity, spin } = of_view(view).and_then(|taken| taken.motion).unwrap_or(still);
-            super::joined([velocity, spin])
+            joined([velocity, spin])
         };
         Self { of_camera: views.iter().map(row).collect(), per_second: views.iter().map(per_second).collect(), sensors }
     }
@@ -113,8 +113,7 @@ impl SensorTraining {
         let row = row as usize;
         let GivenSensor { share, rates: of_numbers, .. } = given.sensors[row];
         self.steps[row] = self.steps[row].saturating_add(1);
-        let age = self.steps[row].min(1 << 20) as i32;
-        let ages = [1.0 - BETA1.powi(age), 1.0 - BETA2.powi(age)];
+        let bias = adam::bias(self.steps[row]);
         let of_clock: f32 = given.per_second[camera].iter().zip(gradient).map(|(motion, slope)| motion * slope).sum();
         let [values, first, second] = &mut self.values;
         for k in 0..NUMBERS {
@@ -124,11 +123,8 @@ impl SensorTraining {
                 CLOCK => -of_clock,
                 _ => -gradient[k],
             };
-            let (m, v) = (&mut first[row][k], &mut second[row][k]);
-            *m = BETA1 * *m + (1.0 - BETA1) * gradient;
-            *v = BETA2 * *v + (1.0 - BETA2) * gradient * gradient;
-            let step = rates.rate * of_numbers[k] * (*m / ages[0]) / ((*v / ages[1]).sqrt() + EPSILON);
-            values[row][k] = (1.0 - rates.decay * share) * values[row][k] - step;
+            let step = adam::step([&mut first[row][k], &mut second[row][k]], gradient, bias);
+            values[row][k] = (1.0 - rates.decay * share) * values[row][k] - rates.rate * of_numbers[k] * step;
         }
     }
 
