@@ -41,7 +41,7 @@ pub(crate) fn open_to_plan(path: &Path, options: &PlanOptions, output: &Output) 
         let advice = "give the weight of the depths' loss, such as --depth-weight 0.1";
         return Err(BadInput::new(name, "has no effect without --depth-weight", advice));
     }
-    let open = OpenOptions { lidar: !options.no_lidar, depths, ..OpenOptions::default() };
+    let open = OpenOptions { lidar: !options.no_lidar, radar: !options.no_radar, depths, ..OpenOptions::default() };
     let mut source = open_with(path, &open, output)?;
     if options.no_masks {
         source.unmask();
@@ -57,7 +57,7 @@ pub(crate) fn open_to_plan(path: &Path, options: &PlanOptions, output: &Output) 
 /// Opens a capture to show what is in it: as [`open_to_plan`], and depth maps whether they are used or not.
 pub(crate) fn open_to_inspect(path: &Path, options: &PlanOptions) -> Result<Source, BadInput> {
     let depths = depth_maps(options)?;
-    let options = OpenOptions { lidar: !options.no_lidar, depths, ..OpenOptions::default() };
+    let options = OpenOptions { lidar: !options.no_lidar, radar: !options.no_radar, depths, ..OpenOptions::default() };
     open_with(path, &options, &Output::silent())
 }
 

@@ -17,6 +17,7 @@ pub mod networks;
 mod observations;
 pub mod open;
 mod photo;
+pub mod radar;
 pub mod synth;
 mod tables;
 pub mod true_boxes;

@@ -61,6 +61,33 @@ pub(crate) struct Return {
     pub(crate) range: f32,
 }
 
+/// What initial points come from.
+pub(crate) trait Scan: Sync {
+    /// Where the sensor was, world metres.
+    fn origin(&self) -> DVec3;
+    /// The views taken at its time, ascending.
+    fn views(&self) -> &[u32];
+    /// What it measured.
+    ///
+    /// # Errors
+    /// A file that cannot be used.
+    fn returns(&self) -> Result<Vec<Return>, BadInput>;
+}
+
+impl Scan for Sweep {
+    fn origin(&self) -> DVec3 {
+        self.world_from_sensor.translation
+    }
+
+    fn views(&self) -> &[u32] {
+        &self.views
+    }
+
+    fn returns(&self) -> Result<Vec<Return>, BadInput> {
+        self.read()
+    }
+}
+
 impl Sweep {
     /// The returns within the range that is used.
     ///

@@ -17,11 +17,11 @@ mod kitti;
 mod kitti360;
 mod kitti_raw;
 mod label_maps;
-mod lidar;
 mod masks;
 mod nuscenes;
 mod opensfm;
 mod parsed;
+mod sweeps;
 mod tracks;
 mod transforms;
 mod truth;
@@ -41,8 +41,9 @@ pub use self::parsed::{LabelledBox, OpenOptions};
 use self::parsed::{ParsedCapture, PosedImage};
 pub(crate) use self::truth::{truth_boxes, truth_folder, truth_instances};
 use crate::depth_maps::DepthFile;
-use crate::lidar::Sweep;
 use crate::lidar::seeds::{Seeds, seeds};
+use crate::lidar::{Scan, Sweep};
+use crate::radar::{self, RoadStrip};
 use crate::undistortion;
 
 /// The file behind a view.
@@ -93,7 +94,9 @@ pub struct Source {
     pub format: &'static str,
     /// Lidar sweeps. The last [`seeds`](Self::seeds) points of the capture come from them.
     pub sweeps: Vec<Sweep>,
-    /// For each of the points that come from lidar, the view that colours it.
+    /// The road that a car with a radar drove over. Points of the capture come from it, as from lidar.
+    pub road: Vec<RoadStrip>,
+    /// For each of the points that come from lidar and radar, the view that colours it.
     pub seeds: Vec<u32>,
     /// Number of annotated boxes by class.
     pub labels: BTreeMap<String, usize>,
@@ -109,9 +112,9 @@ impl Source {
         }
     }
 
-    /// Whether its views have target depths from lidar or from depth maps.
+    /// Whether its views have target depths from lidar, radar or depth maps.
     pub fn is_measured(&self) -> bool {
-        self.depth_maps() > 0 || self.sweeps.iter().any(|sweep| !sweep.views.is_empty())
+        self.depth_maps() > 0 || !self.road.is_empty() || self.sweeps.iter().any(|sweep| !sweep.views.is_empty())
     }
 
     /// The number of photos with a depth map.
@@ -147,10 +150,13 @@ pub fn open(path: &Path, options: &OpenOptions) -> Result<Source, BadInput> {
     let cameras: Vec<Camera> = views.iter().map(|view| view.camera).collect();
     let sweeps = match sweeps {
         _ if !options.lidar => Vec::new(),
-        none if none.is_empty() => lidar::find(&root, &views)?,
-        parsed => lidar::with_views(parsed, &images),
+        none if none.is_empty() => sweeps::of_lidar(&root, &views)?,
+        parsed => sweeps::with_views(parsed, &images),
     };
-    let Seeds { points: measured, best_view: seeds } = seeds(&sweeps, &cameras, points.len())?;
+    let road = if options.radar { radar::road::strips(sweeps::of_radar(&root, &views)?, &points)? } else { Vec::new() };
+    let of_lidar = sweeps.iter().map(|sweep| sweep as &dyn Scan);
+    let scans: Vec<&dyn Scan> = of_lidar.chain(road.iter().map(|strip| strip as &dyn Scan)).collect();
+    let Seeds { points: measured, best_view: seeds } = seeds(&scans, &cameras, points.len())?;
     points.append(measured);
     if points.is_empty() && !options.cameras_only {
         points = frustum_points::sample(&cameras).ok_or_else(|| {
@@ -170,7 +176,7 @@ pub fn open(path: &Path, options: &OpenOptions) -> Result<Source, BadInput> {
         };
     }
     let capture = Capture { views, points, geo_origin: geo_origin(&root)?.or(origin), objects };
-    Ok(Source { capture, photos, left_out, format, sweeps, seeds, labels })
+    Ok(Source { capture, photos, left_out, format, sweeps, road, seeds, labels })
 }
 
 /// Detects the format of a capture and parses it.

@@ -1,11 +1,12 @@
-//! Reads `lidar/poses.jsonl`, which lists the sweeps of a capture's lidar: one JSON object a line.
+//! Reads `lidar/poses.jsonl` and `radar/poses.jsonl`, which list the sweeps of a capture's sensors: one JSON object a line.
 //!
 //! | key | value |
 //! |---|---|
-//! | `name` | of the file with the points, without its extension |
+//! | `name` | of the file with the readings, without its extension |
 //! | `world_from_sensor` | pose: `rotation` (quaternion x, y, z, w) and `translation` (metres) |
 //! | `photos` | names of the photos taken during the sweep, without extensions; optional |
-//! | `readings` | the number of points; optional |
+//! | `readings` | their number; optional |
+//! | `height` | of the sensor above the road, metres; optional |
 //! | `turn_seconds`, `velocity`, `spin` | duration of the sweep, clockwise, and the sensor's motion in the world (m/s, rad/s); optional |
 
 use glam::{DQuat, DVec3};
@@ -20,20 +21,24 @@ const MAX_SWEEPS: usize = 1_000_000;
 /// A line of the file.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 pub struct SweepPose {
-    /// Name of the file with the points, without its extension.
+    /// Name of the file with the readings, without its extension.
     pub name: String,
     /// Pose at the middle of the sweep: x ahead, y left, z up.
     pub world_from_sensor: Rigid,
     /// Names of the photos taken during the sweep, without extensions.
     #[serde(default)]
     pub photos: Option<Vec<String>>,
-    /// The number of points.
+    /// The number of readings.
     #[serde(default)]
     pub readings: Option<u64>,
+    /// Height of the sensor above the road, metres.
+    #[serde(default)]
+    pub height: Option<f64>,
+    /// Velocity of the sensor in the world, metres per second.
+    #[serde(default)]
+    pub velocity: Option<DVec3>,
     #[serde(default)]
     turn_seconds: f64,
-    #[serde(default)]
-    velocity: DVec3,
     #[serde(default)]
     spin: DVec3,
 }
@@ -71,16 +76,18 @@ impl Turn {
 impl SweepPose {
     /// The motion, if the file has it.
     pub fn turn(&self) -> Option<Turn> {
-        let Self { turn_seconds: seconds, velocity, spin, .. } = *self;
+        let Self { turn_seconds: seconds, spin, .. } = *self;
+        let velocity = self.velocity.unwrap_or_default();
         (seconds > 0.0).then_some(Turn { seconds, clockwise: true, velocity, spin })
     }
 
     fn check(&self) -> Result<(), &'static str> {
-        let motion = [self.velocity, self.spin];
+        let motion = [self.velocity.unwrap_or_default(), self.spin];
         match self {
             s if s.name.is_empty() => Err("has an empty name"),
             s if !s.world_from_sensor.is_sane() => Err("has a pose that is not finite or not a rotation"),
             _ if !motion.iter().all(|v| v.is_finite() && v.length() < 1e4) => Err("has a motion out of range"),
+            s if !s.height.is_none_or(|height| height > 0.0 && height < 100.0) => Err("has a height out of range"),
             s if !(0.0..=10.0).contains(&s.turn_seconds) => Err("has a turn that takes under 0 or over 10 seconds"),
             _ => Ok(()),
         }

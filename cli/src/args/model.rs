@@ -141,7 +141,7 @@ pub(crate) struct RenderArgs {
     /// several times
     #[arg(long = "move", value_name = "ID=X,Y,Z[,DEGREES]", allow_hyphen_values = true)]
     pub(crate) moves: Vec<ObjectMove>,
-    /// Also write depth as <view>.depth.npy: float32, metres, 0 = no surface
+    /// Also write depth as <view>.depth.npy: float32, metres along the optical axis, the harmonic mean over a pixel's splats, 0 = no surface
     #[arg(long)]
     pub(crate) depth: bool,
     /// Compensate opacity for the screen-space dilation; by default as the model says

@@ -105,6 +105,9 @@ pub(crate) struct PlanOptions {
     /// Leave out the capture's lidar: its sweeps give neither target depths nor initial points
     #[arg(long)]
     pub(crate) no_lidar: bool,
+    /// Leave out the capture's radar: its sweeps give no target depths
+    #[arg(long)]
+    pub(crate) no_radar: bool,
     /// Use the pixels that the capture's mask files exclude, and those of labelled objects that move, as all others
     #[arg(long)]
     pub(crate) no_masks: bool,

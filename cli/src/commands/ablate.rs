@@ -141,6 +141,7 @@ fn plan_options(args: &AblateArgs, seed: u64) -> PlanOptions {
         label_blocks: false,
         depth_weight: 0.0,
         no_lidar: true,
+        no_radar: true,
         no_masks: false,
         no_backdrop: false,
         block_memory: BLOCK_MEMORY_MIB,

@@ -147,6 +147,7 @@ pub(crate) fn settings(args: &DemoArgs) -> (Settings, TrainArgs) {
             label_blocks: false,
             depth_weight: 0.0,
             no_lidar: true,
+            no_radar: true,
             no_masks: false,
             no_backdrop: false,
             block_memory: BLOCK_MEMORY_MIB,

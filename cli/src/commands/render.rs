@@ -47,7 +47,7 @@ pub(crate) fn run(args: &RenderArgs, output: &Output) -> Result<(), Failure> {
     // All names are checked before the first picture is rendered.
     let names = captures::stems(&args.cameras, views.iter().map(|view| view.name.as_str()))?;
     let antialiased = (model.antialiased || args.antialiased) && !args.classic;
-    let options = Options { antialiased, extras: args.depth, ..model.options() };
+    let options = Options { antialiased, extras: args.depth, inverse_depth: args.depth, ..model.options() };
     let clock = Stopwatch::start();
     let mut renderer = Renderer::new(&backend)?;
     let objects = placed(&model.objects, args)?;
@@ -160,10 +160,12 @@ fn coloured(splats: &Splats, attribute: &str, path: &Path) -> Result<Splats, Fai
     .into())
 }
 
-/// Mean depth of each pixel, metres; 0 where its alpha is too low.
+/// Depth of each pixel, metres: the harmonic mean over its splats, as `plat eval --depth` measures it. The mean would put a wall
+/// behind which a little of a sky at 1 km shines through metres too far. 0 where alpha is too low.
 fn depth_metres(frame: &Frame) -> Vec<f32> {
     let depth = frame.depth.iter().zip(&frame.transmittance);
-    depth.map(|(depth, rest)| if 1.0 - rest > MIN_ALPHA { depth / (1.0 - rest) } else { 0.0 }).collect()
+    let metres = |(inverse, rest): (&f32, &f32)| (1.0 - rest) / inverse.max(f32::MIN_POSITIVE);
+    depth.map(|of| if 1.0 - of.1 > MIN_ALPHA { metres(of) } else { 0.0 }).collect()
 }
 
 #[cfg(test)]
@@ -171,12 +173,12 @@ mod tests {
     use super::*;
 
     #[test]
-    fn depth_is_the_mean_over_alpha() {
+    fn depth_is_the_harmonic_mean_over_alpha() {
         let frame = Frame {
             width: 3,
             height: 1,
             transmittance: vec![0.2, 0.6, 1.0],
-            depth: vec![8.0, 4.0, 0.0],
+            depth: vec![0.08, 0.4, 0.0],
             ..Frame::default()
         };
         assert_eq!(depth_metres(&frame), [10.0, 0.0, 0.0]);

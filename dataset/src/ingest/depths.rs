@@ -1,6 +1,6 @@
 //! Target depths of the views from lidar and depth maps, and the colours of points from lidar, with the photos in the store.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use glam::DVec2;
 use scene::{ArtefactId, BadInput, Capture, Pixels, View};
@@ -10,9 +10,17 @@ use super::error::IngestError;
 use super::from_map::{FromMap, Maps};
 use super::undistorter::LastUndistorter;
 use crate::depth_samples::DepthSamples;
-use crate::lidar::{Sweep, visible};
+use crate::lidar::{Scan, Sweep, visible};
 use crate::mip_tiles::MipLayout;
+use crate::observations::Observations;
 use crate::open::Source;
+use crate::radar::RoadStrip;
+
+/// A view shows the road of sweeps within this distance of it, metres.
+const ROAD_METRES: f64 = 40.0;
+/// Side of the squares of a picture that get a depth of the road each, as a share of the focal length: 3.4°. Closer ones would weigh
+/// more than the points that the view observed.
+const SQUARE: f64 = 0.06;
 
 /// What lidar and its depth map add to a view.
 #[derive(Default)]
@@ -33,6 +41,10 @@ pub(super) struct Depths<'a> {
     of_view: Vec<Vec<u32>>,
     /// The points that a view colours, as indices of the capture's points.
     coloured_by: BTreeMap<u32, Vec<u32>>,
+    road: &'a [RoadStrip],
+    /// The strip of which the sweep was taken with a view.
+    road_of_view: BTreeMap<u32, usize>,
+    observations: Observations,
     maps: Maps<'a>,
 }
 
@@ -47,12 +59,22 @@ impl<'a> Depths<'a> {
         for (point, &view) in (first..).zip(&source.seeds) {
             coloured_by.entry(view).or_default().push(point);
         }
-        Self { sweeps: &source.sweeps, of_view, coloured_by, maps: Maps::new(source, downscale) }
+        let road_of_view =
+            (0..).zip(&source.road).flat_map(|(i, strip)| strip.views().iter().map(move |&view| (view, i)));
+        Self {
+            sweeps: &source.sweeps,
+            of_view,
+            coloured_by,
+            road: &source.road,
+            road_of_view: road_of_view.collect(),
+            observations: Observations::new(&source.capture),
+            maps: Maps::new(source, downscale),
+        }
     }
 
     /// Whether there is anything to do for a view.
     pub(super) fn concerns(&self, view: usize) -> bool {
-        self.has_lidar(view) || self.maps.has(view)
+        self.has_lidar(view) || self.road_of_view.contains_key(&(view as u32)) || self.maps.has(view)
     }
 
     fn has_lidar(&self, view: usize) -> bool {
@@ -111,8 +133,36 @@ impl<'a> Depths<'a> {
             seen.extend(samples.filter(|&(x, y, _)| held.binary_search(&(y, x)).is_err()));
             map
         });
+        seen.extend(self.of_road(capture, number, &seen, is_used));
         let (width, height) = (camera.pinhole.width, camera.pinhole.height);
         Ok((DepthSamples::new(width, height, seen.into_iter()), map))
+    }
+
+    /// Depths of the road where a view has no others: one in each square of the picture without measured depths and without points
+    /// that the view observed. Those squares are where photos cannot be trusted: dark, in fog, or without texture.
+    fn of_road(
+        &self,
+        capture: &Capture,
+        number: usize,
+        measured: &[(u32, u32, f32)],
+        is_used: &dyn Fn(u32, u32) -> bool,
+    ) -> Vec<(u32, u32, f32)> {
+        let Some(&own) = self.road_of_view.get(&(number as u32)) else { return Vec::new() };
+        let camera = &capture.views[number].camera;
+        let centre = camera.centre();
+        let near = self.road.iter().filter(|strip| strip.origin().distance(centre) < ROAD_METRES);
+        let places = near.flat_map(RoadStrip::places).filter(|place| !self.road[own].hides(*place));
+        let seen = visible(camera, (0..).zip(places));
+        let side = (SQUARE * camera.pinhole.fx.min(camera.pinhole.fy)).max(1.0) as u32;
+        let square = |x: u32, y: u32| (y / side, x / side);
+        let observed = self.observations.of(number).iter().map(|&point| {
+            let (at, _) = camera.project(capture.points.positions[point as usize]);
+            pixel_at(at, camera.pinhole.width, camera.pinhole.height)
+        });
+        let known = measured.iter().map(|&(x, y, _)| (x, y)).chain(observed);
+        let mut taken: BTreeSet<(u32, u32)> = known.map(|(x, y)| square(x, y)).collect();
+        let first = seen.into_iter().filter(|s| is_used(s.x, s.y) && taken.insert(square(s.x, s.y)));
+        first.map(|s| (s.x, s.y, s.depth)).collect()
     }
 
     /// The colours of the points that a view colours.

@@ -47,6 +47,7 @@ fn source(folder: &Path, count: u32) -> Source {
         left_out: Vec::new(),
         format: "test",
         sweeps: Vec::new(),
+        road: Vec::new(),
         seeds: Vec::new(),
         labels: Default::default(),
     }

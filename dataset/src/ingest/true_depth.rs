@@ -57,7 +57,8 @@ impl TrueDepth {
             view.camera.pinhole = downscaled(view.camera.pinhole, downscale.max(1));
         }
         let numbers = (0..).zip(&self.source.capture.views).map(|(i, view)| (view.name.as_str(), i)).collect();
-        ViewDepths { capture, numbers, depths: Depths::new(&self.source, downscale.max(1)), last_undistorter: None }
+        let depths = Depths::new(&self.source, downscale.max(1));
+        ViewDepths { capture, numbers, depths, last_undistorter: None }
     }
 }
 

@@ -1,4 +1,4 @@
-//! Initial points from lidar: the sweeps of a capture, thinned to one return per voxel, with the views that see each.
+//! Initial points from lidar and radar: the sweeps of a capture, thinned to one return per voxel, with the views that see each.
 //!
 //! A voxel keeps the return that was measured from the smallest distance. The voxels grow until there are few enough of them:
 //! a lidar measures streets by the million, and initial points as dense as that would leave no splats for the rest of the scene.
@@ -10,7 +10,7 @@ use glam::{DVec3, I64Vec3};
 use rayon::prelude::*;
 use scene::{BadInput, Camera, SparsePoints};
 
-use super::{Return, Seen, Sweep, visible};
+use super::{Return, Scan, Seen, visible};
 
 /// Side of the smallest voxel, metres.
 const VOXEL_METRES: f64 = 0.1;
@@ -30,7 +30,7 @@ const CHUNK: usize = 32;
 /// the air, may look at them through roofs, which the lidar does not measure.
 const NEAR_METRES: f64 = 15.0;
 
-/// Initial points from lidar.
+/// Initial points from sweeps.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub(crate) struct Seeds {
     /// Points with tracks, grey: [`crate::ingest`] colours them.
@@ -61,7 +61,7 @@ impl Measured {
 ///
 /// # Errors
 /// A sweep that cannot be read.
-pub(crate) fn seeds(sweeps: &[Sweep], cameras: &[Camera], sparse_points: usize) -> Result<Seeds, BadInput> {
+pub(crate) fn seeds(sweeps: &[&dyn Scan], cameras: &[Camera], sparse_points: usize) -> Result<Seeds, BadInput> {
     let max = (PER_SPARSE_POINT * sparse_points).clamp(*MAX_POINTS.start(), *MAX_POINTS.end());
     let Voxels { side, returns } = thinned(sweeps, UNSEEN_FACTOR * max)?;
     let measured = sorted(returns);
@@ -70,10 +70,9 @@ pub(crate) fn seeds(sweeps: &[Sweep], cameras: &[Camera], sparse_points: usize) 
     let seen_by = |view: usize| -> Vec<Seen> {
         let centre = cameras[view].centre();
         let is_near = |sweep: &usize| {
-            let Sweep { world_from_sensor, views, .. } = &sweeps[*sweep];
             start[*sweep] < start[*sweep + 1]
-                && (world_from_sensor.translation.distance_squared(centre) <= NEAR_METRES * NEAR_METRES
-                    || views.binary_search(&(view as u32)).is_ok())
+                && (sweeps[*sweep].origin().distance_squared(centre) <= NEAR_METRES * NEAR_METRES
+                    || sweeps[*sweep].views().binary_search(&(view as u32)).is_ok())
         };
         let near = (0..sweeps.len()).filter(is_near).flat_map(|sweep| start[sweep]..start[sweep + 1]);
         visible(&cameras[view], near.map(|i| (i as u32, measured[i].place)))
@@ -93,7 +92,7 @@ pub(crate) fn seeds(sweeps: &[Sweep], cameras: &[Camera], sparse_points: usize) 
     for point in sorted(kept.at_most(max).returns) {
         let track = &tracks[point.number];
         let distance = |view: u32| {
-            let is_other = sweeps[point.sweep as usize].views.binary_search(&view).is_err();
+            let is_other = sweeps[point.sweep as usize].views().binary_search(&view).is_err();
             (is_other, cameras[view as usize].centre().distance_squared(point.place).to_bits(), view)
         };
         seeds.best_view.extend(track.iter().copied().min_by_key(|&view| distance(view)));
@@ -114,13 +113,13 @@ fn sorted(returns: HashMap<I64Vec3, Measured>) -> Vec<Measured> {
 }
 
 /// At most `max` returns of the sweeps, one per voxel.
-fn thinned(sweeps: &[Sweep], max: usize) -> Result<Voxels, BadInput> {
+fn thinned(sweeps: &[&dyn Scan], max: usize) -> Result<Voxels, BadInput> {
     let chosen: Vec<usize> = (0..sweeps.len()).step_by(sweeps.len().div_ceil(MAX_SWEEPS).max(1)).collect();
     let mut voxels = Voxels::new(VOXEL_METRES);
     for chunk in chosen.chunks(CHUNK) {
         let read = |&sweep: &usize| -> Result<Voxels, BadInput> {
             let mut own = Voxels::new(voxels.side);
-            for Return { place, range } in sweeps[sweep].read()? {
+            for Return { place, range } in sweeps[sweep].returns()? {
                 own.insert(Measured { place, range, sweep: sweep as u32, number: 0 });
             }
             Ok(own)

@@ -21,6 +21,8 @@ pub struct OpenOptions {
     pub cameras_only: bool,
     /// Uses the capture's lidar: sweeps give target depths and initial points.
     pub lidar: bool,
+    /// Uses the capture's radar: sweeps give target depths.
+    pub radar: bool,
     /// Finds depth maps in files, which give target depths. `None` leaves them out.
     pub depths: Option<DepthMapOptions>,
 }

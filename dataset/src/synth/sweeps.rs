@@ -114,6 +114,7 @@ fn run_sensor<T: Send>(
             "world_from_sensor": pose,
             "velocity": motion.velocity,
             "spin": motion.spin,
+            "height": mount.offset.z,
             "readings": readings,
             "photos": station.photos,
             "turn_seconds": turn_seconds.unwrap_or(0.0),

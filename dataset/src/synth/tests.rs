@@ -8,7 +8,7 @@ use glam::{DVec2, DVec3};
 
 use super::*;
 use crate::depth_samples::DepthSamples;
-use crate::open::{OpenOptions, open};
+use crate::open::{OpenOptions, Source, open};
 
 mod kitti_raw;
 mod nuscenes;
@@ -447,22 +447,17 @@ fn the_gallery_shows_every_layout_label_and_fault() {
     }
 }
 
-#[test]
-fn lidar_measures_the_depths_that_photos_show() {
-    let settings = Settings { aerial: 0.0, width: 192, height: 108, truth: true, lidar: true, ..small() };
-    let (folder, _) = written(&settings, 2);
-    let source = open(folder.path(), &OpenOptions { lidar: true, ..OpenOptions::default() }).unwrap();
-    assert!(!source.sweeps.is_empty() && source.sweeps.iter().all(|sweep| !sweep.views.is_empty()));
+/// Relative errors of a capture's target depths against the true depths of its photos, ascending.
+fn depth_errors(folder: &Path, source: &Source) -> Vec<f32> {
     let store = store::Store::open("memory://").unwrap().blocking();
     let options = crate::ingest::IngestOptions { downscale: 1, threads: 2 };
-    let ingested = crate::ingest::ingest(&source, &store, &options, &|_, _| ()).unwrap();
-    // Relative errors of the samples against the photo's true depths.
+    let ingested = crate::ingest::ingest(source, &store, &options, &|_, _| ()).unwrap();
     let mut errors = Vec::new();
     for view in &ingested.capture.views {
         let Some(id) = view.depth else { continue };
         let depths = DepthSamples::decode(&store.get(id).unwrap(), 192, 108).unwrap();
         let name = view.name.rsplit_once('.').unwrap().0;
-        let truth = fs::read(folder.path().join(format!("depth/{name}.npy"))).unwrap();
+        let truth = fs::read(folder.join(format!("depth/{name}.npy"))).unwrap();
         let (shape, truth) = scene::npy::read_f32(&truth).unwrap();
         assert_eq!(shape, [108, 192]);
         errors.extend(depths.iter().map(|(x, y, depth)| {
@@ -471,14 +466,54 @@ fn lidar_measures_the_depths_that_photos_show() {
         }));
     }
     errors.sort_by(f32::total_cmp);
-    let within = |share: f32| errors.partition_point(|error| *error <= share) as f64 / errors.len() as f64;
-    println!(
-        "{} samples, median {}, within 5 % {}, 20 % {}",
-        errors.len(),
-        errors[errors.len() / 2],
-        within(0.05),
-        within(0.2)
-    );
+    errors
+}
+
+fn share_within(errors: &[f32], most: f32) -> f64 {
+    errors.partition_point(|error| *error <= most) as f64 / errors.len() as f64
+}
+
+#[test]
+fn lidar_measures_the_depths_that_photos_show() {
+    let settings = Settings { aerial: 0.0, width: 192, height: 108, truth: true, lidar: true, ..small() };
+    let (folder, _) = written(&settings, 2);
+    let source = open(folder.path(), &OpenOptions { lidar: true, ..OpenOptions::default() }).unwrap();
+    assert!(!source.sweeps.is_empty() && source.sweeps.iter().all(|sweep| !sweep.views.is_empty()));
+    let errors = depth_errors(folder.path(), &source);
+    let [near, far] = [0.05, 0.2].map(|most| share_within(&errors, most));
+    println!("{} samples, median {}, within 5 % {near}, 20 % {far}", errors.len(), errors[errors.len() / 2]);
     assert!(errors.len() > 2000 && errors[errors.len() / 2] < 0.01, "{} {}", errors.len(), errors[errors.len() / 2]);
-    assert!(within(0.05) > 0.9 && within(0.2) > 0.95, "{} {}", within(0.05), within(0.2));
+    assert!(near > 0.9 && far > 0.95, "{near} {far}");
+}
+
+#[test]
+fn a_radar_says_where_the_road_is_that_photos_show() {
+    let settings =
+        Settings { aerial: 0.0, width: 192, height: 108, truth: true, radar: true, spacing: Some(3.0), ..small() };
+    let (folder, _) = written(&settings, 2);
+    let options = OpenOptions { radar: true, ..OpenOptions::default() };
+    let source = open(folder.path(), &options).unwrap();
+    let without = open(folder.path(), &OpenOptions::default()).unwrap();
+    assert!(source.is_measured() && !without.is_measured());
+    let initial = source.capture.points.len() - without.capture.points.len();
+    assert!(initial > 50 && source.seeds.len() == initial, "{initial}");
+    let errors = depth_errors(folder.path(), &source);
+    let [near, far] = [0.05, 0.2].map(|most| share_within(&errors, most));
+    println!("{initial} points, {} samples, within 5 % {near}, 20 % {far}", errors.len());
+    assert!(errors.len() > 100 && near > 0.75 && far > 0.9, "{} {near} {far}", errors.len());
+
+    // What is missing is said in one line.
+    let poses = folder.path().join("radar/poses.jsonl");
+    let text = fs::read_to_string(&poses).unwrap();
+    for (key, other) in [("height", "hight"), ("velocity", "speed")] {
+        fs::write(&poses, text.replacen(&format!("\"{key}\""), &format!("\"{other}\""), 1)).unwrap();
+        let error = open(folder.path(), &options).map(|_| ()).unwrap_err().to_string();
+        assert!(error.contains(&format!("does not have the key {key}")) && !error.contains('\n'), "{error}");
+    }
+    fs::write(&poses, &text).unwrap();
+    let sweep = fs::read_dir(folder.path().join("radar")).unwrap().map(|entry| entry.unwrap().path());
+    let sweep = sweep.filter(|path| path.extension().is_some_and(|of| of == "csv")).min().unwrap();
+    fs::write(&sweep, "range,azimuth,velocity\n1,x,1\n").unwrap();
+    let error = open(folder.path(), &options).map(|_| ()).unwrap_err().to_string();
+    assert!(error.contains("has no number in line 2, column azimuth"), "{error}");
 }
