@@ -68,7 +68,9 @@ impl Counter {
 }
 
 const LIDAR: Counter = Counter::Options("lidar: initial points and depths");
-const LIDAR_TRAIN: [&str; 2] = ["--no-lidar", "--depth-weight 0.1"];
+const LIDAR_TRAIN: [&str; 2] = ["--no-lidar --depth-weight 0.1", "--depth-weight 0.1"];
+const RADAR: Counter = Counter::Options("radar: the road's initial points and depths");
+const RADAR_TRAIN: [&str; 2] = ["--no-radar --depth-weight 0.1", "--depth-weight 0.1"];
 const POSES: Counter = Counter::Options("poses refined");
 const POSES_TRAIN: [&str; 2] = ["", "--refine-poses"];
 const SENSORS: Counter = Counter::Options("sensors refined");
@@ -78,6 +80,11 @@ const SENSORS_TRAIN: [&str; 2] = ["", "--refine-sensors"];
 const fn depths(name: &'static str, about: &'static str, synth: &'static str) -> Case {
     let (counter, train, photos) = (LIDAR, LIDAR_TRAIN, MeasuredOn::Own);
     Case { name, about, synth, counter, train, eval: "--depth", photos }
+}
+
+/// A fault of light in which a radar sees what photos do not show.
+const fn radar(name: &'static str, about: &'static str, synth: &'static str) -> Case {
+    Case { name, about, synth, counter: RADAR, train: RADAR_TRAIN, eval: "--depth", photos: MeasuredOn::Own }
 }
 
 /// A fault of cameras, measured with the true ones.
@@ -99,7 +106,16 @@ const fn pictures(name: &'static str, about: &'static str, synth: &'static str) 
 }
 
 /// All cases.
-pub(crate) const CASES: [Case; 22] = [
+pub(crate) const CASES: [Case; 26] = [
+    Case {
+        name: "no-depths",
+        about: "nothing says how far the road is: it is painted on the backdrop",
+        synth: "--truth",
+        counter: Counter::Options("depths of sparse points"),
+        train: ["", "--depth-weight 0.1"],
+        eval: "--depth",
+        photos: MeasuredOn::Own,
+    },
     depths(
         "curved-corridor",
         "street that bends: every view is seen from few others",
@@ -118,6 +134,9 @@ pub(crate) const CASES: [Case; 22] = [
     depths("night", "moonlight, lamps, grain", "--fault night --lidar --truth"),
     depths("rain", "wet ground and streaks", "--fault rain --lidar --truth"),
     depths("fog", "a visibility of 200 m", "--fault fog=0.5 --lidar --truth"),
+    radar("radar-night", "moonlight, lamps, grain", "--fault night --radar --truth"),
+    radar("radar-rain", "wet ground and streaks", "--fault rain --radar --truth"),
+    radar("radar-fog", "a visibility of 200 m", "--fault fog=0.5 --radar --truth"),
     Case {
         name: "exposure-drift",
         about: "the gain wanders between photos",

@@ -36,8 +36,10 @@ struct Inspected {
     sweeps: usize,
     /// Views taken during a sweep.
     views_with_lidar: usize,
-    /// How many of the points come from lidar.
+    /// How many of the points come from lidar, and from the road that a radar found.
     lidar_points: usize,
+    /// Sweeps of the capture's radar.
+    radar_sweeps: usize,
     /// Photos with a depth map.
     depth_maps: usize,
     /// Number of annotated boxes by class.
@@ -107,6 +109,7 @@ pub(crate) fn run(args: &InspectArgs, output: &Output) -> Result<(), Failure> {
         sweeps: source.sweeps.len(),
         views_with_lidar: source.sweeps.iter().flat_map(|sweep| &sweep.views).collect::<BTreeSet<_>>().len(),
         lidar_points: source.seeds.len(),
+        radar_sweeps: source.road.len(),
         depth_maps: source.depth_maps(),
         boxes: source.labels,
         moving: capture.objects.len(),
@@ -138,10 +141,14 @@ fn text(found: &Inspected, plan: Option<&Plan>) -> String {
     }
     text += &format!(", over {x:.1} × {y:.1} m, {z:.1} m high\n");
     if found.sweeps > 0 {
-        let (sweeps, views, points) = (found.sweeps, found.views_with_lidar, found.lidar_points);
-        text += &format!(
-            "{sweeps} sweeps of a lidar, taken with {views} of the views; {points} of the points come from them\n"
-        );
+        let (sweeps, views) = (found.sweeps, found.views_with_lidar);
+        text += &format!("{sweeps} sweeps of a lidar, taken with {views} of the views\n");
+    }
+    if found.radar_sweeps > 0 {
+        text += &format!("{} sweeps of a radar\n", found.radar_sweeps);
+    }
+    if found.lidar_points > 0 {
+        text += &format!("{} of the points come from these\n", found.lidar_points);
     }
     if found.depth_maps > 0 {
         text += &format!("depth maps of {} of the views, for --depth-weight\n", found.depth_maps);
