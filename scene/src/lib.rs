@@ -28,6 +28,7 @@ pub mod parquet;
 pub mod ply;
 pub mod poses;
 pub mod rad;
+pub mod radar;
 pub mod random;
 pub mod sensors;
 pub mod similarity;

@@ -98,14 +98,14 @@ pub(crate) struct PlanOptions {
     /// Label each splat with the block that trained it, as the integer property `block` of merged.ply
     #[arg(long)]
     pub(crate) label_blocks: bool,
-    /// Weight of a loss that compares rendered depths with those that lidar, depth maps and the sparse points give for the photo. It
+    /// Weight of a loss that compares rendered depths with those that lidar, radar, depth maps and the sparse points give for the photo. It
     /// keeps splats from floating where few photos overlap; 0 leaves it out
     #[arg(long, value_name = "W", value_parser = weight, default_value_t = 0.0)]
     pub(crate) depth_weight: f64,
     /// Leave out the capture's lidar: its sweeps give neither target depths nor initial points
     #[arg(long)]
     pub(crate) no_lidar: bool,
-    /// Leave out the capture's radar: its sweeps give no target depths
+    /// Leave out the capture's radar: the road that its sweeps find gives neither target depths nor initial points
     #[arg(long)]
     pub(crate) no_radar: bool,
     /// Use the pixels that the capture's mask files exclude, and those of labelled objects that move, as all others

@@ -12,9 +12,10 @@ use std::collections::{BTreeMap, HashSet};
 
 use glam::{DVec2, DVec3, I64Vec3, IVec2};
 use rayon::prelude::*;
+use scene::radar::Detection;
 use scene::{BadInput, Rigid, SparsePoints};
 
-use super::{Detection, RadarSweep};
+use super::RadarSweep;
 use crate::lidar::{Return, Scan};
 
 /// Difference to the radial velocity of something that stands, metres per second: velocities are measured to 0.1, and directions to
@@ -68,10 +69,11 @@ pub(crate) fn strips(sweeps: Vec<RadarSweep>, points: &SparsePoints) -> Result<V
     for (sweep, found) in sweeps.iter().zip(&read) {
         let pose = &sweep.world_from_sensor;
         let own = pose.rotation.inverse() * sweep.velocity;
+        let towards = |of: &Detection| DVec3::new(of.azimuth.cos(), of.azimuth.sin(), 0.0);
         let (still, moves): (Vec<&Detection>, Vec<&Detection>) =
-            found.iter().partition(|of| (of.velocity + own.dot(of.direction)).abs() < STANDING_SPEED);
-        standing.push(still.iter().map(|of| (pose.apply(of.range * of.direction), of.range)).collect());
-        moving.push(moves.iter().map(|of| (pose.rotation * of.direction, of.range)).collect::<Vec<_>>());
+            found.iter().partition(|of| (of.velocity + own.dot(towards(of))).abs() < STANDING_SPEED);
+        standing.push(still.iter().map(|of| (pose.apply(of.range * towards(of)), of.range)).collect());
+        moving.push(moves.iter().map(|of| (pose.rotation * towards(of), of.range)).collect::<Vec<_>>());
     }
     let obstacles = Obstacles::new(&standing, &sweeps);
     let triangulated: HashSet<I64Vec3> = points.positions.iter().map(|place| cube(*place)).collect();

@@ -91,6 +91,11 @@ pub(crate) fn swelling() -> Vec<Seed> {
     let items = |item: &str| format!("<a><tracklets>{}</tracklets></a>", item.repeat(60_000));
     corpus.plain("empty objects in tracklet_labels.xml", items("<item></item>"), &kitti_raw_codecs()[4]);
     corpus.plain("deep elements in tracklet_labels.xml", items("<a>"), &kitti_raw_codecs()[4]);
+    corpus.plain(
+        "columns without end of a radar",
+        format!("range,azimuth,velocity\n{}", "1,x,".repeat(500_000)),
+        &radar_codecs()[1],
+    );
     corpus.plain("a long line of oxts", text.as_str(), &kitti_raw_codecs()[2]);
     let text = format!("P_rect_00: {text}");
     corpus.plain("a long line in calib_cam_to_cam.txt", text.as_str(), &kitti_raw_codecs()[0]);
@@ -231,6 +236,9 @@ impl Corpus {
         self.plain("transforms.json", transforms::write(&file), &transforms_codec());
         self.plain("reconstruction.json", RECONSTRUCTION, &opensfm_codec());
         self.plain("tracks.json", TRACKS, &tracks_codec());
+        let [sweeps, detections] = radar_codecs();
+        self.plain("radar/poses.jsonl", RADAR_POSES, &sweeps);
+        self.plain("radar/NAME.csv", "range,azimuth,velocity,power\n12.5,-0.25,-9.5,31\n7e0,1.0,.5,12\n", &detections);
         let [perspective, cam_to_pose, cam_to_velo, poses, scan] = kitti_codecs();
         self.plain("perspective.txt", PERSPECTIVE, &perspective);
         self.plain("calib_cam_to_pose.txt", CAM_TO_POSE, &cam_to_pose);
@@ -386,6 +394,11 @@ pub(crate) const CLOUD: &str = "ply\nformat ascii 1.0\ncomment a cloud\nelement 
     property float z\nproperty uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n\
     0 0 -3 1 2 3\n1 0.5 -3 4 5 6\n-1 1e-3 -4 7 8 9\n";
 /// Two objects that move and the times of photos.
+const RADAR_POSES: &str = concat!(
+    r#"{"name":"a","seconds":0.5,"height":0.6,"velocity":[10,0,0],"photos":["a","b"],"readings":2,"#,
+    r#""world_from_sensor":{"rotation":[0,0,0,1],"translation":[1,2,3]}}"#,
+    "\n",
+);
 const TRACKS: &str = r#"{"tracks": [{"id": "van", "class": "car", "low": [-2, -1, 0], "high": [2, 1, 1.5],
     "poses": [[0, [1, 2, 3], [0, 0, 0, 1]], [0.5, [2, 2, 3], [0, 0, 0.1, 0.995]], [3, [4, 2, 3], [0, 0, 0.2, 0.98]]]},
     {"instance": 7, "class": "person", "low": [0, 0, 0], "high": [1, 1, 2], "poses": [[1.5, [0, 0, 0], [1, 0, 0, 0]]]}],

@@ -17,7 +17,8 @@ use scene::parquet::Table;
 use scene::transforms::{Frame, Intrinsics, Transforms};
 use scene::{CameraModel, Capture, CodecError, Exposures, Rect, Rigid};
 use scene::{
-    colmap, kitti_raw, kitti360, npy, nuscenes, objects, opensfm, ply, rad, sog, splat_glb, spz, transforms, waymo,
+    colmap, kitti_raw, kitti360, lidar, npy, nuscenes, objects, opensfm, ply, rad, radar, sog, splat_glb, spz,
+    transforms, waymo,
 };
 use store::Store;
 
@@ -106,6 +107,20 @@ pub(crate) fn tracks_codec() -> Read {
             |seconds: f64| tracks.objects.iter().filter_map(|object| object.pose(seconds)).all(|pose| pose.is_sane());
         [-1e300, 0.25, 1.5, f64::INFINITY].into_iter().all(at) && objects::read(&objects::write(&tracks)).is_ok()
     })
+}
+
+/// The poses of sweeps, and the detections of a radar.
+pub(crate) fn radar_codecs() -> [Read; 2] {
+    [
+        codec("radar", lidar::read_poses, |sweeps| {
+            let sane =
+                |sweep: &lidar::SweepPose| sweep.world_from_sensor.is_sane() && sweep.height.is_none_or(f64::is_finite);
+            sweeps.iter().all(sane)
+        }),
+        codec("radar", radar::read_detections, |found| {
+            found.iter().all(|of| [of.range, of.azimuth, of.velocity].iter().all(|value| value.is_finite()))
+        }),
+    ]
 }
 
 pub(crate) fn opensfm_codec() -> Read {
