@@ -67,10 +67,13 @@ impl Counter {
     }
 }
 
+/// Target depths; of a capture without other sensors, those of its triangulated points. The last options of a case without its
+/// counter-measure.
+pub(crate) const DEPTHS: &str = "--depth-weight 0.1";
 const LIDAR: Counter = Counter::Options("lidar: initial points and depths");
-const LIDAR_TRAIN: [&str; 2] = ["--no-lidar --depth-weight 0.1", "--depth-weight 0.1"];
+const LIDAR_TRAIN: [&str; 2] = ["--no-lidar --depth-weight 0.1", DEPTHS];
 const RADAR: Counter = Counter::Options("radar: the road's initial points and depths");
-const RADAR_TRAIN: [&str; 2] = ["--no-radar --depth-weight 0.1", "--depth-weight 0.1"];
+const RADAR_TRAIN: [&str; 2] = ["--no-radar --depth-weight 0.1", DEPTHS];
 const POSES: Counter = Counter::Options("poses refined");
 const POSES_TRAIN: [&str; 2] = ["", "--refine-poses"];
 const SENSORS: Counter = Counter::Options("sensors refined");
@@ -112,7 +115,7 @@ pub(crate) const CASES: [Case; 26] = [
         about: "nothing says how far the road is: it is painted on the backdrop",
         synth: "--truth",
         counter: Counter::Options("depths of sparse points"),
-        train: ["", "--depth-weight 0.1"],
+        train: ["", DEPTHS],
         eval: "--depth",
         photos: MeasuredOn::Own,
     },

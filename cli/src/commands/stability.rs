@@ -22,7 +22,7 @@ use crate::eval_report::Evaluated;
 use crate::failure::{Failure, cannot, make_folder};
 use crate::output::Output;
 use crate::run_record::{commit, invocation};
-use crate::stability_cases::{Case, Counter, MeasuredOn};
+use crate::stability_cases::{Case, Counter, DEPTHS, MeasuredOn};
 use crate::stability_table::{GENERATED, Row, row, table};
 
 /// The file of lines.
@@ -48,6 +48,8 @@ struct Stage<'a> {
     /// Options of `plat synth` and `plat train` without those of the counter-measure.
     synth: String,
     train: &'a str,
+    /// Whether the capture has triangulated points. Without them, and without lidar, there are no target depths to weigh.
+    is_triangulated: bool,
 }
 
 pub(crate) fn run(args: &StabilityArgs, output: &Output) -> Result<(), Failure> {
@@ -121,6 +123,7 @@ fn stages<'a>(args: &'a StabilityArgs, output: &Output) -> Result<Vec<Stage<'a>>
                 measured_on: of.path.clone(),
                 synth: String::new(),
                 train: &args.train_given,
+                is_triangulated: !captures::open(&of.path, output)?.capture.points.seen_by.is_empty(),
             });
         }
     }
@@ -147,7 +150,8 @@ fn generated<'a>(case: &'a Case, args: &'a StabilityArgs, output: &Output) -> Re
     if case.counter == Counter::Refusal {
         spoil(&own)?;
     }
-    Ok(Stage { case, capture_name: GENERATED.to_owned(), trained_on: own, measured_on, synth, train: &args.train })
+    let capture_name = GENERATED.to_owned();
+    Ok(Stage { case, capture_name, trained_on: own, measured_on, synth, train: &args.train, is_triangulated: true })
 }
 
 /// Whether all of a generated capture is there.
@@ -254,7 +258,9 @@ fn draw(stage: &Stage, seed: u64, args: &StabilityArgs, output: &Output) -> Resu
 }
 
 fn blank_line(stage: &Stage, on: bool) -> Stability {
-    let train = format!("{} {}", stage.train, stage.case.train[usize::from(on)]);
+    let own = stage.case.train[usize::from(on)];
+    let own = if on || stage.is_triangulated { own } else { own.trim_end_matches(DEPTHS) };
+    let train = format!("{} {own}", stage.train);
     Stability {
         commit: commit().to_owned(),
         machine: ::bench::machine(),
