@@ -6,7 +6,7 @@
 //!
 //! A detection stands still if its radial velocity is that of the sensor's own motion. Reflections by two surfaces do not stay in
 //! place when the sensor moves, so other sweeps do not find them again. The detections themselves are no samples: elevation is not
-//! measured, and 6 of 10 places at any height are within 5 % of the depth that a photo shows there (docs/decisions/0090).
+//! measured, and at the best height 6 of 10 are within 5 % of the depth that a photo shows there (docs/decisions/0090).
 
 use std::collections::{BTreeMap, HashSet};
 
