@@ -114,7 +114,12 @@ impl Source {
 
     /// Whether its views have target depths from lidar, radar or depth maps.
     pub fn is_measured(&self) -> bool {
-        self.depth_maps() > 0 || !self.road.is_empty() || self.sweeps.iter().any(|sweep| !sweep.views.is_empty())
+        self.depth_maps() > 0 || self.roads() > 0 || self.sweeps.iter().any(|sweep| !sweep.views.is_empty())
+    }
+
+    /// The number of radar sweeps after which there is a road, to the next one.
+    pub fn roads(&self) -> usize {
+        self.road.iter().filter(|strip| !strip.is_empty()).count()
     }
 
     /// The number of photos with a depth map.

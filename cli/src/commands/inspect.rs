@@ -40,6 +40,8 @@ struct Inspected {
     lidar_points: usize,
     /// Sweeps of the capture's radar.
     radar_sweeps: usize,
+    /// After how many of them there is a road to the next one.
+    radar_roads: usize,
     /// Photos with a depth map.
     depth_maps: usize,
     /// Number of annotated boxes by class.
@@ -110,6 +112,7 @@ pub(crate) fn run(args: &InspectArgs, output: &Output) -> Result<(), Failure> {
         views_with_lidar: source.sweeps.iter().flat_map(|sweep| &sweep.views).collect::<BTreeSet<_>>().len(),
         lidar_points: source.seeds.len(),
         radar_sweeps: source.road.len(),
+        radar_roads: source.roads(),
         depth_maps: source.depth_maps(),
         boxes: source.labels,
         moving: capture.objects.len(),
@@ -145,7 +148,8 @@ fn text(found: &Inspected, plan: Option<&Plan>) -> String {
         text += &format!("{sweeps} sweeps of a lidar, taken with {views} of the views\n");
     }
     if found.radar_sweeps > 0 {
-        text += &format!("{} sweeps of a radar\n", found.radar_sweeps);
+        let (sweeps, roads) = (found.radar_sweeps, found.radar_roads);
+        text += &format!("{sweeps} sweeps of a radar, which find the road from {roads} of them to the next\n");
     }
     if found.lidar_points > 0 {
         text += &format!("{} of the points come from these\n", found.lidar_points);

@@ -1,4 +1,4 @@
-//! Target depths of the views from lidar and depth maps, and the colours of points from lidar, with the photos in the store.
+//! Target depths of the views from lidar, radar and depth maps, and the colours of points from sweeps, with the photos in the store.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -44,7 +44,8 @@ pub(super) struct Depths<'a> {
     road: &'a [RoadStrip],
     /// The strip of which the sweep was taken with a view.
     road_of_view: BTreeMap<u32, usize>,
-    observations: Observations,
+    /// Where there is a road.
+    observations: Option<Observations>,
     maps: Maps<'a>,
 }
 
@@ -67,7 +68,7 @@ impl<'a> Depths<'a> {
             coloured_by,
             road: &source.road,
             road_of_view: road_of_view.collect(),
-            observations: Observations::new(&source.capture),
+            observations: (!source.road.is_empty()).then(|| Observations::new(&source.capture)),
             maps: Maps::new(source, downscale),
         }
     }
@@ -155,7 +156,7 @@ impl<'a> Depths<'a> {
         let seen = visible(camera, (0..).zip(places));
         let side = (SQUARE * camera.pinhole.fx.min(camera.pinhole.fy)).max(1.0) as u32;
         let square = |x: u32, y: u32| (y / side, x / side);
-        let observed = self.observations.of(number).iter().map(|&point| {
+        let observed = self.observations.iter().flat_map(|all| all.of(number)).map(|&point| {
             let (at, _) = camera.project(capture.points.positions[point as usize]);
             pixel_at(at, camera.pinhole.width, camera.pinhole.height)
         });

@@ -10,6 +10,7 @@
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
+use glam::DVec3;
 use rayon::prelude::*;
 use scene::lidar::{self, SweepPose};
 use scene::{BadInput, View};
@@ -23,6 +24,8 @@ use crate::radar::RadarSweep;
 const MAX_POSES_BYTES: u64 = 1 << 30;
 /// A sweep that does not name its photos was taken at the time of those within this distance of the sensor, metres.
 const OWN_METRES: f64 = 2.5;
+/// A radar looks ahead: its z axis has at least this part of the world's, as no road is steeper.
+const LEAST_UP: f64 = 0.7;
 
 /// The sweeps of the capture's lidar, in the file's order; none if it has no such file.
 pub(super) fn of_lidar(root: &CaptureRoot, views: &[View]) -> Result<Vec<Sweep>, BadInput> {
@@ -47,6 +50,11 @@ pub(super) fn of_radar(root: &CaptureRoot, views: &[View]) -> Result<Vec<RadarSw
         };
         let velocity = pose.velocity.ok_or_else(|| lacks("velocity"))?;
         let height = pose.height.ok_or_else(|| lacks("height"))?;
+        if (world_from_sensor.rotation * DVec3::Z).z < LEAST_UP {
+            let advice = "turn the capture, or remove the folder radar";
+            let problem = "does not stand upright: the z axis of a capture with a radar must point up";
+            return Err(BadInput::new(format!("radar sweep {name}"), problem, advice));
+        }
         Ok(RadarSweep { path, readings, world_from_sensor, velocity, height, views })
     };
     listed(root, "radar", "csv", views)?.into_iter().map(sweep).collect()

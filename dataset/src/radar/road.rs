@@ -10,7 +10,7 @@
 
 use std::collections::{BTreeMap, HashSet};
 
-use glam::{DVec2, DVec3, I64Vec3, IVec2};
+use glam::{DVec2, DVec3, I64Vec3};
 use rayon::prelude::*;
 use scene::radar::Detection;
 use scene::{BadInput, Rigid, SparsePoints};
@@ -42,6 +42,10 @@ const STEP_METRES: f64 = 0.25;
 const SPARSE_METRES: f64 = 0.25;
 /// Consecutive sweeps this close were taken on one drive, metres.
 const DRIVE_METRES: f64 = 20.0;
+/// Most detections of all sweeps: 80,000 sweeps of a car's radar.
+const MAX_DETECTIONS: usize = 20_000_000;
+/// Sweeps read before their detections are counted.
+const CHUNK: usize = 32;
 /// Half the angle that something moving hides, radians.
 const SHADOW_RADIANS: f64 = 0.05;
 
@@ -58,13 +62,33 @@ pub struct RoadStrip {
     moving: Vec<(DVec3, f64)>,
 }
 
+/// The detections of each sweep.
+fn read(sweeps: &[RadarSweep]) -> Result<Vec<Vec<Detection>>, BadInput> {
+    let (mut read, mut count) = (Vec::with_capacity(sweeps.len()), 0);
+    for chunk in sweeps.chunks(CHUNK) {
+        // All results first, then the first error in order, whichever thread is faster.
+        let found: Vec<_> = chunk.par_iter().map(RadarSweep::read).collect();
+        for (sweep, found) in chunk.iter().zip(found) {
+            let found = found?;
+            count += found.len();
+            if count > MAX_DETECTIONS {
+                let problem =
+                    format!("is where the sweeps of the radar have over {MAX_DETECTIONS} detections together");
+                let advice = "leave out sweeps in radar/poses.jsonl, or the weakest detections";
+                return Err(BadInput::new(sweep.path.display().to_string(), problem, advice));
+            }
+            read.push(found);
+        }
+    }
+    Ok(read)
+}
+
 /// The road along the drives of a radar. Where the capture has sparse points there are no initial points.
 ///
 /// # Errors
 /// A sweep that cannot be read.
 pub(crate) fn strips(sweeps: Vec<RadarSweep>, points: &SparsePoints) -> Result<Vec<RoadStrip>, BadInput> {
-    let read: Vec<_> = sweeps.par_iter().map(RadarSweep::read).collect();
-    let read = read.into_iter().collect::<Result<Vec<_>, _>>()?;
+    let read = read(&sweeps)?;
     let (mut standing, mut moving) = (Vec::new(), Vec::new());
     for (sweep, found) in sweeps.iter().zip(&read) {
         let pose = &sweep.world_from_sensor;
@@ -93,6 +117,11 @@ impl RoadStrip {
     /// Where the sensor was, world metres.
     pub(crate) fn origin(&self) -> DVec3 {
         self.origin
+    }
+
+    /// Whether there is any road.
+    pub(crate) fn is_empty(&self) -> bool {
+        self.places.is_empty()
     }
 
     /// The places on the road.
@@ -128,16 +157,16 @@ impl Scan for RoadStrip {
 }
 
 /// Places where something stands, that two sweeps found, by square cells of the ground.
-struct Obstacles(BTreeMap<[i32; 2], Vec<DVec2>>);
+struct Obstacles(BTreeMap<[i64; 2], Vec<DVec2>>);
 
 impl Obstacles {
     /// Of the places of each sweep with their ranges.
     fn new(standing: &[Vec<(DVec3, f64)>], sweeps: &[RadarSweep]) -> Self {
-        let mut all: BTreeMap<[i32; 2], Vec<(usize, DVec2)>> = BTreeMap::new();
+        let mut all: BTreeMap<[i64; 2], Vec<(usize, DVec2)>> = BTreeMap::new();
         for (sweep, places) in standing.iter().enumerate() {
             for (place, _) in places {
                 let place = place.truncate();
-                all.entry(cell(place).to_array()).or_default().push((sweep, place));
+                all.entry(cell(place)).or_default().push((sweep, place));
             }
         }
         let origin = |sweep: usize| sweeps[sweep].world_from_sensor.translation;
@@ -154,9 +183,9 @@ impl Obstacles {
             flat.filter(|(place, range)| is_confirmed(sweep, *place, *range)).map(|(place, _)| place).collect()
         };
         let confirmed: Vec<_> = standing.par_iter().enumerate().map(of_sweep).collect();
-        let mut cells: BTreeMap<[i32; 2], Vec<DVec2>> = BTreeMap::new();
+        let mut cells: BTreeMap<[i64; 2], Vec<DVec2>> = BTreeMap::new();
         for place in confirmed.into_iter().flatten() {
-            cells.entry(cell(place).to_array()).or_default().push(place);
+            cells.entry(cell(place)).or_default().push(place);
         }
         Self(cells)
     }
@@ -165,7 +194,7 @@ impl Obstacles {
     fn clearance(&self, place: DVec2, left: DVec2) -> [f64; 2] {
         let mut nearest = [f64::INFINITY; 2];
         let steps = ((MAX_HALF_ROAD + MARGIN_METRES) / CELL_METRES).ceil() as i32;
-        let mut cells: Vec<[i32; 2]> =
+        let mut cells: Vec<[i64; 2]> =
             (-steps..=steps).flat_map(|i| around(place + left * (CELL_METRES * f64::from(i)))).collect();
         cells.sort_unstable();
         cells.dedup();
@@ -183,14 +212,14 @@ impl Obstacles {
     }
 }
 
-fn cell(place: DVec2) -> IVec2 {
-    (place / CELL_METRES).floor().as_ivec2()
+fn cell(place: DVec2) -> [i64; 2] {
+    (place / CELL_METRES).floor().as_i64vec2().to_array()
 }
 
 /// The cell of a place and the eight beside it.
-fn around(place: DVec2) -> impl Iterator<Item = [i32; 2]> {
-    let at = cell(place);
-    (-1..=1).flat_map(move |x| (-1..=1).map(move |y| (at + IVec2::new(x, y)).to_array()))
+fn around(place: DVec2) -> impl Iterator<Item = [i64; 2]> {
+    let steps = || [-CELL_METRES, 0.0, CELL_METRES].into_iter();
+    steps().flat_map(move |x| steps().map(move |y| cell(place + DVec2::new(x, y))))
 }
 
 /// The cube of [`SPARSE_METRES`] that a place is in.

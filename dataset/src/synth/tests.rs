@@ -510,6 +510,15 @@ fn a_radar_says_where_the_road_is_that_photos_show() {
         let error = open(folder.path(), &options).map(|_| ()).unwrap_err().to_string();
         assert!(error.contains(&format!("does not have the key {key}")) && !error.contains('\n'), "{error}");
     }
+    let mut fallen: serde_json::Value = serde_json::from_str(text.lines().next().unwrap()).unwrap();
+    fallen["world_from_sensor"]["rotation"] = serde_json::json!([1, 0, 0, 0]);
+    fs::write(&poses, fallen.to_string()).unwrap();
+    let error = open(folder.path(), &options).map(|_| ()).unwrap_err().to_string();
+    assert!(error.contains("does not stand upright"), "{error}");
+    // One sweep spans no road, so there are no target depths.
+    fs::write(&poses, text.lines().next().unwrap()).unwrap();
+    let alone = open(folder.path(), &options).unwrap();
+    assert!(alone.road.len() == 1 && alone.roads() == 0 && !alone.is_measured());
     fs::write(&poses, &text).unwrap();
     let sweep = fs::read_dir(folder.path().join("radar")).unwrap().map(|entry| entry.unwrap().path());
     let sweep = sweep.filter(|path| path.extension().is_some_and(|of| of == "csv")).min().unwrap();
