@@ -98,7 +98,7 @@ pub struct PlanSettings {
     pub test_stretches: f64,
     /// Whether the root refines the poses of the training views, which all other blocks reuse unchanged.
     pub refine_poses: bool,
-    /// Whether the root refines the mounts and clocks of the sensors that took the photos; all other blocks reuse the poses.
+    /// Whether the root refines the mounts, focal lengths and clocks of the sensors that took the photos; all other blocks reuse the cameras.
     pub refine_sensors: bool,
     /// Whether tasks of the job train the capture's objects that move.
     pub objects: bool,

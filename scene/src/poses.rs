@@ -59,9 +59,9 @@ impl SensorError {
     }
 }
 
-/// Whether focal lengths can be multiplied by this.
+/// Whether focal lengths can be multiplied by this, and stay finite.
 fn is_factor(factor: f64) -> bool {
-    factor.is_finite() && factor > 0.0
+    (1e-3..=1e3).contains(&factor)
 }
 
 impl FromIterator<(u32, RefinedCamera)> for Poses {
@@ -130,7 +130,9 @@ impl Poses {
             }
             let focal_factor = number(7);
             if !is_factor(focal_factor) {
-                return Err(CodecError::new(format!("the focal length of view {view} is not a positive number")));
+                return Err(CodecError::new(format!(
+                    "the focal length of view {view} is not multiplied by 0.001 to 1000"
+                )));
             }
             poses.insert(view, RefinedCamera { camera_from_world: pose, focal_factor });
         }

@@ -41,7 +41,7 @@ pub struct Job<'a> {
     pub trains_exposures: bool,
     /// Refines the poses of the views' cameras, which are the start.
     pub trains_poses: bool,
-    /// The sensor of each view of the capture, whose mounts and clocks are refined; `None`: they are not.
+    /// The sensor of each view of the capture, whose mounts, focal lengths and clocks are refined; `None`: they are not.
     pub sensors: Option<&'a [Taken]>,
     /// Hyperparameters.
     pub recipe: &'a Recipe,

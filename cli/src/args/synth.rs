@@ -160,7 +160,7 @@ with --lidar, for every place NAME (street-LEG-NUMBER) where a photo of the car 
   lidar/NAME.npy         float64 x 7, ground truth of each point: world position, range, intensity, seconds since the
                          middle of the turn, 1 if it was seen through glass
   lidar/poses.jsonl      each turn: time, pose, motion, and the photos taken during it; plat train reads it
-with --radar: radar/NAME.csv (readings, then their ground truth), radar/poses.jsonl
+with --radar: radar/NAME.csv (readings, then their ground truth), radar/poses.jsonl; plat train reads the readings
 with --nuscenes, in nuscenes/, which plat and the nuScenes devkit read (a scene is a drive of a car, scene-LEG):
   v1.0-mini/*.json       thirteen tables; the boxes are of vehicles and people within 70 m, seen or hit by the lidar
   samples/CAM_*/NAME.png, samples/LIDAR_TOP/NAME.pcd.bin (float32 x 5, corrected for the car's motion), maps/none.png
