@@ -132,6 +132,7 @@ impl<'a> Pruner<'a> {
             trains_exposures: false,
             trains_poses: false,
             sensors: None,
+            path: None,
             recipe: &recipe,
             source: &self.weighted,
             picture_loss: None,

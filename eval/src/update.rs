@@ -302,6 +302,7 @@ impl Area<'_> {
             trains_exposures: false,
             trains_poses: false,
             sensors: None,
+            path: None,
             recipe: &recipe,
             source: self.reader,
             picture_loss: None,

@@ -160,9 +160,9 @@ fn objects_of(
 ) -> Result<Vec<ModelObject>, ModelError> {
     let results = results.get(plan.first_object()..).unwrap_or_default();
     let object = |(task, id): (&ObjectTask, &ArtefactId)| {
-        let about = capture.objects.get(task.object as usize).ok_or(ModelError::NoObject(task.object))?.clone();
-        let decoded = frame::decode_splats(&store.get(*id)?);
-        let splats = decoded.map_err(|error| ModelError::DamagedObject(about.id.clone(), error))?;
+        let about = capture.objects.get(task.object as usize).ok_or(ModelError::NoObject(task.object))?;
+        let decoded = objects::from_frame(&store.get(*id)?, about);
+        let (about, splats) = decoded.map_err(|error| ModelError::DamagedObject(about.id.clone(), error))?;
         Ok(ModelObject { about, splats })
     };
     plan.object_tasks.iter().zip(results).map(object).collect()

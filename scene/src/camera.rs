@@ -38,6 +38,13 @@ impl Rigid {
         Self { rotation, translation: self.apply(first.translation) }
     }
 
+    /// This share of the way to `other`, 0 to 1: straight, and by slerp.
+    #[must_use]
+    pub fn between(&self, other: &Self, share: f64) -> Self {
+        let rotation = self.rotation.slerp(other.rotation, share).normalize();
+        Self { rotation, translation: self.translation.lerp(other.translation, share) }
+    }
+
     /// True if every number is finite and the quaternion has unit length within 1e-3.
     pub fn is_sane(&self) -> bool {
         self.translation.is_finite() && self.rotation.is_finite() && (self.rotation.length() - 1.0).abs() < 1e-3

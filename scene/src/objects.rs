@@ -16,6 +16,11 @@ use serde::{Deserialize, Serialize};
 
 use crate::camera::Rigid;
 use crate::error::CodecError;
+use crate::frame::{self, Kind};
+use crate::splats::Splats;
+
+/// A trained object: its path, and as the bulk a frame of its splats, in its own axes.
+pub const OBJECT: Kind = Kind(*b"movo", 1);
 
 /// An object keeps its first and its last pose for this long before and after, seconds. nuScenes annotates every half second.
 const ALONE_SECONDS: f64 = 0.3;
@@ -68,12 +73,25 @@ impl MovingObject {
         match (after.checked_sub(1).and_then(|i| self.path.get(i)), self.path.get(after)) {
             (Some(a), Some(b)) => {
                 let share = (seconds - a.seconds) / (b.seconds - a.seconds).max(f64::MIN_POSITIVE);
-                let (from, to) = (a.world_from_object, b.world_from_object);
-                let rotation = from.rotation.slerp(to.rotation, share).normalize();
-                Some(Rigid { rotation, translation: from.translation.lerp(to.translation, share) })
+                Some(a.world_from_object.between(&b.world_from_object, share))
             }
             (a, b) => a.and_then(near).or_else(|| b.and_then(near)),
         }
+    }
+
+    /// Its path where the object moves, at these times in seconds (ascending), by these motions in its own axes: between two times by
+    /// what lies between them, before the first as then, after the last as then. It has a pose at every time that the given path
+    /// and the motions have one.
+    pub fn moved(&self, motions: &[(f64, Rigid)]) -> Vec<PathPose> {
+        let given = self.path.iter().map(|pose| pose.seconds);
+        let mut times: Vec<f64> = given.chain(motions.iter().map(|(seconds, _)| *seconds)).collect();
+        times.sort_unstable_by(f64::total_cmp);
+        times.dedup();
+        let pose = |seconds: f64| {
+            let world_from_object = self.pose(seconds)?.after(&motion_at(motions, seconds));
+            Some(PathPose { seconds, world_from_object })
+        };
+        times.into_iter().filter_map(pose).collect()
     }
 
     /// The corners of the box in its own axes that its pixels lie in, numbered by the bits of their signs along x, y and z. Boxes are
@@ -130,6 +148,31 @@ impl MovingObject {
         }
         Ok(())
     }
+}
+
+/// The motion at a time.
+fn motion_at(motions: &[(f64, Rigid)], seconds: f64) -> Rigid {
+    let after = motions.partition_point(|(at, _)| *at < seconds);
+    match (after.checked_sub(1).and_then(|i| motions.get(i)), motions.get(after)) {
+        (Some((from, a)), Some((to, b))) => a.between(b, (seconds - from) / (to - from).max(f64::MIN_POSITIVE)),
+        (a, b) => a.or(b).map_or(Rigid::IDENTITY, |(_, motion)| *motion),
+    }
+}
+
+/// Encodes a trained object.
+pub fn to_frame(path: &[PathPose], splats: &Splats) -> Vec<u8> {
+    frame::encode(OBJECT, &path, &frame::encode_splats(splats))
+}
+
+/// Decodes a trained object of which all else is known.
+///
+/// # Errors
+/// As [`frame::decode`], splats or a path that are wrong.
+pub fn from_frame(bytes: &[u8], about: &MovingObject) -> Result<(MovingObject, Splats), CodecError> {
+    let (path, splats): (Vec<PathPose>, _) = frame::decode(OBJECT, bytes)?;
+    let object = MovingObject { path, ..about.clone() };
+    object.check()?;
+    Ok((object, frame::decode_splats(splats)?))
 }
 
 /// Whether a text can name an object: 1 to 64 letters, digits, `-` and `_`.

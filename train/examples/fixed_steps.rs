@@ -58,6 +58,7 @@ fn steps() -> Splats {
         trains_exposures: false,
         trains_poses: false,
         sensors: None,
+        path: None,
         recipe: &recipe,
         source: &photos,
         picture_loss: None,

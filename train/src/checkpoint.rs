@@ -10,6 +10,7 @@ use crate::exposure::ExposureTraining;
 use crate::growth::DensificationStats;
 use crate::optimiser::Adam;
 use crate::pose::PoseTraining;
+use crate::pose::path::PathTraining;
 use crate::pose::sensors::{NUMBERS, SensorTraining};
 
 /// A checkpoint. The header is [`Header`]. The bulk holds, little endian:
@@ -17,8 +18,10 @@ use crate::pose::sensors::{NUMBERS, SensorTraining};
 /// - the densification error of each splat (f32);
 /// - per trained exposure: view, steps (u32), then value, first and second moment (twelve f32 each);
 /// - per trained pose: view, steps (u32), then displacement, first and second moment (six f32 each);
+/// - per refined sensor: steps (u32), then numbers, first and second moment (eight f32 each);
+/// - per time of a refined path: steps (u32), then motion, first and second moment (six f32 each);
 /// - all attributes of the splats (u32).
-const CHECKPOINT: Kind = Kind(*b"ckpt", 7);
+const CHECKPOINT: Kind = Kind(*b"ckpt", 8);
 
 /// Everything that a training step depends on besides its job.
 #[derive(Debug, Clone)]
@@ -58,6 +61,8 @@ struct Header {
     pose_count: Option<u64>,
     /// Number of sensors, where their errors are trained with the poses.
     sensor_count: Option<u64>,
+    /// Number of times of the object's path, where it is refined with the poses.
+    time_count: Option<u64>,
     /// Names of the splats' attributes.
     attributes: Vec<String>,
 }
@@ -68,6 +73,8 @@ const EXPOSURE_WORDS: usize = 2 + 3 * 12;
 const POSE_WORDS: usize = 2 + 3 * 6;
 /// 32-bit words of a sensor in a checkpoint.
 const SENSOR_WORDS: usize = 1 + 3 * NUMBERS;
+/// 32-bit words of a time of a path in a checkpoint.
+const TIME_WORDS: usize = 1 + 3 * 6;
 
 impl State {
     /// Steps done.
@@ -77,6 +84,10 @@ impl State {
 
     fn sensors(&self) -> Option<&SensorTraining> {
         self.poses.as_ref()?.sensors.as_ref()
+    }
+
+    fn path(&self) -> Option<&PathTraining> {
+        self.poses.as_ref()?.path.as_ref()
     }
 
     /// Encodes a checkpoint.
@@ -94,6 +105,7 @@ impl State {
             exposure_count: self.exposures.as_ref().map(|exposures| exposures.views.len() as u64),
             pose_count: self.poses.as_ref().map(|poses| poses.views.len() as u64),
             sensor_count: self.sensors().map(|sensors| sensors.steps.len() as u64),
+            time_count: self.path().map(|path| path.steps.len() as u64),
             attributes: self.splats.attribute_names(),
         };
         let columns = self.splats.columns().iter().chain(first).chain(second);
@@ -106,6 +118,9 @@ impl State {
             write_rows(&mut bulk, views, steps, values);
         }
         if let Some(SensorTraining { steps, values }) = self.sensors() {
+            write_rows(&mut bulk, &[], steps, values);
+        }
+        if let Some(PathTraining { steps, values }) = self.path() {
             write_rows(&mut bulk, &[], steps, values);
         }
         let attributes = self.splats.attributes().iter().flat_map(|attribute| &attribute.values);
@@ -133,6 +148,8 @@ impl State {
         let words = words.and_then(|words| words.checked_add(posed.checked_mul(POSE_WORDS as u64)?));
         let sensed = header.sensor_count.unwrap_or(0);
         let words = words.and_then(|words| words.checked_add(sensed.checked_mul(SENSOR_WORDS as u64)?));
+        let timed = header.time_count.unwrap_or(0);
+        let words = words.and_then(|words| words.checked_add(timed.checked_mul(TIME_WORDS as u64)?));
         let attribute_words = (header.attributes.len() as u64).checked_mul(header.count);
         let words = words.and_then(|words| words.checked_add(attribute_words?));
         if words.and_then(|words| words.checked_mul(4)) != Some(bulk.len() as u64)
@@ -146,7 +163,8 @@ impl State {
         let (stats_bytes, rest) = rest.split_at(4 * stats_count);
         let (exposure_bytes, rest) = rest.split_at(4 * EXPOSURE_WORDS * exposed as usize);
         let (pose_bytes, rest) = rest.split_at(4 * POSE_WORDS * posed as usize);
-        let (sensor_bytes, attribute_bytes) = rest.split_at(4 * SENSOR_WORDS * sensed as usize);
+        let (sensor_bytes, rest) = rest.split_at(4 * SENSOR_WORDS * sensed as usize);
+        let (path_bytes, attribute_bytes) = rest.split_at(4 * TIME_WORDS * timed as usize);
         let mut all = columns_bytes.chunks_exact(4 * count).map(floats);
         let splats = Splats::from_columns(all.by_ref().take(columns).collect()).ok_or_else(wrong)?;
         let splats = frame::with_attributes(splats, &header.attributes, attribute_bytes)?;
@@ -162,7 +180,11 @@ impl State {
                 let (steps, values) = read_values(sensor_bytes, count as usize);
                 SensorTraining { steps, values }
             });
-            PoseTraining { views, steps, values, sensors }
+            let path = header.time_count.map(|count| {
+                let (steps, values) = read_values(path_bytes, count as usize);
+                PathTraining { steps, values }
+            });
+            PoseTraining { views, steps, values, sensors, path }
         };
         Ok(Self {
             step: header.step,
@@ -253,6 +275,7 @@ mod tests {
                     steps: vec![5, 9],
                     values: [1.0, 0.5, 0.25].map(|v| vec![[v; NUMBERS], [4.0 * v; NUMBERS]]),
                 }),
+                path: Some(PathTraining { steps: vec![3], values: [1.0, 0.5, 0.25].map(|v| vec![[5.0 * v; 6]]) }),
             });
             let state = State {
                 step,
@@ -277,14 +300,16 @@ mod tests {
             assert!(State::from_frame(&[]).is_err());
         }
         // A header that announces more than the bulk holds.
-        for (count, exposure_count, pose_count, sensor_count) in [
-            (u64::MAX / 3, None, None, None),
-            (1, Some(u64::MAX / 38), None, None),
-            (1, Some(1), None, None),
-            (1, None, Some(u64::MAX / 20), None),
-            (1, None, Some(1), None),
-            (1, None, None, Some(u64::MAX / 22)),
-            (1, None, None, Some(1)),
+        for (count, exposure_count, pose_count, sensor_count, time_count) in [
+            (u64::MAX / 3, None, None, None, None),
+            (1, Some(u64::MAX / 38), None, None, None),
+            (1, Some(1), None, None, None),
+            (1, None, Some(u64::MAX / 20), None, None),
+            (1, None, Some(1), None, None),
+            (1, None, None, Some(u64::MAX / 22), None),
+            (1, None, None, Some(1), None),
+            (1, None, None, None, Some(u64::MAX / 19)),
+            (1, None, None, None, Some(1)),
         ] {
             let header = Header {
                 step: 1,
@@ -298,6 +323,7 @@ mod tests {
                 exposure_count,
                 pose_count,
                 sensor_count,
+                time_count,
                 attributes: Vec::new(),
             };
             assert!(State::from_frame(&frame::encode(CHECKPOINT, &header, &[0; 64])).is_err());

@@ -50,7 +50,7 @@ impl<'a> PoseFinder<'a> {
         views: &[TrainView],
         source: &'a dyn WindowSource,
     ) -> Result<Self, TrainError> {
-        let given = Arc::new(GivenPoses::of(views, splats, false, None));
+        let given = Arc::new(GivenPoses::of(views, splats, false, None, None));
         let isa = Isa::detect();
         let state = State {
             step: 0,
@@ -113,6 +113,7 @@ impl<'a> PoseFinder<'a> {
                     pose_rates: Some(PoseRates {
                         views: Some(Rates { rate: FIRST_RATE * (last_rate / FIRST_RATE).powf(progress), decay: 0.0 }),
                         sensors: None,
+                        path: None,
                     }),
                 };
                 self.device.step(&mut self.state, step)?;

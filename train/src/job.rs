@@ -7,6 +7,7 @@ use scene::{Exposures, Splats};
 use crate::device::Backend;
 use crate::free_space::FreeSpace;
 use crate::picture_loss::PictureLoss;
+use crate::pose::path::ObjectTimes;
 use crate::recipe::Recipe;
 use crate::source::WindowSource;
 use crate::view::TrainView;
@@ -43,6 +44,8 @@ pub struct Job<'a> {
     pub trains_poses: bool,
     /// The sensor of each view of the capture, whose mounts, focal lengths and clocks are refined; `None`: they are not.
     pub sensors: Option<&'a [Taken]>,
+    /// When the views see the object that is trained, whose path is refined, on the CPU only; `None`: it is not.
+    pub path: Option<&'a ObjectTimes>,
     /// Hyperparameters.
     pub recipe: &'a Recipe,
     /// Photos.

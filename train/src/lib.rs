@@ -41,6 +41,7 @@ pub use find_pose::PoseFinder;
 pub use free_space::FreeSpace;
 pub use job::{Flow, Job};
 pub use picture_loss::PictureLoss;
+pub use pose::path::ObjectTimes;
 pub use recipe::Recipe;
 pub use road_poses::{Positions, road_poses};
 pub use source::WindowSource;

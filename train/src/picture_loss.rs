@@ -138,7 +138,7 @@ pub(crate) mod tests {
 
     /// The loss of a step and its gradient along the splats' first colour column.
     fn step(splats: &Splats, context: &Splats, picture_weight: f32) -> (f64, Vec<f32>) {
-        let given = Arc::new(GivenPoses::of(&[], &Splats::new(0), true, None));
+        let given = Arc::new(GivenPoses::of(&[], &Splats::new(0), true, None, None));
         let mut state = State {
             step: 0,
             skipped: 0,

@@ -20,10 +20,12 @@ use scene::{Camera, Rigid, Splats};
 
 pub(crate) use self::adam::{Rates, TRANSLATION_RATE};
 use self::adam::{joined, median};
+use self::path::{ObjectTimes, PathRates, PathTraining};
 use self::sensors::{GivenSensors, SensorTraining};
 use crate::view::TrainView;
 
 mod adam;
+pub(crate) mod path;
 pub(crate) mod sensors;
 
 /// Splats whose depths a view's median is taken of.
@@ -43,11 +45,19 @@ pub(crate) struct GivenPoses {
     pub(crate) is_anchored: bool,
     /// What errors of sensors do, where those are refined.
     pub(crate) sensors: Option<GivenSensors>,
+    /// When the cameras see the object that is trained, where its path is refined.
+    pub(crate) times: Option<ObjectTimes>,
 }
 
 impl GivenPoses {
     /// The cameras of these views. `splats` are those at the start of training.
-    pub(crate) fn of(views: &[TrainView], splats: &Splats, is_anchored: bool, taken: Option<&[Taken]>) -> Self {
+    pub(crate) fn of(
+        views: &[TrainView],
+        splats: &Splats,
+        is_anchored: bool,
+        taken: Option<&[Taken]>,
+        times: Option<&ObjectTimes>,
+    ) -> Self {
         let mut windows: Vec<&TrainView> = views.iter().collect();
         windows.sort_by_key(|view| view.view);
         windows.dedup_by_key(|view| view.view);
@@ -65,6 +75,7 @@ impl GivenPoses {
             depths,
             offsets: centres.into_iter().map(|centre| centre - mean).collect(),
             is_anchored,
+            times: times.cloned(),
         }
     }
 
@@ -107,6 +118,8 @@ pub(crate) struct PoseRates {
     pub(crate) views: Option<Rates>,
     /// Of all cameras of a sensor; the step of one photo is a share of it.
     pub(crate) sensors: Option<Rates>,
+    /// Of the path of the object that is trained.
+    pub(crate) path: Option<PathRates>,
 }
 
 /// Displacements in training, each with its own Adam state. A view's step count is the number of times that it was
@@ -121,6 +134,8 @@ pub(crate) struct PoseTraining {
     pub(crate) values: [Vec<[f32; 6]>; 3],
     /// Where errors of sensors are refined.
     pub(crate) sensors: Option<SensorTraining>,
+    /// Where the path of an object is refined.
+    pub(crate) path: Option<PathTraining>,
 }
 
 impl PoseTraining {
@@ -132,6 +147,7 @@ impl PoseTraining {
             steps: vec![0; given.views.len()],
             values: [zeros(), zeros(), zeros()],
             sensors: given.sensors.as_ref().map(SensorTraining::new),
+            path: given.times.as_ref().map(PathTraining::new),
         }
     }
 
@@ -145,7 +161,10 @@ impl PoseTraining {
     /// The camera in a row, from its given pose.
     fn refined(&self, given: &GivenPoses, at: usize, pose: &Rigid) -> RefinedCamera {
         let [motion @ .., focal] = self.displacement(given, at);
-        RefinedCamera { camera_from_world: displaced(pose, &motion), focal_factor: f64::from(focal).exp() }
+        let pose = displaced(pose, &motion);
+        let path = self.path.as_ref().zip(given.times.as_ref());
+        let camera_from_world = path.map_or(pose, |(path, times)| path.apply(times, given.views[at], &pose));
+        RefinedCamera { camera_from_world, focal_factor: f64::from(focal).exp() }
     }
 
     /// The displacement of the camera in a row: its own, and that by its sensor; and what ln(focal length) is greater by.
@@ -156,6 +175,11 @@ impl PoseTraining {
             sum.iter_mut().zip(sensors.displacement(given, at)).for_each(|(sum, by_sensor)| *sum += by_sensor);
         }
         sum
+    }
+
+    /// The motion of the object at each time in seconds, where its path is refined.
+    pub(crate) fn motions(&self, given: &GivenPoses) -> Vec<(f64, Rigid)> {
+        self.path.as_ref().zip(given.times.as_ref()).map_or(Vec::new(), |(path, times)| path.motions(times))
     }
 
     /// The refined poses.
@@ -175,6 +199,11 @@ impl PoseTraining {
         };
         if let (Some(sensors), Some(given), Some(rates)) = (&mut self.sensors, &given.sensors, &rates.sensors) {
             sensors.step(given, at, gradient, rates);
+        }
+        if let (Some(times), Some(rates)) = (&given.times, rates.path) {
+            let refined = self.refined(given, at, &given.poses[at]).camera_from_world;
+            let [of_pose @ .., _] = *gradient;
+            self.path.iter_mut().for_each(|path| path.step(times, view, &refined, &of_pose, rates));
         }
         let Some(rates) = &rates.views else { return };
         let depth = given.depths.get(at).copied().unwrap_or(1.0);
@@ -267,7 +296,7 @@ mod tests {
 
     #[test]
     fn a_common_motion_of_all_cameras_is_removed_and_nothing_else() {
-        let given = GivenPoses::of(&views(9), &Splats::new(0), true, None);
+        let given = GivenPoses::of(&views(9), &Splats::new(0), true, None, None);
         assert_eq!(given.views, (0..9).map(|view| 2 * view).collect::<Vec<u32>>());
         let axes: Vec<DMat3> = given.poses.iter().map(|pose| DMat3::from_quat(pose.rotation)).collect();
         let own = |of: &dyn Fn(usize) -> [DVec3; 2]| -> Vec<[f32; 6]> {
@@ -290,10 +319,10 @@ mod tests {
 
     #[test]
     fn gradients_that_are_not_finite_or_of_unknown_views_change_nothing() {
-        let given = GivenPoses::of(&views(3), &Splats::new(0), true, None);
+        let given = GivenPoses::of(&views(3), &Splats::new(0), true, None, None);
         let mut training = PoseTraining::new(&given);
         let before = training.clone();
-        let rates = PoseRates { views: Some(Rates { rate: 0.1, decay: 0.0 }), sensors: None };
+        let rates = PoseRates { views: Some(Rates { rate: 0.1, decay: 0.0 }), sensors: None, path: None };
         training.step(&given, 2, &[f32::NAN, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0], &rates);
         training.step(&given, 3, &[1.0; 7], &rates);
         assert_eq!(training, before);

@@ -79,6 +79,12 @@ pub struct Recipe {
     /// As `pose`, of sensors: every photo of a sensor is a step of its numbers, so they may move further than one camera's.
     #[serde(default)]
     pub sensor: [f32; 2],
+    /// As `pose`, of the path of an object: metres of its ends.
+    #[serde(default)]
+    pub path: [f32; 2],
+    /// As `pose_decay`, of paths.
+    #[serde(default)]
+    pub path_decay: f32,
 }
 
 impl Default for Recipe {
@@ -110,6 +116,8 @@ impl Default for Recipe {
             pose_from: 0.05,
             pose_decay: 0.1,
             sensor: [0.4, 0.01],
+            path: [1.0, 0.05],
+            path_decay: 0.1,
         }
     }
 }
@@ -149,6 +157,7 @@ impl Recipe {
             exposure: scaled(self.exposure),
             pose: scaled(self.pose),
             sensor: scaled(self.sensor),
+            path: scaled(self.path),
             ..self
         }
     }

@@ -9,7 +9,7 @@ use std::sync::Arc;
 
 use render::Options;
 use render::cpu::Isa;
-use scene::{Camera, Exposures, Poses, Rect, Splats};
+use scene::{Camera, Exposures, Poses, Rect, Rigid, Splats};
 
 use crate::checkpoint::State;
 use crate::coarse_to_fine::{self, CoarseToFine};
@@ -20,6 +20,7 @@ use crate::exposure::ExposureTraining;
 use crate::growth::{self, DensificationStats};
 use crate::job::{Flow, Job};
 use crate::optimiser::{Adam, LearningRates};
+use crate::pose::path::PathRates;
 use crate::pose::{GivenPoses, PoseRates, PoseTraining, Rates};
 use crate::random;
 use crate::recipe::Recipe;
@@ -91,6 +92,9 @@ pub struct Trained {
     pub exposures: Option<Exposures>,
     /// The refined poses, where they are trained.
     pub poses: Option<Poses>,
+    /// Where the path of an object is refined: each time in seconds with the motion of the object then, in its own axes, that
+    /// `world_from_object` is followed by. Ascending.
+    pub motions: Vec<(f64, Rigid)>,
 }
 
 /// Trains a block. Calls `report` after every step.
@@ -132,7 +136,8 @@ pub fn train_from(
     trainer.device.download(&mut trainer.state, StatePart::Splats)?;
     let Trainer { state: State { splats, exposures, poses, .. }, given, .. } = trainer;
     let exposures = exposures.map(|exposures| exposures.exposures());
-    Ok(Trained { splats, exposures, poses: poses.map(|poses| poses.poses(&given)) })
+    let motions = poses.as_ref().map_or(Vec::new(), |poses| poses.motions(&given));
+    Ok(Trained { splats, exposures, poses: poses.map(|poses| poses.poses(&given)), motions })
 }
 
 /// A job with its state and device.
@@ -157,9 +162,12 @@ impl<'a> Trainer<'a> {
     fn new(mut job: Job<'a>, from: Option<State>) -> Result<Self, TrainError> {
         let Job { context, views, counts, steps, recipe, .. } = job;
         let initial = std::mem::replace(&mut job.initial, Splats::new(0));
-        let refines = job.trains_poses || job.sensors.is_some();
+        if job.path.is_some() && !matches!(job.backend, Backend::Cpu) {
+            return Err(TrainError::Device("the path of an object is refined on the CPU only".into()));
+        }
+        let refines = job.trains_poses || job.sensors.is_some() || job.path.is_some();
         let posed = if refines { views } else { &[] };
-        let given = Arc::new(GivenPoses::of(posed, &initial, true, job.sensors));
+        let given = Arc::new(GivenPoses::of(posed, &initial, true, job.sensors, job.path));
         let state = from.unwrap_or_else(|| State {
             step: 0,
             skipped: 0,
@@ -245,6 +253,10 @@ impl<'a> Trainer<'a> {
                 sensors: self.job.sensors.map(|_| Rates {
                     rate: geometric(recipe.sensor, progress) / visits,
                     decay: recipe.pose_decay / visits,
+                }),
+                path: self.job.path.map(|_| PathRates {
+                    metres: geometric(recipe.path, progress) / visits,
+                    decay: recipe.path_decay / visits,
                 }),
             }),
         };

@@ -117,6 +117,7 @@ fn with_job<R>(
         trains_exposures: false,
         trains_poses: false,
         sensors: None,
+        path: None,
         recipe: &recipe,
         source: photos,
         picture_loss: None,

@@ -19,6 +19,7 @@ use dataset::ingest::IngestError;
 use dataset::windows::{SharedTileCache, WindowReader};
 use perceive::Detector;
 use scene::frame::{self, TrainingInfo};
+use scene::objects;
 use scene::{ArtefactId, BlockId, Capture, Exposures, Poses, Splats};
 use store::BlockingStore;
 use train::Backend;
@@ -219,7 +220,7 @@ impl PlanExecutor {
         })
     }
 
-    /// Trains an object that moves; the artefact is its splats, in its own axes.
+    /// Trains an object that moves; the artefact is its path and its splats, in its own axes.
     fn object(
         &self,
         job: &Assignment,
@@ -229,7 +230,9 @@ impl PlanExecutor {
     ) -> Result<ArtefactId, ExecuteError> {
         let &Assignment { order, plan, capture, .. } = job;
         let TrainerContext { store, shared, options, .. } = &self.context;
-        let is_sound = |bytes: &[u8]| frame::decode_splats(bytes).is_ok();
+        let about = capture.objects.get(task.object as usize);
+        let about = about.ok_or_else(|| ExecuteError::work(format!("the capture has no object {}", task.object)))?;
+        let is_sound = |bytes: &[u8]| objects::from_frame(bytes, about).is_ok();
         self.kept_or(job, is_sound, || {
             let reader = job.reader(store, options.cache_bytes - 2 * self.remote_bytes);
             let (mut results, mut given) = (BTreeMap::new(), TrainingInfo::default());
@@ -247,7 +250,8 @@ impl PlanExecutor {
             let span = tracing::info_span!("train", object = task.object);
             let trained = self.pool.install(|| span.in_scope(|| training.train(results, memory, stopwatch, report)));
             shared.metrics.count_reads(reader.stats());
-            Ok(frame::encode_result(&trained?, TrainingInfo::default()))
+            let (path, splats) = trained?;
+            Ok(objects::to_frame(&path, &splats))
         })
     }
 

@@ -122,8 +122,9 @@ impl Inputs<'_> {
         self.for_each(&tasks, report, |of, bytes, _| {
             let Some(PlannedTask::Object(of)) = self.plan.planned(of) else { return Ok(()) };
             let missing = || ExecuteError::work(format!("the capture has no object {}", of.object));
-            let about = capture.objects.get(of.object as usize).ok_or_else(missing)?.clone();
-            objects.push(ModelObject { about, splats: frame::decode_splats(&bytes).map_err(ExecuteError::work)? });
+            let about = capture.objects.get(of.object as usize).ok_or_else(missing)?;
+            let (about, splats) = scene::objects::from_frame(&bytes, about).map_err(ExecuteError::work)?;
+            objects.push(ModelObject { about, splats });
             Ok(())
         })?;
         Ok(objects)

@@ -7,9 +7,9 @@ use blocks::{Cut, ObjectTask, Plan, object_camera};
 use dataset::windows::WindowReader;
 use glam::Vec3;
 use proto::FailureKind;
-use scene::{BlockId, Camera, Capture, Exposures, MovingObject, Poses, SparsePoints, Splats, View};
+use scene::{BlockId, Camera, Capture, Exposures, MovingObject, PathPose, Poses, SparsePoints, Splats, View};
 use train::growth::Growth;
-use train::{Backend, Job, Recipe, TrainError, TrainView, random};
+use train::{Backend, Job, ObjectTimes, Recipe, TrainError, TrainView, Trained, random};
 
 use crate::clock::Stopwatch;
 use crate::memory_budget::MemoryBudget;
@@ -41,7 +41,7 @@ pub(crate) struct ObjectTraining<'a> {
 }
 
 impl ObjectTraining<'_> {
-    /// The object's splats, in its own axes. `results` are those of the blocks around its path.
+    /// The object's path, refined with its splats, and these, in its own axes. `results` are those of the blocks around its path.
     ///
     /// # Errors
     /// Photos that cannot be read, training that fails, memory above the budget, or a report that was answered with [`Flow::Stop`].
@@ -51,7 +51,7 @@ impl ObjectTraining<'_> {
         mut memory: Option<MemoryBudget>,
         stopwatch: &Stopwatch,
         report: &mut Reporter,
-    ) -> Result<Splats, ExecuteError> {
+    ) -> Result<(Vec<PathPose>, Splats), ExecuteError> {
         let (plan, task) = (self.plan, self.task);
         let number = task.object as usize;
         let object = self.capture.objects.get(number);
@@ -67,8 +67,15 @@ impl ObjectTraining<'_> {
             growth: Growth { worth_db: 0.0, ..Growth::default() },
             ..Recipe::default()
         };
+        let mut recipe = recipe; // EXPERIMENT
+        if let Ok(given) = std::env::var("PLAT_X") {
+            let n: Vec<f32> = given.split(',').map(|n| n.parse().unwrap()).collect();
+            (recipe.path, recipe.path_decay) = ([n[0], n[1]], n[2]);
+        }
         let recipe = recipe.at_rate(self.order.rate_permille as f32 / FULL_RATE as f32);
         let sizes = size_bounds_metres(object);
+        let taken = views.iter().filter_map(|view| Some((view.view, self.capture.views[view.view as usize].seconds?)));
+        let times = ObjectTimes::of(taken, (object.high - object.low).max_element());
         let count = (INITIAL_SHARE * f64::from(task.budget)) as usize;
         let hull = visual_hull(&silhouettes, &views, count.max(1), seed);
         let (positions, colours) = hull.map_err(unread)?.into_iter().unzip();
@@ -90,6 +97,7 @@ impl ObjectTraining<'_> {
             trains_exposures: false,
             trains_poses: false,
             sensors: None,
+            path: std::env::var("PLAT_NOPATH").is_err().then_some(&times),
             recipe: &recipe,
             source: &silhouettes,
             picture_loss: None,
@@ -97,7 +105,7 @@ impl ObjectTraining<'_> {
             backend: &Backend::Cpu,
         };
         let (mut overrun, mut is_stopped) = (None, false);
-        let trained = train::train(job, &mut |mut now| {
+        let trained = train::train_from(job, None, &mut |mut now| {
             if now.step % REPORT_EVERY >= now.views && now.step < now.steps {
                 return train::Flow::Continue;
             }
@@ -115,7 +123,7 @@ impl ObjectTraining<'_> {
             is_stopped |= (flow == Flow::Stop || overrun.is_some()) && step < steps;
             if is_stopped { train::Flow::Stop } else { train::Flow::Continue }
         });
-        let mut splats = trained.map_err(|error| failure(object, &error))?;
+        let Trained { mut splats, motions, .. } = trained.map_err(|error| failure(object, &error))?;
         if let Some(resident) = overrun {
             let message = format!("object {}: the worker takes {} MiB, above its --memory", object.id, resident >> 20);
             return Err(ExecuteError::of(FailureKind::OutOfMemory, message));
@@ -126,7 +134,7 @@ impl ObjectTraining<'_> {
         if !plan.settings.antialiased {
             train::low_pass::to_full_resolution(&mut splats, &views);
         }
-        Ok(splats.filter(|i| is_part(object, splats.mean(i))))
+        Ok((object.moved(&motions), splats.filter(|i| is_part(object, splats.mean(i)))))
     }
 
     /// The windows, with cameras in the object's axes.

@@ -139,6 +139,7 @@ impl OneBlockTraining<'_> {
             trains_exposures: false,
             trains_poses: false,
             sensors: None,
+            path: None,
             recipe: &recipe,
             source: &reader,
             picture_loss: None,

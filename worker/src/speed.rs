@@ -57,6 +57,7 @@ fn step_seconds() -> f64 {
         trains_exposures: false,
         trains_poses: false,
         sensors: None,
+        path: None,
         recipe: &recipe,
         source: &Photo,
         picture_loss: None,

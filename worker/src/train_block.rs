@@ -83,6 +83,7 @@ impl Block<'_> {
             trains_exposures: plan.settings.exposure && task.parent.is_none(),
             trains_poses: plan.settings.refine_poses && task.parent.is_none(),
             sensors: sensors.as_ref().map(|sensors| &sensors.of_views[..]),
+            path: None,
             recipe: &recipe,
             source: self.reader,
             picture_loss: self.aligned.map(|aligned| aligned as &dyn PictureLoss),
@@ -111,7 +112,7 @@ impl Block<'_> {
         };
         progress.begin(trained + pruning.map_or(0, |pruning| pruning.steps(all_steps)));
 
-        let Trained { mut splats, exposures, poses } = self.optimise(job, limit.as_ref(), &mut progress)?;
+        let Trained { mut splats, exposures, poses, .. } = self.optimise(job, limit.as_ref(), &mut progress)?;
         let refined: Vec<TrainView> = match &poses {
             Some(poses) => {
                 views.iter().map(|view| TrainView { camera: poses.apply(view.view, view.camera), ..*view }).collect()

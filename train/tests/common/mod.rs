@@ -201,6 +201,7 @@ impl<'a> Setup<'a> {
             trains_exposures: self.trains_exposures,
             trains_poses: self.trains_poses,
             sensors: self.sensors,
+            path: None,
             recipe: &self.recipe,
             source: self.photos,
             picture_loss: self.picture_loss,

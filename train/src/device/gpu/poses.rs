@@ -63,7 +63,7 @@ impl GpuPoses {
     /// Replaces the poses in training.
     pub(super) fn upload(&mut self, gpu: &Gpu, training: Option<&PoseTraining>) -> Result<(), GpuError> {
         self.views = training.map(|training| training.views.clone());
-        let Some(PoseTraining { steps, values: [values, first, second], views, sensors }) = training else {
+        let Some(PoseTraining { steps, values: [values, first, second], views, sensors, .. }) = training else {
             return Ok(());
         };
         let rows = views.len() as u64;
@@ -100,7 +100,8 @@ impl GpuPoses {
             Ok(SensorTraining { steps: rows.iter().map(|row| row.steps).collect(), values })
         });
         let (views, steps, sensors) = (views.clone(), gpu.read(&self.steps, 0, rows)?, sensors.transpose()?);
-        Ok(Some(PoseTraining { views, steps, values, sensors }))
+        // Paths of objects are refined on the CPU.
+        Ok(Some(PoseTraining { views, steps, values, sensors, path: None }))
     }
 
     /// Row of the displacement of each sample; empty where poses are not trained.

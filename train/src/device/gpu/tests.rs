@@ -96,7 +96,7 @@ fn with_weights_and_depth(mut sample: ViewSample, key: u64) -> ViewSample {
 
 /// Poses of no view.
 fn none() -> Arc<GivenPoses> {
-    Arc::new(GivenPoses::of(&[], &Splats::new(0), true, None))
+    Arc::new(GivenPoses::of(&[], &Splats::new(0), true, None, None))
 }
 
 fn new_state(splats: Splats) -> State {
@@ -400,7 +400,7 @@ fn trained_poses_agree_with_the_cpu() {
     };
     let taken: Vec<Taken> =
         (0..10).map(|view| Taken { sensor: u32::from(view == 3), motion: (view != 2).then(|| motion(view)) }).collect();
-    let given = Arc::new(GivenPoses::of(&views, &cpu.splats, true, Some(&taken)));
+    let given = Arc::new(GivenPoses::of(&views, &cpu.splats, true, Some(&taken), None));
     let rows = |key: u64, size: f32| -> Vec<[f32; 6]> {
         let number = |view: &u32, k: u64| size * (uniform(key, 6 * u64::from(*view) + k) - 0.5);
         given.views.iter().map(|view| [0, 1, 2, 3, 4, 5].map(|k| number(view, k))).collect()
@@ -421,7 +421,7 @@ fn trained_poses_agree_with_the_cpu() {
     let mut cpu_device = super::super::cpu::CpuDevice::new(0.2, None, None, &given);
     let mut device = GpuDevice::new(&gpu, &cpu, 0.2, None, None, &given).unwrap();
     let rates = Some(Rates { rate: 2e-3, decay: 0.01 });
-    let pose_rates = Some(PoseRates { views: rates, sensors: rates });
+    let pose_rates = Some(PoseRates { views: rates, sensors: rates, path: None });
     for n in 0..3 {
         let samples: Vec<ViewSample> = samples_of_views().into_iter().skip(n).collect();
         let step = Step { samples, pose_rates, ..step(false, false, 1) };
