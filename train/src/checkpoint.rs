@@ -19,7 +19,7 @@ use crate::pose::sensors::{NUMBERS, SensorTraining};
 /// - per trained exposure: view, steps (u32), then value, first and second moment (twelve f32 each);
 /// - per trained pose: view, steps (u32), then displacement, first and second moment (six f32 each);
 /// - per refined sensor: steps (u32), then numbers, first and second moment (eight f32 each);
-/// - per time of a refined path: steps (u32), then motion, first and second moment (six f32 each);
+/// - of a refined path: steps (u32), then mean squares and the motion at each time (six f32 each);
 /// - all attributes of the splats (u32).
 const CHECKPOINT: Kind = Kind(*b"ckpt", 8);
 
@@ -73,8 +73,9 @@ const EXPOSURE_WORDS: usize = 2 + 3 * 12;
 const POSE_WORDS: usize = 2 + 3 * 6;
 /// 32-bit words of a sensor in a checkpoint.
 const SENSOR_WORDS: usize = 1 + 3 * NUMBERS;
-/// 32-bit words of a time of a path in a checkpoint.
-const TIME_WORDS: usize = 1 + 3 * 6;
+/// 32-bit words of a time of a path in a checkpoint, and of what all times share.
+const TIME_WORDS: usize = 6;
+const PATH_WORDS: usize = 1 + 6;
 
 impl State {
     /// Steps done.
@@ -105,7 +106,7 @@ impl State {
             exposure_count: self.exposures.as_ref().map(|exposures| exposures.views.len() as u64),
             pose_count: self.poses.as_ref().map(|poses| poses.views.len() as u64),
             sensor_count: self.sensors().map(|sensors| sensors.steps.len() as u64),
-            time_count: self.path().map(|path| path.steps.len() as u64),
+            time_count: self.path().map(|path| path.motions.len() as u64),
             attributes: self.splats.attribute_names(),
         };
         let columns = self.splats.columns().iter().chain(first).chain(second);
@@ -120,8 +121,9 @@ impl State {
         if let Some(SensorTraining { steps, values }) = self.sensors() {
             write_rows(&mut bulk, &[], steps, values);
         }
-        if let Some(PathTraining { steps, values }) = self.path() {
-            write_rows(&mut bulk, &[], steps, values);
+        if let Some(PathTraining { steps, squares, motions }) = self.path() {
+            bulk.extend(steps.to_le_bytes());
+            bulk.extend(squares.iter().chain(motions.iter().flatten()).flat_map(|value| value.to_le_bytes()));
         }
         let attributes = self.splats.attributes().iter().flat_map(|attribute| &attribute.values);
         bulk.extend(attributes.flat_map(|value| value.to_le_bytes()));
@@ -148,8 +150,10 @@ impl State {
         let words = words.and_then(|words| words.checked_add(posed.checked_mul(POSE_WORDS as u64)?));
         let sensed = header.sensor_count.unwrap_or(0);
         let words = words.and_then(|words| words.checked_add(sensed.checked_mul(SENSOR_WORDS as u64)?));
-        let timed = header.time_count.unwrap_or(0);
-        let words = words.and_then(|words| words.checked_add(timed.checked_mul(TIME_WORDS as u64)?));
+        let timed = header
+            .time_count
+            .map_or(Some(0), |count| count.checked_mul(TIME_WORDS as u64)?.checked_add(PATH_WORDS as u64));
+        let words = words.and_then(|words| words.checked_add(timed?));
         let attribute_words = (header.attributes.len() as u64).checked_mul(header.count);
         let words = words.and_then(|words| words.checked_add(attribute_words?));
         if words.and_then(|words| words.checked_mul(4)) != Some(bulk.len() as u64)
@@ -164,7 +168,7 @@ impl State {
         let (exposure_bytes, rest) = rest.split_at(4 * EXPOSURE_WORDS * exposed as usize);
         let (pose_bytes, rest) = rest.split_at(4 * POSE_WORDS * posed as usize);
         let (sensor_bytes, rest) = rest.split_at(4 * SENSOR_WORDS * sensed as usize);
-        let (path_bytes, attribute_bytes) = rest.split_at(4 * TIME_WORDS * timed as usize);
+        let (path_bytes, attribute_bytes) = rest.split_at(4 * timed.ok_or_else(wrong)? as usize);
         let mut all = columns_bytes.chunks_exact(4 * count).map(floats);
         let splats = Splats::from_columns(all.by_ref().take(columns).collect()).ok_or_else(wrong)?;
         let splats = frame::with_attributes(splats, &header.attributes, attribute_bytes)?;
@@ -180,9 +184,12 @@ impl State {
                 let (steps, values) = read_values(sensor_bytes, count as usize);
                 SensorTraining { steps, values }
             });
-            let path = header.time_count.map(|count| {
-                let (steps, values) = read_values(path_bytes, count as usize);
-                PathTraining { steps, values }
+            let path = header.time_count.map(|_| {
+                let (steps, rest) = path_bytes.split_at(4);
+                let numbers = floats(rest);
+                let mut rows = numbers.chunks_exact(6).map(|row| row.try_into().expect("6 numbers"));
+                let squares = rows.next().expect("the squares");
+                PathTraining { steps: integers(steps)[0], squares, motions: rows.collect() }
             });
             PoseTraining { views, steps, values, sensors, path }
         };
@@ -275,7 +282,7 @@ mod tests {
                     steps: vec![5, 9],
                     values: [1.0, 0.5, 0.25].map(|v| vec![[v; NUMBERS], [4.0 * v; NUMBERS]]),
                 }),
-                path: Some(PathTraining { steps: vec![3], values: [1.0, 0.5, 0.25].map(|v| vec![[5.0 * v; 6]]) }),
+                path: Some(PathTraining { steps: 3, squares: [0.5; 6], motions: vec![[5.0; 6], [0.25; 6]] }),
             });
             let state = State {
                 step,
@@ -308,7 +315,7 @@ mod tests {
             (1, None, Some(1), None, None),
             (1, None, None, Some(u64::MAX / 22), None),
             (1, None, None, Some(1), None),
-            (1, None, None, None, Some(u64::MAX / 19)),
+            (1, None, None, None, Some(u64::MAX / 6)),
             (1, None, None, None, Some(1)),
         ] {
             let header = Header {

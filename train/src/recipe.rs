@@ -116,7 +116,7 @@ impl Default for Recipe {
             pose_from: 0.05,
             pose_decay: 0.1,
             sensor: [0.4, 0.01],
-            path: [1.0, 0.05],
+            path: [0.3, 0.02],
             path_decay: 0.1,
         }
     }

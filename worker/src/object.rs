@@ -67,11 +67,6 @@ impl ObjectTraining<'_> {
             growth: Growth { worth_db: 0.0, ..Growth::default() },
             ..Recipe::default()
         };
-        let mut recipe = recipe; // EXPERIMENT
-        if let Ok(given) = std::env::var("PLAT_X") {
-            let n: Vec<f32> = given.split(',').map(|n| n.parse().unwrap()).collect();
-            (recipe.path, recipe.path_decay) = ([n[0], n[1]], n[2]);
-        }
         let recipe = recipe.at_rate(self.order.rate_permille as f32 / FULL_RATE as f32);
         let sizes = size_bounds_metres(object);
         let taken = views.iter().filter_map(|view| Some((view.view, self.capture.views[view.view as usize].seconds?)));
@@ -97,7 +92,7 @@ impl ObjectTraining<'_> {
             trains_exposures: false,
             trains_poses: false,
             sensors: None,
-            path: std::env::var("PLAT_NOPATH").is_err().then_some(&times),
+            path: Some(&times),
             recipe: &recipe,
             source: &silhouettes,
             picture_loss: None,

@@ -4,7 +4,12 @@
 //! that has to fit all of them is blurred (Street Gaussians, Yan et al. 2024, section 3.3, refines its boxes too). Each time
 //! at which photos show the object has a rigid motion of the object in its own axes, shared by all photos of that time. The
 //! axes of the object, not those of the camera, keep what is known apart: a turn of the object about itself is one number,
-//! where a camera would need a shift and a turn that cancel.
+//! where a camera would need a shift and a turn that cancel; and a vehicle is surer to stay on the road and upright than in
+//! its lane.
+//!
+//! An object's photos are few, often small, and each is drawn a dozen times: Adam on each time by itself makes paths worse.
+//! Errors of boxes are alike at neighbouring times, as hands and filters smooth them, so that a photo's gradient moves the
+//! times around its own. One scale for all times, unlike Adam's, lets a photo that shows the object small move it little.
 //!
 //! Splats and path are determined up to a common motion, which is removed after every step: the object stays in its box.
 
@@ -13,8 +18,17 @@ use std::collections::BTreeMap;
 use glam::{DMat3, DQuat, DVec3};
 use scene::Rigid;
 
-use super::adam::{self, joined};
+use super::adam::joined;
 use super::parts;
+
+/// Standard deviation of the times that a photo moves with its own, seconds.
+const TOGETHER_SECONDS: f64 = 0.5;
+/// Learning rates, relative to that of a shift along x and y: x ahead, y left, z up; then turns about these.
+const SHARES: [f32; 6] = [1.0, 1.0, 0.2, 0.2, 0.2, 1.0];
+/// Larger gradients, in units of the usual, count as this.
+const MAX_GRADIENT: f32 = 2.0;
+/// What is kept of the mean squares in a step.
+const MEMORY: f32 = 0.99;
 
 /// When the views of a job were taken, and how large the object is.
 #[derive(Debug, Clone, PartialEq)]
@@ -43,35 +57,36 @@ impl ObjectTimes {
 /// Rates of one step.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct PathRates {
-    /// Learning rate of translations, and of rotations at the object's ends: metres.
+    /// How far a step of the usual gradient moves the object, or its ends as it turns: metres.
     pub(crate) metres: f32,
-    /// Share of a time's motion that the step takes back.
+    /// Share of a motion that the step takes back.
     pub(crate) decay: f32,
 }
 
-/// Motions of an object in training, with their Adam state.
+/// Motions of an object in training.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct PathTraining {
-    /// Adam steps of each time.
-    pub(crate) steps: Vec<u32>,
-    /// Motion (metres, radians), first and second moment of each time.
-    pub(crate) values: [Vec<[f32; 6]>; 3],
+    /// Steps done.
+    pub(crate) steps: u32,
+    /// Mean squares of the gradients of all times: where photos say much, the object moves far.
+    pub(crate) squares: [f32; 6],
+    /// The motion at each time, metres and radians.
+    pub(crate) motions: Vec<[f32; 6]>,
 }
 
 impl PathTraining {
     /// The path as it is given.
     pub(crate) fn new(times: &ObjectTimes) -> Self {
-        let zeros = || vec![[0.0; 6]; times.seconds.len()];
-        Self { steps: vec![0; times.seconds.len()], values: [zeros(), zeros(), zeros()] }
+        Self { steps: 0, squares: [0.0; 6], motions: vec![[0.0; 6]; times.seconds.len()] }
     }
 
     /// The camera of a view in the refined axes of the object.
     pub(crate) fn apply(&self, times: &ObjectTimes, view: u32, camera_from_object: &Rigid) -> Rigid {
-        let numbers = times.of_views.get(&view).and_then(|&at| self.values[0].get(at));
+        let numbers = times.of_views.get(&view).and_then(|&at| self.motions.get(at));
         numbers.map_or(*camera_from_object, |numbers| camera_from_object.after(&motion(numbers)))
     }
 
-    /// One Adam step of the time of a view, from the renderer's gradient of the pose of its refined camera
+    /// One step of the motions around the time of a view, from the renderer's gradient of the pose of its refined camera
     /// ([`render::Gradients`]). Then removes the common motion of all times.
     pub(crate) fn step(
         &mut self,
@@ -84,24 +99,30 @@ impl PathTraining {
         let Some(&at) = times.of_views.get(&view).filter(|_| gradient.iter().all(|value| value.is_finite())) else {
             return;
         };
-        self.steps[at] = self.steps[at].saturating_add(1);
-        let bias = adam::bias(self.steps[at]);
-        let [values, first, second] = &mut self.values;
+        self.steps = self.steps.saturating_add(1);
+        let bias = 1.0 - MEMORY.powi(self.steps.min(1 << 20) as i32);
+        let nearness = |seconds: f64| (-0.5 * ((seconds - times.seconds[at]) / TOGETHER_SECONDS).powi(2)).exp() as f32;
+        let near: Vec<f32> = times.seconds.iter().map(|&seconds| nearness(seconds)).collect();
         for (k, gradient) in of_object(refined, gradient).into_iter().enumerate() {
-            let rate = if k < 3 { rates.metres } else { rates.metres / times.lever };
-            let step = adam::step([&mut first[at][k], &mut second[at][k]], gradient, bias);
-            values[at][k] = (1.0 - rates.decay) * values[at][k] - rate * step;
+            let unit = if k < 3 { rates.metres } else { rates.metres / times.lever };
+            let square = &mut self.squares[k];
+            *square = MEMORY * *square + (1.0 - MEMORY) * gradient * gradient;
+            let usual = (*square / bias).sqrt().max(f32::MIN_POSITIVE);
+            let step = unit * SHARES[k] * (gradient / usual).clamp(-MAX_GRADIENT, MAX_GRADIENT);
+            for (row, near) in self.motions.iter_mut().zip(&near) {
+                row[k] -= near * (rates.decay * row[k] + step);
+            }
         }
-        let count = values.len() as f32;
+        let count = self.motions.len() as f32;
         for k in 0..6 {
-            let mean = values.iter().map(|row| row[k]).sum::<f32>() / count;
-            values.iter_mut().for_each(|row| row[k] -= mean);
+            let mean = self.motions.iter().map(|row| row[k]).sum::<f32>() / count;
+            self.motions.iter_mut().for_each(|row| row[k] -= mean);
         }
     }
 
     /// Each time in seconds with the motion of the object then, in its own axes: what `world_from_object` is followed by.
     pub(crate) fn motions(&self, times: &ObjectTimes) -> Vec<(f64, Rigid)> {
-        times.seconds.iter().zip(&self.values[0]).map(|(&seconds, numbers)| (seconds, motion(numbers))).collect()
+        times.seconds.iter().zip(&self.motions).map(|(&seconds, numbers)| (seconds, motion(numbers))).collect()
     }
 }
 
@@ -153,13 +174,13 @@ mod tests {
         let (times, camera) = (times(), camera());
         assert_eq!(times.seconds, [1.0, 2.0]);
         let mut path = PathTraining::new(&times);
-        let rates = PathRates { metres: 0.1, decay: 0.0 };
+        let rates = PathRates { metres: 0.1, decay: 0.1 };
         path.step(&times, 4, &camera, &[1.0, -2.0, 0.5, 0.1, 0.2, -0.3], rates);
         path.step(&times, 9, &camera, &[1.0, -2.0, 0.5, 0.1, 0.2, -0.3], rates);
-        assert_eq!((path.steps.clone(), path.apply(&times, 4, &camera)), (vec![0, 2], path.apply(&times, 9, &camera)));
+        assert_eq!((path.steps, path.apply(&times, 4, &camera)), (2, path.apply(&times, 9, &camera)));
         assert_ne!(path.apply(&times, 9, &camera), path.apply(&times, 7, &camera));
         for k in 0..6 {
-            assert!(path.values[0].iter().map(|row| row[k]).sum::<f32>().abs() < 1e-6);
+            assert!(path.motions.iter().map(|row| row[k]).sum::<f32>().abs() < 1e-6);
         }
         // A view without a time, one that is not known, and a gradient that is not finite change nothing.
         let before = path.clone();
