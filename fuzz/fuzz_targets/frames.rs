@@ -5,7 +5,7 @@ use blocks::{Plan, plan::PLAN};
 use libfuzzer_sys::fuzz_target;
 use scene::exposures::EXPOSURES;
 use scene::poses::POSES;
-use scene::{Capture, Exposures, Poses};
+use scene::{Capture, Exposures, Poses, objects};
 use scene::frame::{self, Kind, SPLATS, SPLATS_WITH_ATTRIBUTES, SPLATS_WITH_POSES};
 
 /// The same as `dataset::ingest::CAPTURE`.
@@ -21,7 +21,11 @@ fuzz_target!(|bytes: &[u8]| {
     }
     let _ = Exposures::from_frame(bytes);
     let _ = Poses::from_frame(bytes);
+    let object = br#"{"tracks": [{"id": "a", "class": "car", "low": [0, 0, 0], "high": [4, 2, 1],
+        "poses": [[0, [0, 0, 0], [0, 0, 0, 1]]]}]}"#;
+    let about = objects::read(object).unwrap().objects.remove(0);
     for header in 0..bytes.len().min(10) {
+        let _ = objects::from_frame(&sealed(objects::OBJECT, bytes, header), &about);
         let _ = Exposures::from_frame(&sealed(EXPOSURES, bytes, header));
         let _ = Poses::from_frame(&sealed(POSES, bytes, header));
     }

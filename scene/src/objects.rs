@@ -83,6 +83,9 @@ impl MovingObject {
     /// what lies between them, before the first as then, after the last as then. It has a pose at every time that the given path
     /// and the motions have one.
     pub fn moved(&self, motions: &[(f64, Rigid)]) -> Vec<PathPose> {
+        if motions.is_empty() {
+            return self.path.clone();
+        }
         let given = self.path.iter().map(|pose| pose.seconds);
         let mut times: Vec<f64> = given.chain(motions.iter().map(|(seconds, _)| *seconds)).collect();
         times.sort_unstable_by(f64::total_cmp);
@@ -331,6 +334,43 @@ mod tests {
         assert_eq!([x(0.5), x(6.0), x(f64::NAN)], [None; 3]);
         let turned = car.pose(1.5).unwrap().rotation * DVec3::X;
         assert!((turned.y.atan2(turned.x) - 0.1).abs() < 1e-9);
+    }
+
+    #[test]
+    fn a_refined_path_has_the_motions_and_what_lies_between_them() {
+        let car = car();
+        let along = |x: f64| Rigid { translation: DVec3::new(x, 0.0, 0.0), ..Rigid::IDENTITY };
+        let moved = car.moved(&[(1.0, along(0.5)), (1.5, along(1.0)), (5.2, along(0.0)), (9.0, along(7.0))]);
+        // Nothing is known at 9 s, so there is no pose; the motion after 5.2 s is on its way there.
+        assert_eq!(moved.iter().map(|pose| pose.seconds).collect::<Vec<_>>(), [1.0, 1.5, 2.0, 5.0, 5.2, 5.5]);
+        let by = |i: usize| {
+            let (given, refined) = (car.pose(moved[i].seconds).unwrap(), moved[i].world_from_object);
+            given.inverse().after(&refined)
+        };
+        for (i, x) in [0.5, 1.0, 1.0 - 0.5 / 3.7, 0.2 / 3.7, 0.0, 7.0 * 0.3 / 3.8].into_iter().enumerate() {
+            assert!((by(i).translation - DVec3::new(x, 0.0, 0.0)).length() < 1e-9, "{i}: {:?}", by(i));
+        }
+        assert_eq!(car.moved(&[]), car.path);
+    }
+
+    #[test]
+    fn a_trained_object_survives_its_frame_and_a_wrong_one_is_refused() {
+        let car = car();
+        let mut splats = Splats::new(1);
+        splats.push(&crate::Splat::round(glam::Vec3::ONE, -2.0, glam::Vec3::splat(0.4), 0.3));
+        let bytes = to_frame(&car.path[..2], &splats);
+        let (about, read) = from_frame(&bytes, &car).unwrap();
+        assert_eq!((&about.path[..], &about.id, read), (&car.path[..2], &car.id, splats.clone()));
+        for at in 0..bytes.len() {
+            let mut damaged = bytes.clone();
+            damaged[at] ^= 0x20;
+            assert!(from_frame(&damaged, &car).is_err(), "flip at {at} was not detected");
+        }
+        let mut jumps = car.path.clone();
+        jumps[1].world_from_object.translation.x = 1e4;
+        assert!(from_frame(&to_frame(&jumps, &splats), &car).unwrap_err().0.contains("jumps"));
+        assert!(from_frame(&to_frame(&[], &splats), &car).is_err());
+        assert!(from_frame(&frame::encode(OBJECT, &car.path, b"no splats"), &car).is_err());
     }
 
     #[test]

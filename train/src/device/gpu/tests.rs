@@ -416,7 +416,7 @@ fn trained_poses_agree_with_the_cpu() {
         ],
     };
     let (views, steps) = (given.views.clone(), vec![7, 0, 1, 3, 2]);
-    cpu.poses = Some(PoseTraining { views, steps, values, sensors: Some(sensors) });
+    cpu.poses = Some(PoseTraining { views, steps, values, sensors: Some(sensors), path: None });
     let mut on_gpu = cpu.clone();
     let mut cpu_device = super::super::cpu::CpuDevice::new(0.2, None, None, &given);
     let mut device = GpuDevice::new(&gpu, &cpu, 0.2, None, None, &given).unwrap();
