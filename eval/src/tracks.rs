@@ -3,8 +3,8 @@
 use std::collections::BTreeSet;
 
 use dataset::true_boxes::TrueBoxes;
-use glam::{DQuat, DVec2};
-use perceive::tracking::{Frame, Score, TrueObject, score};
+use glam::{DQuat, DVec3};
+use perceive::tracking::{Frame, Placed, Score, TrueObject, score};
 use scene::{Camera, MovingObject, View};
 use serde::Serialize;
 
@@ -72,18 +72,20 @@ impl Compared<'_> {
             let high = whole.filter(|of| f64::from(of.corners[3] - of.corners[1]) >= LEAST_PIXELS);
             high.map(|of| of.instance.to_string()).collect()
         });
-        let place = |object: &MovingObject| -> Option<DVec2> {
-            let middle = object.pose(seconds)?.apply(0.5 * (object.low + object.high));
-            Some((self.ground_from_world * middle).truncate())
+        let at = |object: &MovingObject| -> Option<Placed> {
+            let pose = object.pose(seconds)?;
+            let middle = pose.apply(0.5 * (object.low + object.high));
+            let [place, ahead] = [middle, pose.rotation * DVec3::X].map(|of| (self.ground_from_world * of).truncate());
+            Some(Placed { place, ahead })
         };
         let truth = self.truth.iter().enumerate().filter_map(|(id, object)| {
             let is_seen =
                 seen.as_ref().map_or_else(|| pixels(object) >= LEAST_PIXELS, |seen| seen.contains(&object.id));
-            Some(TrueObject { id, place: place(object)?, counts: is_seen && counted(object) })
+            Some(TrueObject { id, at: at(object)?, counts: is_seen && counted(object) })
         });
         let found = self.found.iter().enumerate().filter(|(_, object)| pixels(object) >= NEAR_SHARE * LEAST_PIXELS);
         let found = found.filter(|(_, object)| counted(object));
-        Frame { truth: truth.collect(), found: found.filter_map(|(id, object)| Some((id, place(object)?))).collect() }
+        Frame { truth: truth.collect(), found: found.filter_map(|(id, object)| Some((id, at(object)?))).collect() }
     }
 }
 
@@ -102,7 +104,7 @@ fn height_in(camera: &Camera, object: &MovingObject, seconds: f64) -> f64 {
 
 #[cfg(test)]
 mod tests {
-    use glam::{DMat3, DVec3};
+    use glam::DMat3;
     use scene::{PathPose, Pinhole, Rigid};
 
     use super::*;

@@ -23,7 +23,7 @@ use self::assignment::assigned;
 pub(crate) use self::filter::Place;
 use self::filter::{Belief, Motion, smoothed};
 pub use self::kinds::Kind;
-pub use self::score::{Frame, Score, TrueObject, score};
+pub use self::score::{Frame, Placed, Score, TrueObject, score};
 pub use self::sighting::Sighting;
 
 /// Squared distance up to which a sighting may belong to a prediction, in units of its standard deviation: 99.7 % of them do.

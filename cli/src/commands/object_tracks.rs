@@ -94,14 +94,17 @@ fn summary(said: &Tracked, found: &[MovingObject]) -> String {
         for (what, of) in [("all", all), ("vehicles", vehicles)] {
             let number = |value: Option<f64>| value.map_or("-".to_owned(), |value| format!("{value:.2}"));
             text += &format!(
-                "\n{what}: MOTA {} over {times} times: of {} objects {} missed, {} extra, {} switches; off by {} m in the median, {} m at 95 %",
+                "\n{what}: MOTA {} over {times} times: of {} objects {} missed, {} extra, {} switches; off by {} m and {}° in the median, {} m and {}° at 95 %, ATE {} m",
                 number(of.mota),
                 of.objects,
                 of.misses,
                 of.extra,
                 of.switches,
                 number(of.median_metres),
-                number(of.p95_metres)
+                number(of.median_degrees),
+                number(of.p95_metres),
+                number(of.p95_degrees),
+                number(of.ate_metres)
             );
         }
     }
