@@ -2,6 +2,7 @@
 
 mod bench;
 mod cluster;
+mod film;
 mod garage;
 mod model;
 mod objects;
@@ -31,6 +32,7 @@ pub(crate) use cluster::{
     Connection, CoordinatorArgs, JobArgs, JobsArgs, LogFormat, LogsArgs, RetryArgs, ServeArgs, StatusArgs, SubmitArgs,
     TaskName, TelemetryArgs, WorkerArgs,
 };
+pub(crate) use film::FilmArgs;
 pub(crate) use garage::{GarageAddArgs, GarageCommand, GarageListArgs, GaragePlaceArgs, Stand, VehicleBox};
 pub(crate) use model::{EvalArgs, ExportArgs, Format, ImportArgs, PruneArgs, PruneCapture, RenderArgs};
 pub(crate) use objects::{ObjectsCommand, PoseArgs, TrackArgs};

@@ -14,6 +14,7 @@ mod dashboard;
 mod eval_report;
 mod eval_results;
 mod failure;
+mod film;
 mod live_status;
 mod metrics_log;
 mod objects;

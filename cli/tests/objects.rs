@@ -100,6 +100,8 @@ fn what_moves_has_splats_of_its_own() {
     refused(at, &["render", "model", "--cameras", "city", "--out", "x", "--without", "none"], "has no object 'none'");
     refused(at, &["render", "model", "--cameras", "city", "--out", "x", "--move", "7=1,2"], "give ID=X,Y,Z");
 
+    films(at, "model");
+
     done(at, &["prune", "model", "--keep", "0.5", "--out", "pruned", "--quiet"]);
     assert!(files(&at.join("pruned/objects")) == of_objects, "a pruned model keeps its objects");
 
@@ -118,4 +120,55 @@ fn what_moves_has_splats_of_its_own() {
     fs::write(at.join("city/tracks.json"), &tracks).unwrap();
     refused(at, &["plan", "city", "--blocks", "flat", "--objects", "--out", "plan.json"], "--objects");
     refused(at, &["train", "city", "--objects", "--minutes", "1", "--out", "x"], "--minutes");
+}
+
+/// Films along one camera's photos of the city.
+fn films(at: &Path, model: &str) {
+    let follow = ["render", model, "--cameras", "city", "--backend", "cpu", "--quiet", "--sequence"];
+    let film = |out: &str, more: &[&str]| {
+        done(at, &[&follow[..], &["10", "--out", out, "--sensor", "street-front-left"], more].concat())
+    };
+    let said = film("film", &["--smooth", "1"]);
+    let pictures = files(&at.join("film"));
+    assert!(pictures.len() > 20 && said["views"] == pictures.len() && pictures.contains_key("000020.png"), "{said}");
+    // Every fifth of a second one is that of a photo; a filter that takes nothing of the past changes nothing.
+    let photo = |name: &str| image::open(at.join(name)).unwrap().to_rgb8();
+    assert!(photo("film/000002.png") == photo("composed/street-front-left-0000-00001.png"));
+    assert_eq!(said["flicker"][0], said["flicker"][1]);
+    let calm = film("calm", &["--smooth", "0.4"]);
+    let flicker = |i: usize| calm["flicker"][i].as_f64().unwrap();
+    assert!(flicker(1) < 0.9 * flicker(0) && flicker(0) == said["flicker"][0].as_f64().unwrap(), "{calm}");
+    film("tinted", &["--overlay"]);
+    assert!(differ(at, "tinted", "film"));
+
+    // As one file, whose pictures are the same.
+    let said = film("film.apng", &[]);
+    let bytes = fs::read(at.join("film.apng")).unwrap();
+    let mut reader = png::Decoder::new(std::io::Cursor::new(bytes)).read_info().unwrap();
+    assert_eq!(reader.info().animation_control().map(|of| u64::from(of.num_frames)), said["views"].as_u64());
+    let mut first = vec![0; reader.output_buffer_size().unwrap()];
+    reader.next_frame(&mut first).unwrap();
+    assert!(first == photo("film/000000.png").into_raw());
+    if std::process::Command::new("ffmpeg").arg("-version").output().is_ok() {
+        film("film.mp4", &[]);
+        let bytes = fs::read(at.join("film.mp4")).unwrap();
+        assert!(bytes.len() > 5_000 && &bytes[4..8] == b"ftyp");
+    } else {
+        println!("skipped: ffmpeg is not there");
+        refused(at, &[&follow[..], &["9", "--out", "x.mp4", "--sensor", "street-left"]].concat(), "install ffmpeg");
+    }
+    let left: Vec<String> = files_named(at, ".part");
+    assert!(left.is_empty(), "{left:?}");
+
+    refused(at, &[&follow[..], &["10", "--out", "x"]].concat(), "name one of them by --sensor");
+    refused(at, &[&follow[..], &["10", "--out", "x", "--sensor", "roof"]].concat(), "street-front-left");
+    refused(at, &[&follow[..], &["0", "--out", "x"]].concat(), "pictures a second");
+    refused(at, &[&follow[..6], &["--out", "x", "--smooth", "0.5"]].concat(), "--sequence");
+    refused(at, &[&follow[..6], &["--out", "x", "--overlay", "--without", "all"]].concat(), "--overlay");
+}
+
+/// Names in a folder that contain this.
+fn files_named(at: &Path, part: &str) -> Vec<String> {
+    let names = fs::read_dir(at).unwrap().map(|entry| entry.unwrap().file_name().into_string().unwrap());
+    names.filter(|name| name.contains(part)).collect()
 }

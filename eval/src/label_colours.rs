@@ -24,8 +24,17 @@ pub fn coloured_by(splats: &Splats, attribute: &str) -> Option<Splats> {
     Some(coloured)
 }
 
-/// sRGB in 0..1, saturated and bright.
-pub(crate) fn label_colour(value: u32) -> Vec3 {
+/// The same splats in one sRGB colour, at SH degree 0.
+pub fn painted(splats: &Splats, colour: Vec3) -> Splats {
+    let mut painted = splats.with_sh_degree(0);
+    for (channel, value) in colour.to_array().into_iter().enumerate() {
+        painted.columns_mut()[column::SH + channel].fill((value - 0.5) / SH_C0);
+    }
+    painted
+}
+
+/// sRGB in 0..1, saturated and bright: its largest channel is 1.
+pub fn label_colour(value: u32) -> Vec3 {
     const GOLDEN_RATIO: f64 = 0.618_033_988_749_894_9;
     if value == 0 {
         return UNSET;

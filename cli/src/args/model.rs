@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use clap::{Args, ValueEnum};
 use eval::Levels;
 
+use super::film::FilmArgs;
 use super::values::{Backend, ObjectMove, Size, clock_seconds, decibels, levels, metres, share, share_from_zero};
 use super::zones::ZoneOptions;
 
@@ -141,8 +142,10 @@ pub(crate) struct RenderArgs {
     /// several times
     #[arg(long = "move", value_name = "ID=X,Y,Z[,DEGREES]", allow_hyphen_values = true)]
     pub(crate) moves: Vec<ObjectMove>,
+    #[command(flatten)]
+    pub(crate) film: FilmArgs,
     /// Also write depth as <view>.depth.npy: float32, metres along the optical axis, the harmonic mean over a pixel's splats, 0 = no surface
-    #[arg(long)]
+    #[arg(long, conflicts_with = "sequence")]
     pub(crate) depth: bool,
     /// Compensate opacity for the screen-space dilation; by default as the model says
     #[arg(long, overrides_with = "classic")]

@@ -143,6 +143,15 @@ pub(super) fn share(text: &str) -> Result<f64, String> {
     value.ok_or_else(|| "give a share above 0 and at most 1, such as 0.5".into())
 }
 
+pub(super) fn newest(text: &str) -> Result<f64, String> {
+    share(text).map_err(|_| "give the share of the newest picture, above 0 and at most 1, such as 0.6".into())
+}
+
+pub(super) fn rate(text: &str) -> Result<f64, String> {
+    let value = text.parse().ok().filter(|rate: &f64| (0.1..=240.0).contains(rate));
+    value.ok_or_else(|| "give pictures a second from 0.1 to 240, such as 25".into())
+}
+
 pub(super) fn share_from_zero(text: &str) -> Result<f64, String> {
     let value = text.parse().ok().filter(|share: &f64| (0.0..=1.0).contains(share));
     value.ok_or_else(|| "give a share from 0 to 1, such as 0.05".into())

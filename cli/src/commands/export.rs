@@ -26,7 +26,7 @@ pub(crate) fn run(args: &ExportArgs, output: &Output) -> Result<(), Failure> {
     output.result(&exported, &text)
 }
 
-pub(super) fn make_parent(out: &Path) -> Result<(), Failure> {
+pub(crate) fn make_parent(out: &Path) -> Result<(), Failure> {
     out.parent().filter(|folder| !folder.as_os_str().is_empty()).map_or(Ok(()), make_folder)
 }
 
