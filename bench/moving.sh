@@ -2,6 +2,7 @@
 # Lines of bench/results/moving: streets with objects that move, modelled and left out, one thread, nothing pruned. `moving_psnr` is of the
 # pixels within their boxes, `psnr` of all others. Makes the street in out/moving if it is not there; takes the folder of the captures for
 # drive_dgp_scene_01 too. SEED has the seeds (0). RESULTS is the folder of the lines. A quarter of an hour.
+# ONLY=layouts measures the four layouts of Street Detection Gaussians with traffic instead, smaller ones: ten minutes.
 set -euo pipefail
 repository=$(realpath "$(dirname "${BASH_SOURCE[0]}")/..")
 # Lines of results name the command, so that its paths must not be those of one machine.
@@ -11,6 +12,22 @@ plat=${PLAT:-target/release/plat}
 street=out/moving/street
 common=(--seed "${SEED:-0}" --blocks whole --threads 1 --backend cpu --tolerance-db 0 --eval-every 0 --fresh --results "${RESULTS:-bench/results/moving}")
 
+if [[ ${ONLY:-} == layouts ]]; then
+    for layout in curved-corridor alley winding deck; do
+        street=out/moving/$layout
+        if ! grep -qs '"complete": *true' "$street/manifest.json"; then
+            "$plat" --quiet synth --area-km2 0.03 --layout "$layout" --views 480 --spacing 2 --aerial 0.1 --traffic medium --size 320x180 \
+                --out "$street"
+        fi
+        for objects in without with; do
+            modelled=()
+            [[ $objects == without ]] || modelled=(--objects)
+            "$plat" --quiet bench pareto "$street" --label "plat, $objects objects" --steps 2500 --budget 20000 "${common[@]}" "${modelled[@]}" \
+                --out "out/moving/$layout-$objects"
+        done
+    done
+    exit
+fi
 if ! grep -qs '"complete": *true' "$street/manifest.json"; then
     "$plat" --quiet synth --area-km2 0.02 --views 640 --spacing 2 --aerial 0.1 --traffic medium --size 640x360 --out "$street"
 fi

@@ -62,7 +62,8 @@ impl Film {
                 encoder.set_color(png::ColorType::Rgb);
                 encoder.set_depth(png::BitDepth::Eight);
                 encoder.set_compression(png::Compression::Fast);
-                let (over, under) = (1000, (1000.0 * per_second).round().clamp(1.0, f64::from(u16::MAX)) as u16);
+                // At most 240 pictures a second: 24,000.
+                let (over, under) = (100, (100.0 * per_second).round().clamp(1.0, f64::from(u16::MAX)) as u16);
                 let animated = encoder.set_animated(pictures.max(1), 0);
                 let delayed = animated.and_then(|()| encoder.set_frame_delay(over, under));
                 let writer = delayed.and_then(|()| encoder.write_header()).map_err(|error| unwritten(&path, error))?;
