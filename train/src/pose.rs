@@ -19,7 +19,7 @@ use scene::sensors::Taken;
 use scene::{Camera, Rigid, Splats};
 
 pub(crate) use self::adam::{Rates, TRANSLATION_RATE};
-use self::adam::{joined, median};
+use self::adam::{joined, median, parts};
 use self::path::{ObjectTimes, PathRates, PathTraining};
 use self::sensors::{GivenSensors, SensorTraining};
 use crate::view::TrainView;
@@ -104,11 +104,6 @@ pub(crate) fn displaced(camera_from_world: &Rigid, displacement: &[f32; 6]) -> R
     let [translation, rotation] = parts(displacement);
     let moved = Rigid { rotation: DQuat::from_scaled_axis(rotation), translation };
     moved.inverse().after(camera_from_world)
-}
-
-fn parts(displacement: &[f32; 6]) -> [DVec3; 2] {
-    let [x, y, z, a, b, c] = displacement.map(f64::from);
-    [DVec3::new(x, y, z), DVec3::new(a, b, c)]
 }
 
 /// Rates of one step, of what is refined.

@@ -40,6 +40,12 @@ pub(super) fn joined([translation, rotation]: [DVec3; 2]) -> [f32; 6] {
     [x, y, z, a, b, c].map(|value| value as f32)
 }
 
+/// The translation and the rotation vector of these numbers.
+pub(super) fn parts(numbers: &[f32; 6]) -> [DVec3; 2] {
+    let [x, y, z, a, b, c] = numbers.map(f64::from);
+    [DVec3::new(x, y, z), DVec3::new(a, b, c)]
+}
+
 /// The upper median.
 pub(super) fn median(values: &mut [f32]) -> Option<f32> {
     let middle = values.len() / 2;

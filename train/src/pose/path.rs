@@ -18,8 +18,7 @@ use std::collections::BTreeMap;
 use glam::{DMat3, DQuat, DVec3};
 use scene::Rigid;
 
-use super::adam::joined;
-use super::parts;
+use super::adam::{joined, parts};
 
 /// Standard deviation of the times that a photo moves with its own, seconds.
 const TOGETHER_SECONDS: f64 = 0.5;
