@@ -283,6 +283,8 @@ impl Corpus {
                 self.put(&file.name, file.bytes, &codec, Seal::None, PICTURES);
             }
             self.put("splat columns", frame::encode_splats(&splats), &splats_codec(), Seal::Frame, PLAIN);
+            let object = scene::objects::to_frame(&parked().path, &splats);
+            self.put("trained object", object, &object_codec(), Seal::Frame, PLAIN);
         }
         let exposures: Exposures = (0..40).map(|view| (3 * view, Exposure::IDENTITY)).collect();
         self.put("exposures", exposures.to_frame(), &exposures_codec(), Seal::Frame, PLAIN);

@@ -15,7 +15,7 @@ use image::{ImageFormat, RgbImage};
 use scene::frame::{self, Kind};
 use scene::parquet::Table;
 use scene::transforms::{Frame, Intrinsics, Transforms};
-use scene::{CameraModel, Capture, CodecError, Exposures, Rect, Rigid};
+use scene::{CameraModel, Capture, CodecError, Exposures, MovingObject, PathPose, Rect, Rigid};
 use scene::{
     colmap, kitti_raw, kitti360, lidar, npy, nuscenes, objects, opensfm, ply, rad, radar, sog, splat_glb, spz,
     transforms, waymo,
@@ -293,6 +293,22 @@ pub(crate) fn sog_file_codec(files: Vec<sog::File>, name: &str) -> Read {
 
 pub(crate) fn splats_codec() -> Read {
     codec("frames", frame::decode_splats, |splats| splats.columns().iter().all(|c| c.len() == splats.len()))
+}
+
+/// A trained object: what is known of it, and its frame's reader.
+pub(crate) fn object_codec() -> Read {
+    codec(
+        "frames",
+        |bytes| objects::from_frame(bytes, &parked()),
+        |(object, splats)| object.check().is_ok() && splats.columns().iter().all(|c| c.len() == splats.len()),
+    )
+}
+
+/// An object that stands still.
+pub(crate) fn parked() -> MovingObject {
+    let pose = |seconds: f64| PathPose { seconds, world_from_object: Rigid::IDENTITY };
+    let path = (0..40).map(|i| pose(0.1 * f64::from(i))).collect();
+    MovingObject { id: "car-1".into(), class: "car".into(), low: DVec3::ZERO, high: DVec3::ONE, path }
 }
 
 pub(crate) fn exposures_codec() -> Read {
