@@ -80,14 +80,19 @@ impl MovingObject {
     }
 
     /// Its path where the object moves, at these times in seconds (ascending), by these motions in its own axes: between two times by
-    /// what lies between them, before the first as then, after the last as then. It has a pose at every time that the given path
-    /// and the motions have one.
+    /// what lies between them, before the first as then, after the last as then. It has a pose wherever the given path has one, and
+    /// at the times of motions within it: one beyond its end would keep the object there for longer than it was given.
     pub fn moved(&self, motions: &[(f64, Rigid)]) -> Vec<PathPose> {
         if motions.is_empty() {
             return self.path.clone();
         }
         let given = self.path.iter().map(|pose| pose.seconds);
-        let mut times: Vec<f64> = given.chain(motions.iter().map(|(seconds, _)| *seconds)).collect();
+        let is_within = |seconds: &f64| {
+            self.path.first().is_some_and(|first| first.seconds <= *seconds)
+                && self.path.last().is_some_and(|last| *seconds <= last.seconds)
+        };
+        let between = motions.iter().map(|(seconds, _)| *seconds).filter(is_within);
+        let mut times: Vec<f64> = given.chain(between).collect();
         times.sort_unstable_by(f64::total_cmp);
         times.dedup();
         let pose = |seconds: f64| {
@@ -351,6 +356,10 @@ mod tests {
             assert!((by(i).translation - DVec3::new(x, 0.0, 0.0)).length() < 1e-9, "{i}: {:?}", by(i));
         }
         assert_eq!(car.moved(&[]), car.path);
+        // A photo a moment before the first pose and one after the last: the ends of the path stay where they are in time.
+        let ends = car.moved(&[(0.8, along(0.5)), (5.7, along(0.5))]);
+        assert_eq!(ends.iter().map(|pose| pose.seconds).collect::<Vec<_>>(), [1.0, 2.0, 5.0, 5.5]);
+        assert!((ends[0].world_from_object.translation.x - 0.5).abs() < 1e-9);
     }
 
     #[test]
