@@ -84,7 +84,7 @@ impl TemporalFilter {
                     let Some((u, v)) = places[y * width + x] else { continue };
                     let [low, high] = around(&picture, plane, x, y);
                     let (now, past) = (*value, shown.at(plane, u, v));
-                    *value = newest * now + (1.0 - newest) * past.clamp(low, high);
+                    *value = newest * now + (1.0 - newest) * past.max(low).min(high);
                     changes[0] += f64::from((now - unfiltered.at(plane, u, v)).abs());
                     changes[1] += f64::from((*value - past).abs());
                 }
@@ -237,6 +237,10 @@ mod tests {
         let mut bright = wall(|_, _| 0.5);
         bright.depth.fill(4.0);
         assert!(filter.filtered(bright.clone(), &shifted(0.0)) == bright);
+        // Where no colour around a pixel is a number, there is none to keep within, and nothing breaks.
+        let mut broken = wall(|_, _| f32::NAN);
+        broken.depth.fill(4.0);
+        assert!(filter.filtered(broken, &shifted(0.0)).colour[0].is_nan());
         // Without depth nothing is known.
         let mut unknown = wall(|x, _| x as f32 / 16.0);
         unknown.depth.fill(0.0);
