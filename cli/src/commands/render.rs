@@ -67,6 +67,7 @@ pub(crate) fn run(args: &RenderArgs, output: &Output) -> Result<(), Failure> {
     let antialiased = (model.antialiased || args.antialiased) && !args.classic;
     let has_depth = args.depth || film.smooth.is_some();
     let options = Options { antialiased, extras: has_depth, inverse_depth: has_depth, ..model.options() };
+    let flat = Options { extras: false, inverse_depth: false, ..options };
     let clock = Stopwatch::start();
     let mut renderer = Renderer::new(&backend)?;
     let objects = placed(&model.objects, args)?;
@@ -91,7 +92,7 @@ pub(crate) fn run(args: &RenderArgs, output: &Output) -> Result<(), Failure> {
             picture = filter.filtered(picture, camera);
         }
         if film.overlay {
-            let tint = renderer.compose(&tinted.0, &tinted.1.at(*seconds), camera, &model.options())?;
+            let tint = renderer.compose(&tinted.0, &tinted.1.at(*seconds), camera, &flat)?;
             add_tint(&mut picture, &tint.colour);
         }
         if let Some(per_second) = film.sequence {
