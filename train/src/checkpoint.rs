@@ -185,6 +185,7 @@ impl State {
                 SensorTraining { steps, values }
             });
             let path = header.time_count.map(|_| {
+                // The bytes are those of the steps and of the squares at least: their number was checked above.
                 let (steps, rest) = path_bytes.split_at(4);
                 let numbers = floats(rest);
                 let mut rows = numbers.chunks_exact(6).map(|row| row.try_into().expect("6 numbers"));

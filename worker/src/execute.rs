@@ -245,7 +245,8 @@ impl PlanExecutor {
             })?;
             let (exposures, poses) = self.of_views(given)?;
             let (exposures, poses) = (exposures.as_ref(), poses.as_ref());
-            let training = ObjectTraining { plan, task, order, capture, reader: &reader, exposures, poses };
+            let training =
+                ObjectTraining { plan, task, object: about, order, capture, reader: &reader, exposures, poses };
             let memory = memory_budget(options.memory_bytes);
             let span = tracing::info_span!("train", object = task.object);
             let trained = self.pool.install(|| span.in_scope(|| training.train(results, memory, stopwatch, report)));

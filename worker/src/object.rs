@@ -31,6 +31,8 @@ const REPORT_EVERY: u32 = 20;
 pub(crate) struct ObjectTraining<'a> {
     pub(crate) plan: &'a Plan,
     pub(crate) task: &'a ObjectTask,
+    /// The task's object as the capture has it.
+    pub(crate) object: &'a MovingObject,
     pub(crate) order: &'a TaskOrder,
     pub(crate) capture: &'a Capture,
     pub(crate) reader: &'a WindowReader,
@@ -52,10 +54,8 @@ impl ObjectTraining<'_> {
         stopwatch: &Stopwatch,
         report: &mut Reporter,
     ) -> Result<(Vec<PathPose>, Splats), ExecuteError> {
-        let (plan, task) = (self.plan, self.task);
+        let (plan, task, object) = (self.plan, self.task, self.object);
         let number = task.object as usize;
-        let object = self.capture.objects.get(number);
-        let object = object.ok_or_else(|| ExecuteError::work(format!("the capture has no object {number}")))?;
         let views = self.views(object)?;
         let context = self.context(results, &views);
         let silhouettes = Silhouettes { photos: self.reader, capture: self.capture, object: number };
