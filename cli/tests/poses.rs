@@ -78,8 +78,8 @@ fn errors_of_sensors_are_written_and_do_not_depend_on_workers() {
     let faults = vec![Fault { kind: FaultKind::ClockSkew, strength: 0.5, seed: 0 }];
     let settings = Settings { faults, aerial: 0.2, ..common::small(48, 80, 60) };
     synth::write(&at.join("city"), &settings, &|_, _, _| ()).unwrap();
-    train(at, "on", &["--levels", "1", "--refine-sensors", "--threads", "1"]);
-    train(at, "again", &["--levels", "1", "--refine-sensors", "--threads", "1", "--workers", "2"]);
+    train(at, "on", &["--levels", "1", "--refine-sensors", "--threads", "1", "--evaluate"]);
+    train(at, "again", &["--levels", "1", "--refine-sensors", "--threads", "1", "--evaluate", "--workers", "2"]);
     let bytes = |path: &str| std::fs::read(at.join(path)).unwrap();
     for file in ["merged.ply", "cameras.json", "sensors.json", "model/poses.plat"] {
         let same = bytes(&format!("on/{file}")) == bytes(&format!("again/{file}"));
@@ -111,6 +111,13 @@ fn errors_of_sensors_are_written_and_do_not_depend_on_workers() {
         let found = sensors.iter().find(of_sensor).map_or(1.0, |sensor| sensor["focal_factor"].as_f64().unwrap());
         assert!((factor / found - 1.0).abs() < 1e-9, "{path}: {factor}, {found} in sensors.json");
     }
+
+    // Held-out photos were taken by the same sensors. A file of splats knows nothing of them, and is drawn from the given cameras.
+    let of_job: Value = serde_json::from_slice(&bytes("on/eval/report.json")).unwrap();
+    let evaluate = |model: &str| done(at, &["eval", model, "city", "--backend", "cpu"])["psnr"].as_f64().unwrap();
+    let [corrected, given] = ["on", "on/merged.ply"].map(evaluate);
+    assert_eq!(of_job["psnr"].as_f64(), Some(corrected));
+    assert!(corrected > given, "{corrected} {given}");
 
     // Pruning keeps what was found.
     done(at, &["prune", "on", "--out", "pruned", "--keep", "0.5"]);

@@ -6,8 +6,8 @@ use blocks::Split;
 use dataset::ingest::{IngestOptions, ingest};
 use dataset::open::Source;
 use dataset::windows::WindowReader;
-use model::Model;
-use scene::{ArtefactId, Capture, Zones};
+use model::{Model, read_tree};
+use scene::{ArtefactId, Capture, Poses, Zones};
 use store::{BlockingStore, Store};
 use tempfile::TempDir;
 
@@ -79,6 +79,36 @@ impl Photos {
             zones: None,
             _temporary: temporary,
         })
+    }
+
+    /// Whether these are the photos that a model was trained on. Only then its exposures and refined cameras are theirs.
+    ///
+    /// # Errors
+    /// A trained model whose plan cannot be read.
+    pub(crate) fn are_of(&self, model: &Model) -> Result<bool, EvalError> {
+        match &model.trained {
+            Some((_, out)) => Ok(Some(read_tree(out)?.plan.capture) == self.id),
+            None => Ok(false),
+        }
+    }
+
+    /// The photos with their cameras as training found them, if a model was trained on them with refined cameras.
+    ///
+    /// # Errors
+    /// A trained model whose plan cannot be read.
+    pub fn with_cameras_of(self, model: &Model, observer: &dyn Observer) -> Result<Self, EvalError> {
+        let Some(poses) = &model.poses else { return Ok(self) };
+        if !self.are_of(model)? {
+            observer.note("the model was trained on other photos: its refined cameras are left out");
+            return Ok(self);
+        }
+        Ok(self.corrected_by(poses))
+    }
+
+    /// The photos with these cameras.
+    #[must_use]
+    pub fn corrected_by(self, poses: &Poses) -> Self {
+        Self { capture: Arc::new(poses.in_capture(&self.capture)), ..self }
     }
 
     /// A reader of the photos that keeps this many bytes of them decoded.

@@ -40,18 +40,16 @@ impl<'a> Pruner<'a> {
     /// A trained model whose plan cannot be read.
     pub fn new(model: &'a Model, photos: &Photos, observer: &dyn Observer) -> Result<Self, EvalError> {
         let knows_its_photos = model.exposures.is_some() || model.poses.is_some();
-        let has_own_photos = match &model.trained {
-            Some((_, out)) if knows_its_photos => Some(read_tree(out)?.plan.capture) == photos.id,
-            _ => false,
-        };
+        let has_own_photos = knows_its_photos && photos.are_of(model)?;
         if knows_its_photos && !has_own_photos {
             observer.note("the model was trained on other photos: its exposures are left out, and its refined poses");
         }
         let poses = model.poses.as_ref().filter(|_| has_own_photos);
+        let corrected = poses.map(|poses| poses.corrected(&photos.capture.views));
         let views = |part: Part| {
             let window = |i: u32| {
                 let given = photos.capture.views[i as usize].camera;
-                let camera = poses.map_or(given, |poses| poses.apply(i, given));
+                let camera = corrected.as_ref().map_or(given, |cameras| cameras[i as usize]);
                 TrainView { view: i, mip: 0, rect: camera.full(), camera, camera_from_context: None }
             };
             photos.split.views(part).into_iter().map(window).collect()

@@ -10,8 +10,10 @@ use glam::{DQuat, DVec3};
 use serde::{Deserialize, Serialize};
 
 use crate::camera::{Camera, Rigid};
+use crate::capture::{Capture, View};
 use crate::error::CodecError;
 use crate::frame::{self, Kind};
+use crate::sensors::{self, Motion, Taken};
 
 /// Poses. The header is their number and the errors of sensors. The bulk has, for each view in ascending order, the view
 /// (u32), camera_from_world as seven f64 (the unit quaternion xyzw and the translation in metres), and the factor of the
@@ -53,6 +55,19 @@ pub struct SensorError {
 }
 
 impl SensorError {
+    /// The correct camera of a photo, from the given one and how the sensor moved when it took the photo, if that is known.
+    pub fn corrected(&self, given: &Camera, motion: Option<&Motion>) -> Camera {
+        let by_clock = |of: fn(&Motion) -> DVec3| motion.map_or(DVec3::ZERO, |motion| self.clock_seconds * of(motion));
+        let moved = Rigid {
+            rotation: DQuat::from_scaled_axis(self.turn + by_clock(|motion| motion.spin)),
+            translation: self.shift + by_clock(|motion| motion.velocity),
+        };
+        Camera {
+            pinhole: given.pinhole.with_focal_factor(self.focal_factor),
+            camera_from_world: moved.inverse().after(&given.camera_from_world),
+        }
+    }
+
     fn is_sane(&self) -> bool {
         let numbers = [self.shift.length(), self.turn.length(), self.clock_seconds];
         numbers.iter().all(|number| number.is_finite()) && is_factor(self.focal_factor)
@@ -82,6 +97,31 @@ impl Poses {
         let Some(&RefinedCamera { camera_from_world, focal_factor }) = self.of_views.get(&view) else { return camera };
         let pinhole = camera.pinhole.with_focal_factor(focal_factor);
         Camera { camera_from_world, pinhole }
+    }
+
+    /// The cameras of a capture's views as training found them: those of views that were trained on, and of all others the given ones
+    /// with the errors of their sensors taken out.
+    pub fn corrected(&self, views: &[View]) -> Vec<Camera> {
+        let taken = if self.sensors.is_empty() { Vec::new() } else { sensors::sensors(views).of_views };
+        let of_sensor = |i: usize| {
+            let Taken { sensor, motion } = taken.get(i)?;
+            let error = self.sensors.iter().find(|error| error.sensor == *sensor)?;
+            Some(error.corrected(&views[i].camera, motion.as_ref()))
+        };
+        let camera = |(i, view): (usize, &View)| match u32::try_from(i) {
+            Ok(number) if self.of_views.contains_key(&number) => self.apply(number, view.camera),
+            _ => of_sensor(i).unwrap_or(view.camera),
+        };
+        views.iter().enumerate().map(camera).collect()
+    }
+
+    /// The capture with its cameras [`corrected`](Self::corrected).
+    #[must_use]
+    pub fn in_capture(&self, capture: &Capture) -> Capture {
+        let mut capture = capture.clone();
+        let corrected = self.corrected(&capture.views);
+        capture.views.iter_mut().zip(corrected).for_each(|(view, camera)| view.camera = camera);
+        capture
     }
 
     /// Views with their refined cameras, ascending.
@@ -142,7 +182,10 @@ impl Poses {
 
 #[cfg(test)]
 mod tests {
+    use glam::DMat3;
+
     use super::*;
+    use crate::camera::Pinhole;
 
     fn some() -> Poses {
         let pose = |view: u32| {
@@ -158,6 +201,42 @@ mod tests {
     fn error(clock_seconds: f64) -> SensorError {
         let (shift, turn) = (DVec3::X, DVec3::new(0.0, 0.1, -0.2));
         SensorError { sensor: 3, shift, turn, focal_factor: 0.99, clock_seconds }
+    }
+
+    #[test]
+    fn views_that_were_not_trained_on_are_corrected_by_their_sensor() {
+        let pinhole = Pinhole { width: 40, height: 30, fx: 40.0, fy: 40.0, cx: 20.0, cy: 15.0 };
+        // Two sensors of a car that drives along x at 10 m/s and looks there.
+        let ahead = DQuat::from_mat3(&DMat3::from_cols(-DVec3::Y, -DVec3::Z, DVec3::X)).inverse();
+        let view = |(i, name): (u32, &str)| {
+            let centre = DVec3::X * f64::from(i);
+            let camera_from_world = Rigid { rotation: ahead, translation: -(ahead * centre) };
+            View {
+                name: format!("{name}/{i:04}.png"),
+                camera: Camera { pinhole, camera_from_world },
+                mips: Vec::new(),
+                masked: false,
+                depth: None,
+                seconds: Some(0.1 * f64::from(i)),
+            }
+        };
+        let views: Vec<View> = (0..8).map(|i| view((i, "left"))).chain((0..8).map(|i| view((i, "right")))).collect();
+        let poses = |sensors| Poses { sensors, ..[some().of_views[&3]].map(|own| (9, own)).into_iter().collect() };
+        let late = SensorError { sensor: 1, shift: DVec3::new(0.0, 0.5, 0.0), turn: DVec3::ZERO, ..error(0.05) };
+        let found = poses(vec![late]).corrected(&views);
+        for (i, (found, view)) in found.iter().zip(&views).enumerate() {
+            let moved = found.centre() - view.camera.centre();
+            match i {
+                0..8 => assert_eq!(*found, view.camera),
+                9 => assert_eq!(*found, poses(Vec::new()).apply(9, view.camera)),
+                // Half a metre on, as its photos are late, and half a metre down.
+                _ => {
+                    assert!((moved - DVec3::new(0.5, 0.0, -0.5)).length() < 1e-9, "{i}: {moved}");
+                    assert!((found.pinhole.fx - 0.99 * 40.0).abs() < 1e-9);
+                }
+            }
+        }
+        assert_eq!(poses(Vec::new()).corrected(&views)[10], views[10].camera);
     }
 
     #[test]

@@ -236,6 +236,7 @@ fn remove_common_motion(displacements: &mut [[f32; 6]], given: &GivenPoses) {
 
 #[cfg(test)]
 mod tests {
+    use scene::sensors::Motion;
     use scene::{Pinhole, Rect};
 
     use super::*;
@@ -273,6 +274,25 @@ mod tests {
         let right = pose.inverse().apply(DVec3::new(0.3f64.tan(), 0.0, 1.0));
         let seen = turned.apply(right);
         assert!(seen.x.abs() < 1e-6 && seen.y.abs() < 1e-6 && seen.z > 1.0, "{seen}");
+    }
+
+    #[test]
+    fn a_sensors_error_corrects_the_cameras_as_training_displaced_them() {
+        let views = views(9);
+        let motion = |view: u64| Motion { velocity: random_vector(view, 20.0), spin: random_vector(view + 50, 0.4) };
+        let taken: Vec<Taken> = (0..17).map(|view| Taken { sensor: 0, motion: Some(motion(view)) }).collect();
+        let given = GivenPoses::of(&views, &Splats::new(0), true, Some(&taken), None);
+        let mut training = PoseTraining::new(&given);
+        let numbers = [0.2, -0.1, 0.3, 0.02, -0.01, 0.03, 0.04, 0.05];
+        training.sensors.as_mut().unwrap().values[0][0] = numbers;
+        let poses = training.poses(&given);
+        for view in &views {
+            let trained = poses.apply(view.view, view.camera);
+            let corrected = poses.sensors[0].corrected(&view.camera, taken[view.view as usize].motion.as_ref());
+            let off = trained.camera_from_world.inverse().after(&corrected.camera_from_world);
+            assert!(off.translation.length() < 1e-5 && off.rotation.angle_between(DQuat::IDENTITY) < 1e-5, "{off:?}");
+            assert!((trained.pinhole.fx - corrected.pinhole.fx).abs() < 1e-5);
+        }
     }
 
     #[test]

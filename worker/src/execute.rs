@@ -130,7 +130,12 @@ struct Assignment<'a> {
 impl Assignment<'_> {
     /// A reader of the capture's windows that keeps this many bytes of them.
     fn reader(&self, store: &BlockingStore, cache_bytes: usize) -> WindowReader {
-        WindowReader::with_shared_tiles(self.tiles.clone(), self.capture.clone(), store.clone(), cache_bytes)
+        self.reader_of(self.capture.clone(), store, cache_bytes)
+    }
+
+    /// As [`reader`](Self::reader), with other cameras.
+    fn reader_of(&self, capture: Arc<Capture>, store: &BlockingStore, cache_bytes: usize) -> WindowReader {
+        WindowReader::with_shared_tiles(self.tiles.clone(), capture, store.clone(), cache_bytes)
     }
 }
 
@@ -268,14 +273,17 @@ impl PlanExecutor {
         let TrainerContext { store, shared, backend, options } = &self.context;
         let is_sound = |bytes: &[u8]| eval::figures_from_frame(bytes).is_ok();
         self.kept_or(job, is_sound, || {
-            // Each photo is read once.
-            let reader = job.reader(store, 0);
-            let (mut parts, leaves) = (Vec::new(), plan.leaves());
+            let (mut parts, mut given, leaves) = (Vec::new(), TrainingInfo::default(), plan.leaves());
             job.fetch_span.in_scope(|| {
-                self.inputs(job).blocks(PlannedTask::Evaluate(task), report, |block, splats, _| {
+                self.inputs(job).blocks(PlannedTask::Evaluate(task), report, |block, splats, training| {
                     parts.push((block, leaves.keep(&splats, &plan.ground, block)));
+                    given = training;
                 })
             })?;
+            let corrected = |poses: Poses| Arc::new(poses.in_capture(job.capture));
+            let capture = self.of_views(given)?.1.map_or_else(|| job.capture.clone(), corrected);
+            // Each photo is read once.
+            let reader = job.reader_of(capture, store, 0);
             let objects = self.inputs(job).objects(PlannedTask::Evaluate(task), job.capture, report)?;
             let span = tracing::info_span!("evaluate", views = task.views.len());
             let figures = self.pool.install(|| {

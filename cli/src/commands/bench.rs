@@ -62,7 +62,7 @@ pub(crate) fn adaptive(args: &AdaptiveArgs, output: &Output) -> Result<(), Failu
         let model = model::read(&train.out)?;
         let split = model.split(&trained.capture, None, None);
         let photos = Photos::ingested(trained.capture, store, split, train.plan.downscale);
-        let evaluated = measure_trained(&model, &photos, &Further::default(), &out, output)?;
+        let evaluated = measure_trained(&model, photos, &Further::default(), &out, output)?;
         record.scene = "half a bare plain".into();
         record.set_quality(&evaluated.record);
         let settled = format!(

@@ -69,7 +69,7 @@ pub(crate) fn build(args: &DemoArgs, output: &Output) -> Result<Built, Failure> 
     render_overviews(&model, &trained.capture, &birdseye, &oblique)?;
     let split = model.split(&trained.capture, None, None);
     let photos = Photos::ingested(trained.capture, store, split, train_args.plan.downscale);
-    let evaluated = measure_trained(&model, &photos, &Further::default(), &eval_folder, output)?;
+    let evaluated = measure_trained(&model, photos, &Further::default(), &eval_folder, output)?;
 
     let mut report = trained.report;
     report.record.set_quality(&evaluated.record);

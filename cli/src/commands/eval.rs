@@ -48,6 +48,7 @@ pub(crate) fn measure(args: &EvalArgs, output: &Output) -> Result<Evaluated, Fai
     let depth = args.depth.then(|| TrueDepth::open(&args.capture)).transpose()?;
     let true_boxes = true_boxes(&detectors, &args.capture)?;
     let photos = captures::photos_of(&model, &source, &photos, output)?;
+    let photos = photos.with_cameras_of(&model, &OutputObserver::new(output))?;
     let out = args.out.clone().unwrap_or_else(|| model.report_folder(&args.model, "eval"));
     let request = Request {
         model: &model,
@@ -86,10 +87,10 @@ pub(crate) fn true_boxes(detectors: &[Detector], capture: &Path) -> Result<Optio
     Ok(if detectors.is_empty() { None } else { TrueBoxes::open(capture)? })
 }
 
-/// Measures a model that was just trained on the CPU or a GPU and writes `report.json`. Renders on the CPU.
+/// Measures a model that was just trained on these photos, on the CPU or a GPU, and writes `report.json`. Renders on the CPU.
 pub(crate) fn measure_trained(
     model: &Model,
-    photos: &Photos,
+    photos: Photos,
     further: &Further,
     out: &Path,
     output: &Output,
@@ -97,6 +98,10 @@ pub(crate) fn measure_trained(
     let (details, backend) = (Details::default(), train::Backend::Cpu);
     let fits = Fits { pose: model.poses.is_some(), exposure: model.exposures.is_some() };
     let Further { lpips, depth, detectors, true_boxes } = *further;
+    let photos = &match &model.poses {
+        Some(poses) => photos.corrected_by(poses),
+        None => photos,
+    };
     let (details, backend) = (&details, &backend);
     let request =
         Request { model, details, photos, backend, lpips, fits, depth, detectors, true_boxes, out, trained: 0 };

@@ -194,7 +194,7 @@ fn train_and_measure(
     let split = model.split(&capture, None, None);
     let photos = Photos::ingested(capture, store, split, plan.downscale);
     let further = Further { depth: depth.as_ref(), true_boxes: true_boxes.as_ref(), ..*further };
-    let evaluated = measure_trained(&model, &photos, &further, &out, output)?;
+    let evaluated = measure_trained(&model, photos, &further, &out, output)?;
     record.scene.clone_from(&run.scene);
     record.set_quality(&evaluated.record);
     let depth = evaluated.depth.as_ref().map(|report| report.groups.held_out.all);
