@@ -38,6 +38,7 @@ fn vehicles_get_their_poses_from_positions_and_the_road() {
     let said = done(at, &words("a.json"));
     println!("{said}");
     assert_eq!(said["objects"], tracks.len());
+    assert!(2 * said["on_road"].as_u64().unwrap() > said["poses"].as_u64().unwrap(), "{said}");
     let against = &said["against"];
     assert!(
         against["within_10_degrees"].as_f64() > Some(0.8) && against["within_30_degrees"].as_f64() > Some(0.95),

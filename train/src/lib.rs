@@ -43,7 +43,7 @@ pub use job::{Flow, Job};
 pub use picture_loss::PictureLoss;
 pub use pose::path::ObjectTimes;
 pub use recipe::Recipe;
-pub use road_poses::{Positions, road_poses};
+pub use road_poses::{Positions, RoadPoses, road_poses};
 pub use source::WindowSource;
 pub use trainer::{Progress, Trained, train, train_from};
 pub use view::TrainView;

@@ -42,9 +42,18 @@ pub struct Positions<'a> {
     pub first: Option<DQuat>,
 }
 
-/// The path with poses, gaps filled. Where the road is not found the object keeps the height of its position, and the pitch of its
-/// displacement.
-pub fn road_poses(positions: &Positions, road: &Surface) -> Vec<PathPose> {
+/// A path with poses.
+#[derive(Debug, Clone, PartialEq)]
+pub struct RoadPoses {
+    /// With gaps filled.
+    pub path: Vec<PathPose>,
+    /// At how many of them the object lies on the road. At the others it keeps the pitch of its displacement, and the height of its
+    /// position or of the few corners that found a road.
+    pub on_road: usize,
+}
+
+/// Poses of an object at its positions, from the road under its corners.
+pub fn road_poses(positions: &Positions, road: &Surface) -> RoadPoses {
     let ground_from_world = road.ground_from_world();
     let on_ground = positions.places.iter().map(|(seconds, place)| (*seconds, ground_from_world * *place));
     let places = without_gaps(&on_ground.collect::<Vec<_>>());
@@ -53,15 +62,18 @@ pub fn road_poses(positions: &Positions, road: &Surface) -> Vec<PathPose> {
         ahead.y.atan2(ahead.x)
     });
     let courses = courses(&places, first);
+    let mut on_road = 0;
     let pose = |(&(seconds, place), &(heading, pitch)): (&(f64, DVec3), &(f64, f64))| {
-        let (rotation, translation) = laid_down(place, heading, pitch, positions, road);
+        let (rotation, translation, lies) = laid_down(place, heading, pitch, positions, road);
+        on_road += usize::from(lies);
         let world_from_object = Rigid {
             rotation: (ground_from_world.inverse() * rotation).normalize(),
             translation: ground_from_world.inverse() * translation,
         };
         PathPose { seconds, world_from_object }
     };
-    places.iter().zip(&courses).map(pose).collect()
+    let path = places.iter().zip(&courses).map(pose).collect();
+    RoadPoses { path, on_road }
 }
 
 /// The positions with those that are missing, by the median interval.
@@ -153,12 +165,12 @@ fn turn(from: f64, to: f64) -> f64 {
     (to - from).sin().atan2((to - from).cos())
 }
 
-/// Rotation and origin of the object at a position, on the road; in ground axes.
-fn laid_down(place: DVec3, heading: f64, pitch: f64, of: &Positions, road: &Surface) -> (DQuat, DVec3) {
+/// Rotation and origin of the object at a position, on the road, in ground axes; and whether three corners of it found one.
+fn laid_down(place: DVec3, heading: f64, pitch: f64, of: &Positions, road: &Surface) -> (DQuat, DVec3, bool) {
     let ahead = DVec2::from_angle(heading);
     // Slopes of the lower side ahead and to the left, and its height under the origin.
     let (mut along, mut across) = (pitch.clamp(-MAX_TILT, MAX_TILT).tan(), 0.0);
-    let (mut rotation, mut height) = (tilted(ahead, along, across), place.z);
+    let (mut rotation, mut height, mut lies) = (tilted(ahead, along, across), place.z, false);
     for _ in 0..ROUNDS {
         let corners = [(of.low.x, of.low.y), (of.low.x, of.high.y), (of.high.x, of.low.y), (of.high.x, of.high.y)];
         let met = corners.iter().filter_map(|&(x, y)| {
@@ -170,8 +182,10 @@ fn laid_down(place: DVec3, heading: f64, pitch: f64, of: &Positions, road: &Surf
             Some((DVec3::new(off.dot(ahead), off.dot(ahead.perp()), found), found - corner.z))
         });
         let met = without_the_odd_one(met.collect());
-        match plane(&met) {
-            Some((base, x, y)) if x.atan().abs() < MAX_TILT && y.atan().abs() < MAX_TILT => {
+        let plane = plane(&met).filter(|(_, x, y)| x.atan().abs() < MAX_TILT && y.atan().abs() < MAX_TILT);
+        lies = plane.is_some();
+        match plane {
+            Some((base, x, y)) => {
                 (along, across) = (x, y);
                 rotation = tilted(ahead, along, across);
                 // The lower side's middle lies on the plane.
@@ -179,11 +193,11 @@ fn laid_down(place: DVec3, heading: f64, pitch: f64, of: &Positions, road: &Surf
                 let off = middle.truncate();
                 height = base + along * off.dot(ahead) + across * off.dot(ahead.perp()) - middle.z;
             }
-            _ if met.is_empty() => break,
-            _ => height += met.iter().map(|(_, off)| off).sum::<f64>() / met.len() as f64,
+            None if met.is_empty() => break,
+            None => height += met.iter().map(|(_, off)| off).sum::<f64>() / met.len() as f64,
         }
     }
-    (rotation, DVec3::new(place.x, place.y, height))
+    (rotation, DVec3::new(place.x, place.y, height), lies)
 }
 
 /// The rotation whose x looks ahead and whose lower side has these slopes ahead and to the left.
@@ -258,8 +272,9 @@ mod tests {
         };
         for noise in [0.0, 0.1] {
             let places: Vec<(f64, DVec3)> = (0..50).filter(|i| !(20..24).contains(i)).map(|i| at(i, noise)).collect();
-            let path = road_poses(&Positions { places: &places, low: LOW, high: HIGH, first: None }, &surface);
-            assert_eq!(path.len(), 50, "the gap is filled");
+            let RoadPoses { path, on_road } =
+                road_poses(&Positions { places: &places, low: LOW, high: HIGH, first: None }, &surface);
+            assert_eq!((path.len(), on_road), (50, 50), "the gap is filled");
             let z = DVec3::new(-f64::from(slope), -f64::from(crossfall), 1.0).normalize();
             let x = DVec3::new(1.0, 0.0, f64::from(slope)).normalize();
             let truth = DQuat::from_mat3(&DMat3::from_cols(x, z.cross(x), z));
@@ -277,7 +292,8 @@ mod tests {
         let surface = road(0.0, 0.0, 0.15);
         let places: Vec<(f64, DVec3)> =
             (0..20).map(|i| (0.2 * f64::from(i), DVec3::new(f64::from(i), 3.0, 0.0))).collect();
-        let path = road_poses(&Positions { places: &places, low: LOW, high: HIGH, first: None }, &surface);
+        let RoadPoses { path, .. } =
+            road_poses(&Positions { places: &places, low: LOW, high: HIGH, first: None }, &surface);
         let left = path[10].world_from_object.rotation * DVec3::Y;
         let roll = left.z.asin().to_degrees();
         // 0.15 m over 1.8 m.
@@ -298,7 +314,8 @@ mod tests {
         };
         let places: Vec<(f64, DVec3)> = (0..60).map(|i| (0.2 * f64::from(i), DVec3::new(x(i), 0.0, 0.0))).collect();
         let heading = |first: Option<DQuat>| -> Vec<f64> {
-            let path = road_poses(&Positions { places: &places, low: LOW, high: HIGH, first }, &surface);
+            let RoadPoses { path, .. } =
+                road_poses(&Positions { places: &places, low: LOW, high: HIGH, first }, &surface);
             path.iter().map(|pose| pose.world_from_object.rotation * DVec3::X).map(|a| a.y.atan2(a.x).abs()).collect()
         };
         assert!(heading(None).iter().all(|turn| *turn < 1e-6));
@@ -312,7 +329,9 @@ mod tests {
         let up = DQuat::from_rotation_x(-0.3) * DVec3::Z;
         let places: Vec<(f64, DVec3)> =
             (0..9).map(|i| (f64::from(i), (DVec3::X + 0.1 * up) * f64::from(2 * i))).collect();
-        let path = road_poses(&Positions { places: &places, low: LOW, high: HIGH, first: None }, &surface);
+        let RoadPoses { path, on_road } =
+            road_poses(&Positions { places: &places, low: LOW, high: HIGH, first: None }, &surface);
+        assert_eq!(on_road, 0);
         for (pose, (seconds, place)) in path.iter().zip(&places) {
             let Rigid { rotation, translation } = pose.world_from_object;
             assert!(pose.seconds == *seconds && translation.distance(*place) < 1e-9);
@@ -320,12 +339,13 @@ mod tests {
         }
         let one = [(3.0, DVec3::ONE)];
         for (places, count) in [(&one[..], 1), (&[], 0)] {
-            let path = road_poses(&Positions { places, low: LOW, high: HIGH, first: None }, &surface);
+            let RoadPoses { path, .. } = road_poses(&Positions { places, low: LOW, high: HIGH, first: None }, &surface);
             assert!(path.len() == count && path.iter().all(|pose| pose.world_from_object.is_sane()));
         }
         // Positions at one time, of which only one is right.
         let same = [(1.0, DVec3::ZERO), (1.0 + 1e-9, DVec3::X), (9.0, DVec3::Y)];
-        let path = road_poses(&Positions { places: &same, low: LOW, high: HIGH, first: None }, &surface);
+        let RoadPoses { path, .. } =
+            road_poses(&Positions { places: &same, low: LOW, high: HIGH, first: None }, &surface);
         assert!(path.iter().all(|pose| pose.world_from_object.is_sane()));
     }
 }

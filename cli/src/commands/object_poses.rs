@@ -11,7 +11,7 @@ use scene::objects::{self, Tracks};
 use scene::{BadInput, CodecError, MovingObject, PathPose};
 use serde::Serialize;
 use store::file::save;
-use train::{Positions, road_poses};
+use train::{Positions, RoadPoses, road_poses};
 
 use crate::args::PoseArgs;
 use crate::commands::export::make_parent;
@@ -33,6 +33,8 @@ struct Posed<'a> {
     /// Poses of all objects, and how many of them fill gaps.
     poses: usize,
     filled: usize,
+    /// At how many the object lies on the road.
+    on_road: usize,
     /// Splats of the model that lie near the paths.
     splats: usize,
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -80,8 +82,11 @@ pub(crate) fn run(args: &PoseArgs, output: &Output) -> Result<(), Failure> {
     }
     let progress = output.progress("posing", given.objects.len() as u64);
     let mut posed = Vec::new();
+    let mut on_road = 0;
     for (done, object) in (1..).zip(&given.objects) {
-        posed.push(on_the_road(object, &road));
+        let RoadPoses { path, on_road: lies } = on_the_road(object, &road);
+        on_road += lies;
+        posed.push(MovingObject { path, ..object.clone() });
         progress.at(done, "");
     }
     drop(progress);
@@ -95,12 +100,19 @@ pub(crate) fn run(args: &PoseArgs, output: &Output) -> Result<(), Failure> {
         objects: posed.len(),
         poses: poses(&posed),
         filled: poses(&posed) - poses(&given.objects),
+        on_road,
         splats,
         against: truth.map(|truth| errors(&posed, &truth.objects)),
     };
     make_parent(&args.out)?;
     save(&args.out, &objects::write(&Tracks { objects: posed, seconds: given.seconds }))?;
-    let mut text = format!("{} objects, {} poses, {} of which fill gaps", said.objects, said.poses, said.filled);
+    let mut text = format!(
+        "{} objects, {} poses, {} of which fill gaps, {} on the road",
+        said.objects, said.poses, said.filled, said.on_road
+    );
+    if on_road == 0 {
+        output.note("no pose is on a road of the model: heights are those of the positions, and nothing tilts");
+    }
     if let Some(errors) = &said.against {
         text += &format!(
             "\nrotation off by {:.1} degrees in the median, by up to 10 in {:.1} % of {} poses, by up to 30 in {:.1} %; height by {:.2} m",
@@ -133,14 +145,13 @@ pub(crate) fn read(path: &Path, decode: fn(&[u8]) -> Result<Tracks, CodecError>)
     Ok(tracks)
 }
 
-fn on_the_road(object: &MovingObject, road: &Surface) -> MovingObject {
+fn on_the_road(object: &MovingObject, road: &Surface) -> RoadPoses {
     let places: Vec<(f64, DVec3)> =
         object.path.iter().map(|pose| (pose.seconds, pose.world_from_object.translation)).collect();
     let first = object.path.first().map(|pose| pose.world_from_object.rotation);
     let is_known = first.is_some_and(|rotation| rotation != DQuat::IDENTITY);
     let first = first.filter(|_| is_known);
-    let path = road_poses(&Positions { places: &places, low: object.low, high: object.high, first }, road);
-    MovingObject { path, ..object.clone() }
+    road_poses(&Positions { places: &places, low: object.low, high: object.high, first }, road)
 }
 
 /// Errors against true objects of the same names, at the times of poses between theirs.
