@@ -38,13 +38,15 @@ fn vehicles_get_their_poses_from_positions_and_the_road() {
     let said = done(at, &words("a.json"));
     println!("{said}");
     assert_eq!(said["objects"], tracks.len());
-    assert!(2 * said["on_road"].as_u64().unwrap() > said["poses"].as_u64().unwrap(), "{said}");
+    // Of a model that is a fog, few corners find a road.
+    let [poses, on_road] = ["poses", "on_road"].map(|name| said[name].as_u64().unwrap());
+    assert!((poses / 10..=poses).contains(&on_road), "{said}");
     let against = &said["against"];
     assert!(
         against["within_10_degrees"].as_f64() > Some(0.8) && against["within_30_degrees"].as_f64() > Some(0.95),
         "{said}"
     );
-    // Of a model that is a fog.
+    // Of that model, too.
     assert!(against["median_height_metres"].as_f64() < Some(0.5), "{said}");
     done(at, &words("b.json"));
     let bytes = |name: &str| fs::read(at.join(name)).unwrap();
