@@ -6,7 +6,7 @@ use blocks::Split;
 use dataset::ingest::{IngestOptions, ingest};
 use dataset::open::Source;
 use dataset::windows::WindowReader;
-use model::{Model, read_tree};
+use model::Model;
 use scene::{ArtefactId, Capture, Poses, Zones};
 use store::{BlockingStore, Store};
 use tempfile::TempDir;
@@ -87,7 +87,7 @@ impl Photos {
     /// A trained model whose plan cannot be read.
     pub(crate) fn are_of(&self, model: &Model) -> Result<bool, EvalError> {
         match &model.trained {
-            Some((_, out)) => Ok(Some(read_tree(out)?.plan.capture) == self.id),
+            Some((_, out)) => Ok(self.id.is_some() && model::capture_of(out)? == self.id),
             None => Ok(false),
         }
     }

@@ -43,7 +43,7 @@ pub use garage::{Garage, Vehicle, cut_out, place};
 pub use import::{Kind, kind};
 pub use manifest::{BlockEntry, Manifest};
 pub use rad::write_rad;
-pub use read::{Tree, ground_from_world, read, read_tree};
+pub use read::{Tree, capture_of, ground_from_world, read, read_tree};
 pub use rewrite::{check_out, replace_blocks, rewrite};
 pub use streamed_sog::write_streamed_sog;
 pub use tiles::write_tiles;

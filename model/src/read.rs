@@ -8,7 +8,8 @@ use std::path::{Path, PathBuf};
 use blocks::{Cut, Ground, Mode, Plan};
 use glam::{DQuat, DVec3};
 use scene::{
-    BLOCK_ATTRIBUTE, BadInput, BlockId, CodecError, Exposures, GeoOrigin, MovingObject, Poses, Splats, frame, ply,
+    ArtefactId, BLOCK_ATTRIBUTE, BadInput, BlockId, CodecError, Exposures, GeoOrigin, MovingObject, Poses, Splats,
+    frame, ply,
 };
 
 use crate::files::{
@@ -66,6 +67,14 @@ pub fn ground_from_world(path: &Path) -> Result<DQuat, BadInput> {
         Some(folder) => read_plan(&folder).map(|(_, plan)| plan.ground.ground_from_world),
         None => Ok(DQuat::IDENTITY),
     }
+}
+
+/// The capture that a model was trained on; `None` for a file, which does not say. Reads no splats.
+///
+/// # Errors
+/// As [`read`], of a folder that `plat train` wrote.
+pub fn capture_of(path: &Path) -> Result<Option<ArtefactId>, BadInput> {
+    trained_folder(path).map(|folder| Ok(read_plan(&folder)?.1.capture)).transpose()
 }
 
 /// The objects of a folder, by name; none without their paths.

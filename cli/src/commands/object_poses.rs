@@ -111,7 +111,7 @@ pub(crate) fn run(args: &PoseArgs, output: &Output) -> Result<(), Failure> {
         said.objects, said.poses, said.filled, said.on_road
     );
     if on_road == 0 {
-        output.note("no pose is on a road of the model: heights are those of the positions, and nothing tilts");
+        output.note("no pose has a road of the model under three corners: heights and tilts are not those of a road");
     }
     if let Some(errors) = &said.against {
         text += &format!(
