@@ -5,8 +5,8 @@ use std::path::PathBuf;
 use eval::cuts::CutFigures;
 use eval::seams::SeamReport;
 use eval::{
-    AgainstTruth, BudgetFigures, ByKind, Correlation, Correlations, DepthReport, DetectionReport, Group, MovingFigures,
-    ObjectFigures, Summary, ViewFigures, mean,
+    AgainstTruth, BudgetFigures, ByKind, Correlation, Correlations, DepthReport, DetectionReport, Group, MovedReport,
+    MovingFigures, ObjectFigures, Summary, ViewFigures, mean,
 };
 use perceive::{Counts, Precision};
 use serde::Serialize;
@@ -56,6 +56,9 @@ pub(crate) struct Evaluated {
     /// Of objects that move, where the capture has some.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) moving: Option<MovingFigures>,
+    /// With `--objects-later`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(crate) objects_moved: Option<MovedReport>,
 }
 
 impl Evaluated {
@@ -78,6 +81,7 @@ impl Evaluated {
             budgets: Vec::new(),
             seams: None,
             moving: None,
+            objects_moved: None,
         }
     }
 }
@@ -130,6 +134,9 @@ pub(crate) fn text(evaluated: &Evaluated) -> String {
     if let Some(report) = &evaluated.depth {
         text += &format!("\n{}", depth(report));
     }
+    if let Some(report) = &evaluated.objects_moved {
+        text += &format!("\n{}", objects_moved(report));
+    }
     for report in &evaluated.detections {
         text += &format!("\n{}", detections(report));
     }
@@ -143,6 +150,20 @@ pub(crate) fn text(evaluated: &Evaluated) -> String {
         text += &format!("\n{}\n\n", seams(report));
     }
     text + &evaluated.sheet.as_ref().map_or(String::new(), |sheet| sheet.display().to_string())
+}
+
+/// What detectors find of objects that were moved.
+fn objects_moved(report: &MovedReport) -> String {
+    let MovedReport { seconds, views, detectors } = report;
+    let mut text = format!("objects {seconds} s later on their paths, on {views} held-out views\n");
+    for of in detectors {
+        let each = [("photos", of.photos), ("renders", of.renders), ("moved", of.moved)].map(|(name, found)| {
+            let [map, map50] = [found.precision.map, found.precision.map50].map(|value| figure(value, 3));
+            format!("{name} mAP {map}, at 0.5 {map50}, {} objects", found.boxes)
+        });
+        text += &format!("{}: {}\n", of.detector, each.join("; "));
+    }
+    text
 }
 
 /// Means of groups of views with their names.

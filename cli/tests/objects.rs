@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 use std::fs;
 use std::path::Path;
 
-use common::{done, refused};
+use common::{done, refused, write_tiny};
 use serde_json::Value;
 
 const SYNTH: [&str; 16] = [
@@ -100,6 +100,7 @@ fn what_moves_has_splats_of_its_own() {
     refused(at, &["render", "model", "--cameras", "city", "--out", "x", "--without", "none"], "has no object 'none'");
     refused(at, &["render", "model", "--cameras", "city", "--out", "x", "--move", "7=1,2"], "give ID=X,Y,Z");
 
+    detected(at);
     films(at, "model");
 
     done(at, &["prune", "model", "--keep", "0.5", "--out", "pruned", "--quiet"]);
@@ -120,6 +121,21 @@ fn what_moves_has_splats_of_its_own() {
     fs::write(at.join("city/tracks.json"), &tracks).unwrap();
     refused(at, &["plan", "city", "--blocks", "flat", "--objects", "--out", "plan.json"], "--objects");
     refused(at, &["train", "city", "--objects", "--minutes", "1", "--out", "x"], "--minutes");
+}
+
+/// Detectors look for objects where they were, and where a model puts them anew.
+fn detected(at: &Path) {
+    write_tiny(at);
+    let eval = |model: &'static str, later: &'static str| {
+        ["eval", model, "city", "--backend", "cpu", "--detector", "tiny.onnx", "--objects-later", later, "--quiet"]
+    };
+    let moved = |later: &'static str| done(at, &eval("model", later))["objects_moved"].clone();
+    let (same, gone) = (moved("0"), moved("1000"));
+    let of = &same["detectors"][0];
+    assert!(same["views"].as_u64() > Some(0) && of["renders"]["boxes"].as_u64() > Some(0), "{same}");
+    assert!(of["moved"] == of["renders"] && of["photos"]["boxes"] == of["renders"]["boxes"], "{same}");
+    assert!(gone["detectors"][0]["moved"]["boxes"] == 0 && gone["detectors"][0]["renders"] == of["renders"], "{gone}");
+    refused(at, &eval("static", "1"), "finds no objects in the model");
 }
 
 /// Films along one camera's photos of the city.

@@ -21,7 +21,7 @@ use crate::metric_maps;
 use crate::zones::ZoneFigures;
 
 /// Least score of a detection on a render that average precision sees, as COCO's evaluations choose it.
-const LEAST_SCORE: f32 = 0.05;
+pub(crate) const LEAST_SCORE: f32 = 0.05;
 
 /// A photo and a render of its view, as detectors see them.
 pub(crate) struct Sight<'a> {

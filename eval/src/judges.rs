@@ -41,6 +41,11 @@ pub struct DetectionReport {
     pub by_view: Vec<DetectionFigures>,
 }
 
+/// The network's file, without its folder.
+pub(crate) fn file_name(detector: &Detector) -> String {
+    Path::new(detector.file()).file_name().unwrap_or_default().to_string_lossy().into_owned()
+}
+
 /// The judges of an evaluation, and their figures so far.
 pub(crate) struct Judges<'a> {
     depth: Option<DepthJudge<'a>>,
@@ -125,7 +130,7 @@ impl<'a> Judges<'a> {
             by_view: figures.into_iter().map(|(_, _, figures)| figures).collect(),
         });
         let report = |DetectionJudge { detector, figures }: DetectionJudge| DetectionReport {
-            detector: Path::new(detector.file()).file_name().unwrap_or_default().to_string_lossy().into_owned(),
+            detector: file_name(detector),
             score: detector.card().score,
             groups: Groups::of(&figures, kinds, DetectionSummary::of),
             by_view: figures.into_iter().map(|(_, _, figures)| figures).collect(),

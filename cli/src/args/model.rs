@@ -55,6 +55,9 @@ pub(crate) struct EvalArgs {
     /// Also measure how far what this detector (ONNX) finds on renders is what it finds on photos. Repeatable
     #[arg(long, value_name = "FILE", long_help = DETECTOR_HELP)]
     pub(crate) detector: Vec<PathBuf>,
+    /// Also let the detectors look for the model's objects where they are SECONDS later on their paths, on held-out views
+    #[arg(long, value_name = "SECONDS", allow_negative_numbers = true, value_parser = clock_seconds, requires = "detector")]
+    pub(crate) objects_later: Option<f64>,
     /// Also measure the tree cut at level L, or at every level, against the finest model
     #[arg(long, value_name = "L|all", value_parser = levels)]
     pub(crate) level: Option<Levels>,

@@ -67,6 +67,10 @@ pub(crate) fn measure(args: &EvalArgs, output: &Output) -> Result<Evaluated, Fai
         trained: args.trained as usize,
     };
     let mut evaluated = evaluated(&request, output)?;
+    if let Some(seconds) = args.objects_later {
+        let observer = OutputObserver::new(output);
+        evaluated.objects_moved = Some(eval::moved(&model, &photos, &backend, &detectors, seconds, &observer)?);
+    }
     evaluated.record.scene = captures::name_of(&args.capture);
     evaluated.record.downscale = photos.downscale;
     save_json(&out.join("report.json"), &evaluated)?;
