@@ -101,9 +101,20 @@ fn pruning_keeps_what_a_detector_finds_on_renders() {
     assert!(objects(&any)[0] == before && any["splats"] == free["splats"], "a tolerance of all changes the result");
     assert!(none["splats"].as_u64() >= any["splats"].as_u64());
 
+    // Recoveries that ask the detector give another model, the same each time.
+    let of = |out: &str, weight: &str| {
+        prune(out, &["--aligned-weight", weight]);
+        fs::read(at.join(out).join("merged.ply")).unwrap()
+    };
+    let (asked, unasked) = (of("asked", "0.1"), of("unasked", "0"));
+    assert!(
+        unasked == fs::read(at.join("free/merged.ply")).unwrap() && asked != unasked && of("again", "0.1") == asked
+    );
+
     let words = ["prune", "model", "--capture", "city", "--out", "o"];
     let refused_with = |more: &[&str], says: &str| refused(at, &[&words[..], more].concat(), says);
     refused_with(&["--tolerance-detections", "0"], "--detector");
+    refused_with(&["--aligned-weight", "0.1"], "--detector");
     let detector = ["--detector", "tiny.onnx", "--tolerance-detections"];
     for share in ["-0.1", "1.5", "nan", "few"] {
         refused_with(

@@ -8,6 +8,7 @@
 //! Architecture invariant: no command line, no terminal, no clock. Progress and time come from the caller's [`Observer`].
 
 mod against_truth;
+mod aligned;
 mod birdseye;
 mod budgets;
 mod compared;
@@ -50,6 +51,7 @@ pub mod cuts;
 pub mod seams;
 
 pub use against_truth::AgainstTruth;
+pub use aligned::AlignedLoss;
 pub use birdseye::{birdseye_camera, oblique_camera};
 pub use budgets::BudgetFigures;
 pub use compared::side_by_side;
@@ -70,7 +72,7 @@ pub use label_colours::{coloured_by, label_colour, painted};
 pub use lpips::Lpips;
 pub use moved::{FoundObjects, MovedFigures, MovedReport, moved};
 pub use moving::{MovingFigures, ObjectFigures};
-pub use networks::{DetectorFile, load_detector, load_identified_detector};
+pub use networks::{DetectorFile, load_aligned, load_detector, load_identified_detector};
 pub use observer::{Observer, Seconds};
 pub use photos::{PhotoOptions, Photos};
 pub use picture::Picture;

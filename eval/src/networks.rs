@@ -5,7 +5,10 @@ use std::io::Read;
 use std::path::Path;
 
 use perceive::Detector;
+use perceive::aligned::{Aligned, Weights};
 use scene::{ArtefactId, BadInput};
+
+use crate::aligned::AlignedLoss;
 
 /// Networks that are used here have 4 to 60 MB.
 const FILE_LIMIT: u64 = 1 << 30;
@@ -60,6 +63,15 @@ impl DetectorFile {
 /// A file that cannot be read, or a network that is not a detector whose output is understood.
 pub fn load_detector(path: &Path) -> Result<Detector, BadInput> {
     load_identified_detector(path).map(|(detector, _)| detector)
+}
+
+/// As [`load_detector`], for the perception-aligned loss.
+///
+/// # Errors
+/// As [`load_detector`], or a network without a gradient.
+pub fn load_aligned(path: &Path) -> Result<AlignedLoss, BadInput> {
+    let DetectorFile { name, onnx, card } = DetectorFile::read(path)?;
+    Aligned::new(&name, &onnx, card.as_deref(), Weights::default()).map(AlignedLoss::new)
 }
 
 /// As [`load_detector`], with the id of its [artefact](DetectorFile::artefact).

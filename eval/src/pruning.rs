@@ -8,10 +8,10 @@ use perceive::Detector;
 use scene::{BadInput, Exposures, Splats, column};
 use train::importance::{EvaluationViews, Order, OwnershipWeights};
 use train::prune::{self, ObjectTolerance, PruneProgress, Pruned, Pruning};
-use train::{Backend, Flow, Job, Recipe, TrainError, TrainView};
+use train::{Backend, Flow, Job, PictureLoss, Recipe, TrainError, TrainView};
 
 use crate::shown_objects::ShownObjects;
-use crate::{EvalError, Observer, Photos};
+use crate::{AlignedLoss, EvalError, Observer, Photos};
 
 /// Bytes of decoded photos that are kept.
 const CACHE_BYTES: usize = 256 << 20;
@@ -31,6 +31,8 @@ pub struct Pruner<'a> {
     held_out: Vec<TrainView>,
     /// Of the model, if these are the photos that it was trained on.
     exposures: Option<&'a Exposures>,
+    /// A loss beside the photometric one in recoveries, and its weight.
+    aligned: Option<(&'a AlignedLoss, f32)>,
 }
 
 impl<'a> Pruner<'a> {
@@ -57,7 +59,13 @@ impl<'a> Pruner<'a> {
         let (held_in, held_out) = (views(Part::Trained), views(Part::Test));
         let exposures = model.exposures.as_ref().filter(|_| has_own_photos);
         let (reader, weighted) = (photos.reader(CACHE_BYTES), photos.weighted_reader(CACHE_BYTES));
-        Ok(Self { model, reader, weighted, held_in, held_out, exposures })
+        Ok(Self { model, reader, weighted, held_in, held_out, exposures, aligned: None })
+    }
+
+    /// Recoveries also ask a detector, with this weight.
+    #[must_use]
+    pub fn aligned_by(self, loss: &'a AlignedLoss, weight: f32) -> Self {
+        Self { aligned: Some((loss, weight)), ..self }
     }
 
     /// Mean PSNR of these splats over the views that are not held out, dB.
@@ -112,7 +120,8 @@ impl<'a> Pruner<'a> {
             Some((_, out)) => Some(read_tree(out)?.plan.settings),
             None => None,
         };
-        let recipe = Recipe::refinement(1.0);
+        let picture_weight = self.aligned.map_or(0.0, |(_, weight)| weight);
+        let recipe = Recipe { picture_weight, ..Recipe::refinement(1.0) };
         let all: &(dyn Fn(Vec3) -> bool + Sync) = &|_| true;
         let job = Job {
             initial: model.splats.clone(),
@@ -133,7 +142,7 @@ impl<'a> Pruner<'a> {
             path: None,
             recipe: &recipe,
             source: &self.weighted,
-            picture_loss: None,
+            picture_loss: self.aligned.map(|(loss, _)| loss as &dyn PictureLoss),
             backend: &Backend::Cpu,
         };
         let mut report = |now: PruneProgress| {

@@ -10,7 +10,7 @@ use scene::{BLOCK_ATTRIBUTE, BlockId, Capture, Exposures, Poses, Splats};
 use train::prune::Pruning;
 use train::{FreeSpace, TrainView};
 
-use crate::aligned::AlignedLoss;
+use crate::aligned::TalliedLoss;
 use crate::result_cache::ResultCache;
 use crate::task::{ExecuteError, TaskOrder};
 use crate::trainer_context::TrainerContext;
@@ -27,7 +27,7 @@ pub(crate) struct Block<'a> {
     pub(crate) capture: &'a Arc<Capture>,
     pub(crate) reader: &'a WindowReader,
     /// The loss of the plan's detector, if it has a weight.
-    pub(crate) aligned: Option<&'a AlignedLoss>,
+    pub(crate) aligned: Option<&'a TalliedLoss>,
     /// `None` if nothing is resumed.
     pub(crate) cache: Option<&'a ResultCache>,
     /// The exposures that the root trained.

@@ -24,7 +24,7 @@ use scene::{ArtefactId, BlockId, Capture, Exposures, Poses, Splats};
 use store::BlockingStore;
 use train::Backend;
 
-use crate::aligned::AlignedLoss;
+use crate::aligned::TalliedLoss;
 use crate::block::Block;
 use crate::clock::Stopwatch;
 use crate::detect::{Detection, detect, of_network};
@@ -169,7 +169,7 @@ impl PlanExecutor {
             return Ok(artefact);
         }
         let (exposures, poses) = self.of_views(given)?;
-        let aligned = AlignedLoss::of(plan, store)?;
+        let aligned = TalliedLoss::of(plan, store)?;
         drop(fetching);
         let (given_exposures, given_poses, given_residual) = (exposures.as_ref(), poses.as_ref(), given.residual);
         let block = Block {

@@ -10,7 +10,7 @@ use train::importance::EvaluationViews;
 use train::prune::{self, Pruning};
 use train::{Backend, Job, PictureLoss, Recipe, TrainError, TrainView, Trained};
 
-use crate::aligned::AlignedLoss;
+use crate::aligned::TalliedLoss;
 use crate::block::Block;
 use crate::clock::Stopwatch;
 use crate::initial_splats::InitialSplats;
@@ -389,7 +389,7 @@ impl<'a> Progress<'a> {
             wall_seconds,
             psnr: evaluated.map(|(psnr, _)| psnr),
             merged_splats: evaluated.map(|(_, splats)| splats),
-            aligned: self.block.aligned.and_then(AlignedLoss::report),
+            aligned: self.block.aligned.and_then(TalliedLoss::report),
         });
         self.is_cancelled |= flow == Flow::Stop && !is_last;
         self.overrun = self.memory.as_mut().filter(|_| !is_last).and_then(MemoryBudget::overrun);

@@ -62,7 +62,11 @@ pub(crate) fn run(args: &PruneArgs, output: &Output) -> Result<(), Failure> {
     check_out(&args.model, &args.out)?;
     let photos = photos(&model, capture, &args.photos, output)?;
     let observer = OutputObserver::new(output);
-    let pruner = Pruner::new(&model, &photos, &observer)?;
+    let aligned = args.photos.aligned()?;
+    let mut pruner = Pruner::new(&model, &photos, &observer)?;
+    if let Some((loss, weight)) = &aligned {
+        pruner = pruner.aligned_by(loss, *weight);
+    }
     let pruning = Pruning::within(tolerance_db.unwrap_or(TOLERANCE_DB));
     let detector = match (&args.tolerance_detections, &args.photos.zones.finder.zone_detector) {
         (Some(share), Some(path)) => Some((load_detector(path)?, *share)),
@@ -91,7 +95,7 @@ pub(super) fn photos(
     output: &Output,
 ) -> Result<Photos, Failure> {
     let source = captures::open(capture, output)?;
-    let PruneCapture { test_every, downscale, store, zones } = options;
+    let PruneCapture { test_every, downscale, store, zones, .. } = options;
     let from = captures::zone_source(&zones.finder, capture, &source)?;
     let options =
         PhotoOptions { store: store.as_deref(), downscale: *downscale, test_every: *test_every, ..Default::default() };

@@ -27,6 +27,8 @@ const LINES: &str = "prune.jsonl";
 const UNPRUNED: &str = "none";
 /// What the name of an order has behind it where pixels of objects count more.
 const ZONES: &str = "-zones";
+/// What it has behind that where recoveries ask the detector.
+const ALIGNED: &str = "-aligned";
 
 /// Figures of splats.
 struct Measured {
@@ -90,7 +92,12 @@ pub(crate) fn run(args: &BenchPruneArgs, output: &Output) -> Result<(), Failure>
     let mut photos = photos(&model, &args.capture, &args.photos, output)?;
     let observer = OutputObserver::new(output);
     let has_zones = photos.zones.is_some();
+    let aligned = args.photos.aligned()?;
     let zoned_pruner = Pruner::new(&model, &photos, &observer)?;
+    let asking = match &aligned {
+        Some((loss, weight)) => Some(Pruner::new(&model, &photos, &observer)?.aligned_by(loss, *weight)),
+        None => None,
+    };
     photos.zones = None;
     let plain = Pruner::new(&model, &photos, &observer)?;
     let folder = temporary_folder()?;
@@ -128,10 +135,11 @@ pub(crate) fn run(args: &BenchPruneArgs, output: &Output) -> Result<(), Failure>
     };
     add(line.clone())?;
     let orders = if args.order.is_empty() { Order::ALL.to_vec() } else { args.order.clone() };
-    let zoned = has_zones.then_some((Order::Energy, true));
+    let of_orders = orders.into_iter().map(|order| (order, String::new(), &plain));
+    let zoned = has_zones.then_some((Order::Energy, ZONES.to_owned(), &zoned_pruner));
+    let asking = asking.as_ref().map(|pruner| (Order::Energy, format!("{ZONES}{ALIGNED}"), pruner));
     let tolerance = (args.tolerance_db > 0.0).then_some(None);
-    for (order, with_zones) in orders.into_iter().map(|order| (order, false)).chain(zoned) {
-        let pruner = if with_zones { &zoned_pruner } else { &plain };
+    for (order, way, pruner) in of_orders.chain(zoned).chain(asking) {
         let standard = Pruning::within(args.tolerance_db);
         let pruning = Pruning {
             order,
@@ -146,7 +154,7 @@ pub(crate) fn run(args: &BenchPruneArgs, output: &Output) -> Result<(), Failure>
             let cpu_seconds = clock.cpu_seconds();
             let after = judges.measured(pruner, &splats)?;
             add(Prune {
-                order: format!("{}{}", order.name(), if with_zones { ZONES } else { "" }),
+                order: format!("{}{way}", order.name()),
                 keep,
                 recovery_steps: Some(pruned.steps),
                 tolerance_db: keep.is_none().then_some(args.tolerance_db),
