@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Lines of bench/results/prune.jsonl with what detectors find, and bench/results/prune.svg: a generated street with traffic and two real ones,
 # pruned to a half, a quarter and a tenth of their splats: the generated one by every order, the real ones by plain and by detection-aware
-# pruning. Zones are those of YOLOX-nano; FastestDet only judges. Makes the generated street in out/objects if it is not there. Takes the folder of the captures and detectors, and the names of those to prune (all where none is
+# pruning, without and with recoveries that ask the detector. Zones are those of YOLOX-nano; FastestDet only judges. Makes the generated street in out/objects if it is not there. Takes the folder of the captures and detectors, and the names of those to prune (all where none is
 # named). RESULTS is the folder of the lines. An hour.
 set -euo pipefail
 repository=$(realpath "$(dirname "${BASH_SOURCE[0]}")/..")
@@ -23,7 +23,7 @@ while read -r scene capture downscale every steps budget orders; do
         --steps "$steps" --budget "$budget" --threads 1 --backend cpu --tolerance-db 0 --eval-every 0 < /dev/null
     # shellcheck disable=SC2086 # no orders are all
     "$plat" --quiet bench prune $orders "out/objects/model-$scene" "$capture" --scene "$scene" --tolerance-db 0 --keep 0.5,0.25,0.1 --results "$results" \
-        --detector "$data/detectors/yolox_nano_416.onnx" --judge "$data/detectors/yolox_nano_416.onnx" \
+        --detector "$data/detectors/yolox_nano_416.onnx" --aligned-weight 0.003 --judge "$data/detectors/yolox_nano_416.onnx" \
         --judge "$data/detectors/fastestdet_352.onnx" < /dev/null
 done <<CAPTURES
 objects $street 1 8 6000 40000
