@@ -114,9 +114,9 @@ impl Intrinsics {
 /// Malformed JSON, no frames, an unsupported lens model, intrinsics without a focal length or out of range, or a
 /// `transform_matrix` whose 3×3 part is not a rotation times a scale. The scale is dropped.
 pub fn read(bytes: &[u8]) -> Result<Transforms, CodecError> {
-    let file: File = serde_json::from_slice(bytes).map_err(|e| CodecError::new(format!("transforms.json: {e}")))?;
+    let file: File = serde_json::from_slice(bytes).map_err(|e| CodecError::new(e.to_string()))?;
     if file.frames.is_empty() {
-        return Err(CodecError::new("transforms.json has no frames"));
+        return Err(CodecError::new("has no frames"));
     }
     let shared = file.lens();
     let mut frames = Vec::with_capacity(file.frames.len());
