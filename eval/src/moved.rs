@@ -7,7 +7,7 @@ use model::{Model, ModelObject};
 use perceive::tracking::Kind;
 use perceive::{Boxes, Detection, Detector, Picture, Precision, TrueBox, precision};
 use render::Options;
-use scene::{BadInput, Camera, MovingObject, Rigid, Splats};
+use scene::{Camera, MovingObject, Rigid, Splats};
 use serde::Serialize;
 use train::Backend;
 
@@ -64,7 +64,7 @@ pub struct FoundObjects {
 /// photos.
 ///
 /// # Errors
-/// A model without objects, photos that cannot be read, a renderer that fails, a network that cannot be run.
+/// Photos that cannot be read, a renderer that fails, a network that cannot be run.
 pub fn moved(
     model: &Model,
     photos: &Photos,
@@ -73,9 +73,6 @@ pub fn moved(
     seconds: f64,
     observer: &dyn Observer,
 ) -> Result<MovedReport, EvalError> {
-    if model.objects.is_empty() {
-        return Err(BadInput::new("--objects-later", "finds no objects in the model", "train it with --objects").into());
-    }
     let held_out = photos.split.held_out();
     let reader = photos.reader(CACHE_BYTES);
     let mut renderer = Renderer::new(backend)?;
@@ -91,7 +88,7 @@ pub fn moved(
     let mut found: Vec<[Vec<Boxes>; 3]> = detectors.iter().map(|_| Default::default()).collect();
     let mut views = 0;
     for (i, &index) in held_out.iter().enumerate() {
-        observer.progress("objects moved", i as u64, held_out.len() as u64, "");
+        observer.progress("objects moved", i as u64 + 1, held_out.len() as u64, "");
         let view = &photos.capture.views[index as usize];
         let Some(taken) = view.seconds else { continue };
         let [there, later] = [taken, taken + seconds].map(|time| scene.shown(&view.camera, time));

@@ -9,6 +9,7 @@ use dataset::true_boxes::TrueBoxes;
 use eval::{DetailOptions, Details, Evaluation, Fits, Lpips, PhotoOptions, Photos, Request, load_detector};
 use model::{Model, save_json};
 use perceive::Detector;
+use scene::BadInput;
 
 use crate::args::EvalArgs;
 use crate::eval_report::{Evaluated, text};
@@ -29,6 +30,9 @@ pub(crate) fn measure(args: &EvalArgs, output: &Output) -> Result<Evaluated, Fai
     let lpips = args.lpips.as_deref().map(Lpips::load).transpose()?;
     let detectors: Vec<Detector> = args.detector.iter().map(|file| load_detector(file)).collect::<Result<_, _>>()?;
     let model = model::read(&args.model)?;
+    if args.objects_later.is_some() && model.objects.is_empty() {
+        return Err(BadInput::new("--objects-later", "finds no objects in the model", "train it with --objects").into());
+    }
     let options = DetailOptions {
         levels: args.level,
         budgets: args.budget.clone(),
