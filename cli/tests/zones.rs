@@ -79,12 +79,20 @@ fn pixels_of_zones_change_training_and_pruning_reproducibly() {
     );
 }
 
+/// A network with an operator whose gradient is not known.
+fn with_other_operator(onnx: &[u8]) -> Vec<u8> {
+    let mut other = onnx.to_vec();
+    let places: Vec<usize> = (0..other.len() - 4).filter(|&i| &other[i..i + 4] == b"Tanh").collect();
+    places.into_iter().for_each(|i| other[i..i + 4].copy_from_slice(b"Ceil"));
+    other
+}
+
 #[test]
 fn pruning_keeps_what_a_detector_finds_on_renders() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
     city(at, 16, 96, 64);
-    write_tiny(at);
+    let onnx = write_tiny(at);
     done(at, &[&TRAIN[..], &["--tolerance-db", "0", "--out", "model"]].concat());
     let prune = |out: &str, more: &[&str]| {
         let words = ["prune", "model", "--capture", "city", "--detector", "tiny.onnx", "--tolerance-db", "6"];
@@ -115,6 +123,10 @@ fn pruning_keeps_what_a_detector_finds_on_renders() {
     let refused_with = |more: &[&str], says: &str| refused(at, &[&words[..], more].concat(), says);
     refused_with(&["--tolerance-detections", "0"], "--detector");
     refused_with(&["--aligned-weight", "0.1"], "--detector");
+    // A detector that runs, but whose gradient is not known.
+    fs::write(at.join("other.onnx"), with_other_operator(&onnx)).unwrap();
+    fs::copy(at.join("tiny.toml"), at.join("other.toml")).unwrap();
+    refused_with(&["--detector", "other.onnx", "--aligned-weight", "0.1"], "Ceil");
     let detector = ["--detector", "tiny.onnx", "--tolerance-detections"];
     for share in ["-0.1", "1.5", "nan", "few"] {
         refused_with(
@@ -154,10 +166,7 @@ fn a_detectors_loss_changes_training_reproducibly() {
         refused_with(&["--detector", "tiny.onnx", &format!("--aligned-weight={weight}")], "--aligned-weight");
     }
     // A detector that runs, but whose gradient is not known.
-    let mut other = onnx;
-    let places: Vec<usize> = (0..other.len() - 4).filter(|&i| &other[i..i + 4] == b"Tanh").collect();
-    places.into_iter().for_each(|i| other[i..i + 4].copy_from_slice(b"Ceil"));
-    fs::write(at.join("other.onnx"), other).unwrap();
+    fs::write(at.join("other.onnx"), with_other_operator(&onnx)).unwrap();
     fs::copy(at.join("tiny.toml"), at.join("other.toml")).unwrap();
     refused_with(&["--detector", "other.onnx", "--aligned-weight", "0.1"], "Ceil");
 }

@@ -60,9 +60,9 @@ pub(crate) fn run(args: &PruneArgs, output: &Output) -> Result<(), Failure> {
     };
     let model = model::read(&args.model)?;
     check_out(&args.model, &args.out)?;
+    let aligned = args.photos.aligned()?;
     let photos = photos(&model, capture, &args.photos, output)?;
     let observer = OutputObserver::new(output);
-    let aligned = args.photos.aligned()?;
     let mut pruner = Pruner::new(&model, &photos, &observer)?;
     if let Some((loss, weight)) = &aligned {
         pruner = pruner.aligned_by(loss, *weight);

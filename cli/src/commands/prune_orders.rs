@@ -89,10 +89,10 @@ impl Judges<'_> {
 pub(crate) fn run(args: &BenchPruneArgs, output: &Output) -> Result<(), Failure> {
     let model = model::read(&args.model)?;
     let detectors = args.judge.iter().map(|file| load_detector(file)).collect::<Result<_, _>>()?;
+    let aligned = args.photos.aligned()?;
     let mut photos = photos(&model, &args.capture, &args.photos, output)?;
     let observer = OutputObserver::new(output);
     let has_zones = photos.zones.is_some();
-    let aligned = args.photos.aligned()?;
     let zoned_pruner = Pruner::new(&model, &photos, &observer)?;
     let asking = match &aligned {
         Some((loss, weight)) => Some(Pruner::new(&model, &photos, &observer)?.aligned_by(loss, *weight)),
