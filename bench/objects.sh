@@ -2,7 +2,7 @@
 # Lines of bench/results/prune.jsonl with what detectors find, and bench/results/prune.svg: a generated street with traffic and two real ones,
 # pruned to a half, a quarter and a tenth of their splats: the generated one by every order, the real ones by plain and by detection-aware
 # pruning, without and with recoveries that ask the detector. Zones are those of YOLOX-nano; FastestDet only judges. Makes the generated street in out/objects if it is not there. Takes the folder of the captures and detectors, and the names of those to prune (all where none is
-# named). RESULTS is the folder of the lines. An hour.
+# named). RESULTS is the folder of the lines. Over an hour.
 set -euo pipefail
 repository=$(realpath "$(dirname "${BASH_SOURCE[0]}")/..")
 # Lines of results name the command, so that its paths must not be those of one machine.
