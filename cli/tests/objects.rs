@@ -41,6 +41,63 @@ fn differ(at: &Path, a: &str, b: &str) -> bool {
     files(&at.join(a)) != files(&at.join(b))
 }
 
+/// A street that cameras on posts film for three seconds, and someone who walks there.
+const FILM: [&str; 19] = [
+    "synth",
+    "--area-km2",
+    "0.02",
+    "--layout",
+    "alley",
+    "--traffic",
+    "heavy",
+    "--seed",
+    "3",
+    "--watch=-29,42,7",
+    "--film",
+    "3",
+    "--views",
+    "240",
+    "--size",
+    "192x108",
+    "--quiet",
+    "--out",
+    "film",
+];
+
+#[test]
+fn people_who_walk_swing_their_limbs() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    let made = done(at, &FILM);
+    assert_eq!(made["views"].as_u64().map(|views| (views % 30, views > 60)), Some((0, true)), "{made}");
+    // Of another class they are rigid.
+    let tracks = fs::read_to_string(at.join("film/tracks.json")).unwrap();
+    let psnr = |out: &str, class: &str| {
+        fs::write(at.join("film/tracks.json"), tracks.replace("\"person\"", &format!("\"{class}\""))).unwrap();
+        let train = ["train", "film", "--out", out, "--steps", "3000", "--budget", "4000", "--levels", "1"];
+        done(at, &[&train[..], &["--tolerance-db", "0", "--objects", "--backend", "cpu", "--quiet"]].concat());
+        let report = done(at, &["eval", out, "film", "--backend", "cpu", "--quiet"]);
+        report["moving"]["psnr"].as_f64().unwrap()
+    };
+    let [swinging, rigid] = [psnr("swinging", "person"), psnr("rigid", "statue")];
+    println!("{swinging:.2} dB in boxes of people, {rigid:.2} dB where they are rigid");
+    assert!(swinging > rigid + 1.0, "{swinging} {rigid}");
+    assert!(!files(&at.join("rigid/objects")).keys().any(|name| name.ends_with(".swing")));
+
+    // A garage keeps it.
+    let of_objects = files(&at.join("swinging/objects"));
+    let name = of_objects.keys().find_map(|name| name.strip_suffix(".swing")).unwrap();
+    let swing = format!("{name}.swing");
+    done(at, &["garage", "add", "garage", "--model", "swinging", "--object", name, "--name", "walker"]);
+    done(at, &["garage", "place", "garage", "walker", "--model", "rigid", "--at", "0,0,0,0", "--id", "guest"]);
+    let kept = [at.join("garage/walker.swing"), at.join("rigid/objects/guest.swing")];
+    kept.iter().for_each(|path| assert!(fs::read(path).unwrap() == of_objects[&swing], "{}", path.display()));
+
+    // One that is damaged is refused.
+    fs::write(at.join("swinging/objects").join(&swing), &of_objects[&swing][..50]).unwrap();
+    refused(at, &["eval", "swinging", "film", "--backend", "cpu"], &swing);
+}
+
 #[test]
 fn what_moves_has_splats_of_its_own() {
     let folder = tempfile::tempdir().unwrap();

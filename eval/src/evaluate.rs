@@ -136,7 +136,8 @@ pub fn evaluate(request: &Request, observer: &dyn Observer) -> Result<Evaluation
         let view = &photos.capture.views[index as usize];
         let photo = reader.window(index, 0, view.camera.full())?;
         let began = observer.now();
-        let frame = renderer.compose(&splats, &objects.at(view.seconds), &view.camera, &options)?;
+        let placed = objects.at(&renderer, view.seconds)?;
+        let frame = renderer.compose(&splats, &placed, &view.camera, &options)?;
         render_seconds.add(began, observer.now());
         let part = if i < test.len() { Part::Test } else { Part::Stretch };
         let compared = Comparison::new(&view.name, &frame.colour, &photo);
@@ -183,7 +184,8 @@ pub fn evaluate(request: &Request, observer: &dyn Observer) -> Result<Evaluation
     for (i, &index) in trained.iter().enumerate() {
         let view = &photos.capture.views[index as usize];
         let photo = reader.window(index, 0, view.camera.full())?;
-        let frame = renderer.compose(&splats, &objects.at(view.seconds), &view.camera, &options)?;
+        let placed = objects.at(&renderer, view.seconds)?;
+        let frame = renderer.compose(&splats, &placed, &view.camera, &options)?;
         let compared = Comparison::new(&view.name, &frame.colour, &photo);
         let figures = compared.figures(lpips)?;
         judges.add((Part::Trained, index), view, &photo, frame, (&compared, &figures))?;

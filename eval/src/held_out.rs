@@ -38,7 +38,8 @@ pub fn figures_of_views(
             BadInput::new("the plan", problem, "plan the capture again")
         })?;
         let photo = reader.window(index, 0, view.camera.full())?;
-        let frame = renderer.compose(&splats, &objects.at(view.seconds), &view.camera, options)?;
+        let placed = objects.at(&renderer, view.seconds)?;
+        let frame = renderer.compose(&splats, &placed, &view.camera, options)?;
         let compared = Comparison::new(&view.name, &frame.colour, &photo);
         let mut of_view = compared.figures(None)?;
         let rendering = (&mut renderer, &splats, options);

@@ -7,14 +7,15 @@ use model::{Model, ModelObject};
 use perceive::tracking::Kind;
 use perceive::{Boxes, Detection, Detector, Picture, Precision, TrueBox, precision};
 use render::Options;
-use scene::{Camera, MovingObject, Rigid, Splats};
+use scene::{Camera, MovingObject};
 use serde::Serialize;
 use train::Backend;
 
+use crate::composition::Composition;
 use crate::detections::LEAST_SCORE;
 use crate::images::{colour_image, photo_image};
 use crate::judges::file_name;
-use crate::renderer::{Placed, Renderer, Uploaded};
+use crate::renderer::{Held, Placed, Renderer, Uploaded};
 use crate::{EvalError, Observer, Photos};
 
 /// Bytes of decoded photos that are kept.
@@ -76,11 +77,11 @@ pub fn moved(
     let held_out = photos.split.held_out();
     let reader = photos.reader(CACHE_BYTES);
     let mut renderer = Renderer::new(backend)?;
-    let without_shadows: Vec<Splats> = model.objects.iter().map(in_own_box).collect();
+    let without_shadows: Vec<ModelObject> = model.objects.iter().map(in_own_box).collect();
     let mut scene = Scene {
         fixed: renderer.upload(&model.splats)?,
-        objects: upload(&renderer, model.objects.iter().map(|object| &object.splats))?,
-        silhouettes: upload(&renderer, without_shadows.iter())?,
+        objects: Composition::new(&renderer, model.objects.iter())?,
+        silhouettes: &without_shadows,
         about: model.objects.iter().map(|object| &object.about).collect(),
         options: model.options(),
         renderer: &mut renderer,
@@ -121,17 +122,16 @@ pub fn moved(
     Ok(MovedReport { seconds, views, detectors: figures.collect() })
 }
 
-fn upload<'a>(renderer: &Renderer, all: impl Iterator<Item = &'a Splats>) -> Result<Vec<Uploaded<'a>>, EvalError> {
-    all.map(|splats| renderer.upload(splats)).collect()
-}
-
-/// The object's splats without those of its shadow.
-fn in_own_box(object: &ModelObject) -> Splats {
+/// The object without the splats of its shadow.
+fn in_own_box(object: &ModelObject) -> ModelObject {
     let [low, .., high] = object.about.splat_box();
-    object.splats.filter(|i| {
-        let place = object.splats.mean(i).as_dvec3();
+    let is_inside = |i: &u32| {
+        let place = object.splats.mean(*i as usize).as_dvec3();
         place.cmpge(low).all() && place.cmple(high).all()
-    })
+    };
+    let inside: Vec<u32> = (0..object.splats.len() as u32).filter(is_inside).collect();
+    let swing = object.swing.as_ref().map(|swing| swing.select(&inside));
+    ModelObject { about: object.about.clone(), splats: object.splats.select(&inside), swing }
 }
 
 /// An object on a picture.
@@ -146,9 +146,9 @@ struct Shown {
 struct Scene<'a> {
     renderer: &'a mut Renderer,
     fixed: Uploaded<'a>,
-    objects: Vec<Uploaded<'a>>,
+    objects: Composition<'a>,
     /// The objects without their shadows.
-    silhouettes: Vec<Uploaded<'a>>,
+    silhouettes: &'a [ModelObject],
     about: Vec<&'a MovingObject>,
     options: Options,
 }
@@ -158,10 +158,12 @@ impl Scene<'_> {
     fn shown(&mut self, camera: &Camera, seconds: f64) -> Result<Vec<Shown>, EvalError> {
         let Self { renderer, fixed, objects, silhouettes, about, .. } = self;
         let options = Options { extras: true, ..self.options };
-        let poses: Vec<Option<Rigid>> = about.iter().map(|about| about.pose(seconds)).collect();
         let mut shown = Vec::new();
         for (number, silhouette) in silhouettes.iter().enumerate() {
-            let Some((kind, pose)) = Kind::of_class(&about[number].class).zip(poses[number]) else { continue };
+            let Some((kind, (pose, splats))) = Kind::of_class(&about[number].class).zip(silhouette.at(seconds)) else {
+                continue;
+            };
+            let silhouette = &renderer.upload(splats)?;
             // In the object's axes its splats are the trainable ones, whose opacity has a plane of its own, and all else is placed.
             let own = Camera { camera_from_world: camera.camera_from_world.after(&pose), ..*camera };
             let alone = renderer.compose(silhouette, &[], &own, &options)?;
@@ -170,11 +172,13 @@ impl Scene<'_> {
             }
             let whole: f32 = alone.trainable_alpha.iter().sum();
             let object_from_world = pose.inverse();
-            let others = objects.iter().zip(&poses).enumerate().filter(|(other, _)| *other != number);
-            let others = others.filter_map(|(_, (splats, pose))| {
-                Some(Placed { splats, world_from_object: object_from_world.after(&(*pose)?) })
+            let others = objects.each(renderer, seconds)?.into_iter().enumerate().filter(|(other, _)| *other != number);
+            let others = others.filter_map(|(_, placed)| {
+                let placed = placed?;
+                let world_from_object = object_from_world.after(&placed.world_from_object);
+                Some(Placed { world_from_object, ..placed })
             });
-            let scene = Placed { splats: fixed, world_from_object: object_from_world };
+            let scene = Placed { splats: Held::Always(fixed), world_from_object: object_from_world };
             let placed: Vec<Placed> = others.chain([scene]).collect();
             let frame = renderer.compose(silhouette, &placed, &own, &options)?;
             let visible: f32 = frame.trainable_alpha.iter().sum();
@@ -187,12 +191,7 @@ impl Scene<'_> {
 
     /// The view with all objects where they are at a time: three bytes a pixel.
     fn picture(&mut self, camera: &Camera, seconds: f64) -> Result<Vec<u8>, EvalError> {
-        let placed = self
-            .about
-            .iter()
-            .zip(&self.objects)
-            .filter_map(|(about, splats)| Some(Placed { splats, world_from_object: about.pose(seconds)? }));
-        let placed: Vec<Placed> = placed.collect();
+        let placed = self.objects.at(self.renderer, Some(seconds))?;
         let frame = self.renderer.compose(&self.fixed, &placed, camera, &self.options)?;
         Ok(colour_image(&frame.colour, frame.width, frame.height).into_raw())
     }

@@ -1,5 +1,7 @@
 //! Renders views on the CPU or on a GPU behind one interface.
 
+use std::borrow::Cow;
+
 #[cfg(feature = "gpu")]
 use render::gpu::GpuSplats;
 use render::{Frame, Options, Part, cpu};
@@ -26,12 +28,27 @@ pub struct Uploaded<'a>(Place<'a>);
 
 /// An object at a time: its splats, and where it is.
 pub struct Placed<'a> {
-    pub(crate) splats: &'a Uploaded<'a>,
+    pub(crate) splats: Held<'a>,
     pub(crate) world_from_object: Rigid,
 }
 
+/// Splats of an object: the same at all times, or as they are at one.
+pub(crate) enum Held<'a> {
+    Always(&'a Uploaded<'a>),
+    Now(Uploaded<'a>),
+}
+
+impl<'a> Held<'a> {
+    fn place(&self) -> &Place<'a> {
+        match self {
+            Self::Always(uploaded) => &uploaded.0,
+            Self::Now(uploaded) => &uploaded.0,
+        }
+    }
+}
+
 enum Place<'a> {
-    Cpu(&'a Splats),
+    Cpu(Cow<'a, Splats>),
     #[cfg(feature = "gpu")]
     Gpu(Box<GpuSplats>),
 }
@@ -62,11 +79,12 @@ impl Renderer {
     ///
     /// # Errors
     /// Splats that do not fit the device's memory.
-    pub fn upload<'a>(&self, splats: &'a Splats) -> Result<Uploaded<'a>, EvalError> {
+    pub fn upload<'a>(&self, splats: impl Into<Cow<'a, Splats>>) -> Result<Uploaded<'a>, EvalError> {
+        let splats = splats.into();
         Ok(Uploaded(match &self.0 {
             Inner::Cpu(_) => Place::Cpu(splats),
             #[cfg(feature = "gpu")]
-            Inner::Gpu(gpu) => Place::Gpu(Box::new(gpu.upload(splats)?)),
+            Inner::Gpu(gpu) => Place::Gpu(Box::new(gpu.upload(&splats)?)),
         }))
     }
 
@@ -98,7 +116,7 @@ impl Renderer {
         let pose = |object: &Placed| camera.camera_from_world.after(&object.world_from_object);
         match (&mut self.0, &splats.0) {
             (Inner::Cpu(renderer), Place::Cpu(splats)) => {
-                let parts = objects.iter().map(|object| match &object.splats.0 {
+                let parts = objects.iter().map(|object| match object.splats.place() {
                     Place::Cpu(splats) => Part { splats, camera_from_part: Some(pose(object)) },
                     #[cfg(feature = "gpu")]
                     Place::Gpu(_) => panic!("{OTHER_BACKEND}"),
@@ -108,7 +126,7 @@ impl Renderer {
             }
             #[cfg(feature = "gpu")]
             (Inner::Gpu(gpu), Place::Gpu(splats)) => {
-                let parts = objects.iter().map(|object| match &object.splats.0 {
+                let parts = objects.iter().map(|object| match object.splats.place() {
                     Place::Gpu(splats) => (&**splats, [pose(object)]),
                     Place::Cpu(_) => panic!("{OTHER_BACKEND}"),
                 });

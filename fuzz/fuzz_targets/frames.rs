@@ -5,6 +5,7 @@ use blocks::{Plan, plan::PLAN};
 use libfuzzer_sys::fuzz_target;
 use scene::exposures::EXPOSURES;
 use scene::poses::POSES;
+use scene::swing::{NUMBERS, SWING, Swing};
 use scene::{Capture, Exposures, Poses, objects};
 use scene::frame::{self, Kind, SPLATS, SPLATS_WITH_ATTRIBUTES, SPLATS_WITH_POSES};
 
@@ -28,6 +29,7 @@ fuzz_target!(|bytes: &[u8]| {
         let _ = objects::from_frame(&sealed(objects::OBJECT, bytes, header), &about);
         let _ = Exposures::from_frame(&sealed(EXPOSURES, bytes, header));
         let _ = Poses::from_frame(&sealed(POSES, bytes, header));
+        let _ = Swing::from_frame(&sealed(SWING, bytes, header), bytes.len().saturating_sub(header) / (4 * NUMBERS));
     }
     if let Ok(plan) = Plan::from_frame(&sealed(PLAN, bytes, bytes.len())) {
         plan.leaves();

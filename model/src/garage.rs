@@ -3,6 +3,7 @@
 //! ```text
 //! DIR/garage.json     the vehicles; written last, so that one that is not named there is not in it
 //! DIR/NAME.ply        splats of each, in its own axes (x ahead, y left, z up), metres
+//! DIR/NAME.swing      how those of a person swing, as a frame
 //! ```
 
 use std::path::{Path, PathBuf};
@@ -10,13 +11,14 @@ use std::path::{Path, PathBuf};
 use glam::{DMat4, DVec3};
 use scene::objects::is_name;
 use scene::similarity::Similarity;
-use scene::{BadInput, MovingObject, PathPose, Rigid, Splats, ply};
+use scene::{BadInput, MovingObject, PathPose, Rigid, Splats, Swing, ply};
 use serde::{Deserialize, Serialize};
 use store::file::save;
 
 use crate::error::{ModelError, cannot};
 use crate::files::{damaged, load, save_json};
-use crate::write::save_objects;
+use crate::read::read_swing;
+use crate::write::{save_objects, save_swing};
 use crate::{ModelObject, ply_comments, read};
 
 const FILE: &str = "garage.json";
@@ -98,7 +100,7 @@ impl Garage {
     ///
     /// # Errors
     /// A name that it does not have, or a file that cannot be read.
-    pub fn get(&self, name: &str) -> Result<(Vehicle, Splats), BadInput> {
+    pub fn get(&self, name: &str) -> Result<(Vehicle, Splats, Option<Swing>), BadInput> {
         let Some(vehicle) = self.vehicles.iter().find(|vehicle| vehicle.name == name) else {
             let names: Vec<&str> = self.vehicles.iter().map(|vehicle| vehicle.name.as_str()).collect();
             let has = if names.is_empty() { "none".into() } else { names.join(", ") };
@@ -107,7 +109,8 @@ impl Garage {
         };
         let path = self.folder.join(format!("{name}.ply"));
         let splats = ply::read(&load(&path)?).map_err(|error| damaged(&path, &error))?;
-        Ok((vehicle.clone(), splats))
+        let swing = read_swing(&self.folder, name, splats.len())?;
+        Ok((vehicle.clone(), splats, swing))
     }
 
     /// Checks that a vehicle of this name can be added.
@@ -128,7 +131,7 @@ impl Garage {
     ///
     /// # Errors
     /// A name that is taken or no name, a box that is wrong, no splats, a file that cannot be written.
-    pub fn add(&mut self, vehicle: Vehicle, splats: &Splats) -> Result<(), ModelError> {
+    pub fn add(&mut self, vehicle: Vehicle, splats: &Splats, swing: Option<&Swing>) -> Result<(), ModelError> {
         self.check_name(&vehicle.name)?;
         let bad = |problem: &str, advice: &str| bad_vehicle(&vehicle.name, problem, advice);
         vehicle.check().map_err(|error| bad(&error.to_string(), "correct the box"))?;
@@ -138,6 +141,7 @@ impl Garage {
         std::fs::create_dir_all(&self.folder).map_err(cannot("made", &self.folder))?;
         let path = self.folder.join(format!("{}.ply", vehicle.name));
         save(&path, &ply::write(splats, ply_comments(vehicle.antialiased)))?;
+        save_swing(&self.folder, &vehicle.name, swing)?;
         let at = self.vehicles.partition_point(|other| other.name < vehicle.name);
         self.vehicles.insert(at, Vehicle { splats: splats.len(), ..vehicle });
         Ok(save_json(&self.folder.join(FILE), &File { version: VERSION, vehicles: self.vehicles.clone() })?)
@@ -228,7 +232,7 @@ mod tests {
         let mut splats = Splats::new(0);
         splats.push(&Splat::round(Vec3::ZERO, -2.0, Vec3::splat(0.5), 0.7));
         for name in ["van", "car"] {
-            garage.add(car(name), &splats).unwrap();
+            garage.add(car(name), &splats, None).unwrap();
         }
         let names = |garage: &Garage| garage.vehicles().iter().map(|of| of.name.clone()).collect::<Vec<_>>();
         assert_eq!(names(&garage), ["car", "van"]);
@@ -243,7 +247,7 @@ mod tests {
             (car("empty"), &Splats::new(0), "no splats"),
             (Vehicle { high: DVec3::ZERO, ..car("flat") }, &splats, "no size"),
         ] {
-            let error = garage.add(vehicle, splats).unwrap_err().to_string();
+            let error = garage.add(vehicle, splats, None).unwrap_err().to_string();
             assert!(error.contains(says) && !error.contains('\n'), "{error}");
         }
         let file = at.join(FILE);

@@ -10,6 +10,7 @@
 //! OUT/merged.ply                the finest cut, merged
 //! OUT/objects/paths.json        objects that move: names, boxes, paths
 //! OUT/objects/ID.ply            splats of each, in its own axes
+//! OUT/objects/ID.swing          how those of a person swing, as a frame
 //! OUT/cameras.json              the refined cameras as transforms.json, where poses were refined
 //! ```
 //!
@@ -30,10 +31,12 @@ mod streamed_sog;
 mod tiles;
 mod write;
 
+use std::borrow::Cow;
 use std::path::{Path, PathBuf};
 
 use blocks::{Ground, Split};
-use scene::{BadInput, Capture, Exposures, GeoOrigin, MovingObject, Poses, Splats, ply, spz};
+use scene::swing::Way;
+use scene::{BadInput, Capture, Exposures, GeoOrigin, MovingObject, Poses, Rigid, Splats, Swing, ply, spz};
 
 pub use error::ModelError;
 pub use export::Exported;
@@ -61,6 +64,22 @@ pub struct ModelObject {
     pub about: MovingObject,
     /// Its splats, in its own axes.
     pub splats: Splats,
+    /// How they swing as it walks, of a person.
+    pub swing: Option<Swing>,
+}
+
+impl ModelObject {
+    /// Where it is at a time, and its splats then, in its own axes; `None` where that is unknown.
+    pub fn at(&self, seconds: f64) -> Option<(Rigid, Cow<'_, Splats>)> {
+        let pose = self.about.pose(seconds)?;
+        let swung = |swing: &Swing| Cow::Owned(swing.swung(&self.splats, Way::of(&self.about.path).at(seconds)));
+        Some((pose, self.swing.as_ref().map_or(Cow::Borrowed(&self.splats), swung)))
+    }
+}
+
+/// The file of an object's swing.
+fn swing_file(id: &str) -> String {
+    format!("{id}.swing")
 }
 
 /// A model in memory.

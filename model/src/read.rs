@@ -9,7 +9,7 @@ use blocks::{Cut, Ground, Mode, Plan};
 use glam::{DQuat, DVec3};
 use scene::{
     ArtefactId, BLOCK_ATTRIBUTE, BadInput, BlockId, CodecError, Exposures, GeoOrigin, MovingObject, Poses, Splats,
-    frame, ply,
+    Swing, frame, ply,
 };
 
 use crate::files::{
@@ -17,7 +17,7 @@ use crate::files::{
 };
 use crate::import::{self, Imported, Kind};
 use crate::manifest::{Manifest, VERSION};
-use crate::{Model, ModelObject};
+use crate::{Model, ModelObject, swing_file};
 
 /// Reads a model: a folder that `plat train` wrote, its `model` folder, or any file or folder that [`kind`](crate::kind) knows. A
 /// model of another kind than the first is one set of splats, the finest.
@@ -88,9 +88,17 @@ pub(crate) fn read_objects(folder: &Path) -> Result<Vec<ModelObject>, BadInput> 
         // Names have no separators, so that no path leads out of the folder.
         let path = folder.join(format!("{}.ply", about.id));
         let splats = ply::read(&load(&path)?).map_err(|error| damaged(&path, &error))?;
-        Ok(ModelObject { about, splats })
+        let swing = read_swing(folder, &about.id, splats.len())?;
+        Ok(ModelObject { about, splats, swing })
     };
     tracks.objects.into_iter().map(object).collect()
+}
+
+/// How the splats of an object swing, of which there are this many; `None` without a file of it.
+pub(crate) fn read_swing(folder: &Path, id: &str, splats: usize) -> Result<Option<Swing>, BadInput> {
+    let path = folder.join(swing_file(id));
+    let read = || Swing::from_frame(&load(&path)?, splats).map_err(|error| damaged(&path, &error));
+    path.is_file().then(read).transpose()
 }
 
 /// A model whose blocks are read one at a time. A file is one block.

@@ -16,7 +16,7 @@ use crate::files::{
 use crate::import::{Kind, kind};
 use crate::read::{Opened, Tree, open, read_block, read_objects, read_tree};
 use crate::write::{begin, save_objects, write_merged};
-use crate::{BlockEntry, Manifest, Model};
+use crate::{BlockEntry, Manifest, Model, swing_file};
 
 /// Checks where a rewritten model shall go.
 ///
@@ -134,8 +134,9 @@ pub fn replace_blocks(path: &Path, out: &Path, changed: &BTreeMap<BlockId, Splat
         let made = out.join(OBJECTS_FOLDER);
         fs::create_dir_all(&made).map_err(cannot("made", &made))?;
         let splats = objects.iter().map(|object| format!("{}.ply", object.about.id));
+        let swings = objects.iter().filter(|object| object.swing.is_some()).map(|object| swing_file(&object.about.id));
         // Last: objects without their paths are none.
-        for name in splats.chain([PATHS_FILE.to_owned()]) {
+        for name in splats.chain(swings).chain([PATHS_FILE.to_owned()]) {
             copy(&Path::new(OBJECTS_FOLDER).join(name), outer, out)?;
         }
     }

@@ -9,7 +9,7 @@ use scene::objects::{self, Tracks};
 use scene::poses::SensorError;
 use scene::sensors::Sensors;
 use scene::transforms::{self, Frame, Intrinsics, Transforms};
-use scene::{ArtefactId, BlockId, Camera, CameraModel, Capture, Poses, Splats, frame, ply};
+use scene::{ArtefactId, BlockId, Camera, CameraModel, Capture, Poses, Splats, Swing, frame, ply};
 use serde::Serialize;
 use store::BlockingStore;
 use store::file::{AtomicFile, save};
@@ -21,7 +21,7 @@ use crate::files::{
 };
 use crate::manifest::{BlockEntry, Manifest, VERSION};
 use crate::read::read_block;
-use crate::{ModelObject, ply_comments};
+use crate::{ModelObject, ply_comments, swing_file};
 
 /// Creates the model folder under `out` and writes the plan. First removes an older model's manifest, merged file and reports,
 /// so that an interrupted write never passes for a model, nor old figures for those of this model.
@@ -162,8 +162,8 @@ fn objects_of(
     let object = |(task, id): (&ObjectTask, &ArtefactId)| {
         let about = capture.objects.get(task.object as usize).ok_or(ModelError::NoObject(task.object))?;
         let decoded = objects::from_frame(&store.get(*id)?, about);
-        let (about, splats) = decoded.map_err(|error| ModelError::DamagedObject(about.id.clone(), error))?;
-        Ok(ModelObject { about, splats })
+        let (about, splats, swing) = decoded.map_err(|error| ModelError::DamagedObject(about.id.clone(), error))?;
+        Ok(ModelObject { about, splats, swing })
     };
     plan.object_tasks.iter().zip(results).map(object).collect()
 }
@@ -175,13 +175,19 @@ pub(crate) fn save_objects(out: &Path, objects: &[ModelObject], antialiased: boo
     }
     let folder = out.join(OBJECTS_FOLDER);
     fs::create_dir_all(&folder).map_err(cannot("made", &folder))?;
-    for ModelObject { about, splats } in objects {
+    for ModelObject { about, splats, swing } in objects {
         save(&folder.join(format!("{}.ply", about.id)), &ply::write(splats, ply_comments(antialiased)))?;
+        save_swing(&folder, &about.id, swing.as_ref())?;
     }
     // Last: objects without their paths are none.
     let objects = objects.iter().map(|object| object.about.clone()).collect();
     save(&folder.join(PATHS_FILE), &objects::write(&Tracks { objects, ..Tracks::default() }))?;
     Ok(())
+}
+
+/// Writes how the splats of an object swing, if they do.
+pub(crate) fn save_swing(folder: &Path, id: &str, swing: Option<&Swing>) -> Result<(), ModelError> {
+    swing.map_or(Ok(()), |swing| Ok(save(&folder.join(swing_file(id)), &swing.to_frame())?))
 }
 
 /// What was found of each sensor, as people read it.

@@ -18,9 +18,10 @@ use crate::camera::Rigid;
 use crate::error::CodecError;
 use crate::frame::{self, Kind};
 use crate::splats::Splats;
+use crate::swing::Swing;
 
-/// A trained object: its path, and as the bulk a frame of its splats, in its own axes.
-pub const OBJECT: Kind = Kind(*b"movo", 1);
+/// A trained object. The header is [`Header`], the bulk a frame of its splats, in its own axes, and one of their swing if they do.
+pub const OBJECT: Kind = Kind(*b"movo", 2);
 
 /// An object keeps its first and its last pose for this long before and after, seconds. nuScenes annotates every half second.
 const ALONE_SECONDS: f64 = 0.3;
@@ -167,20 +168,34 @@ fn motion_at(motions: &[(f64, Rigid)], seconds: f64) -> Rigid {
     }
 }
 
+#[derive(Serialize, Deserialize)]
+struct Header {
+    path: Vec<PathPose>,
+    /// Length of the frame of its splats; what follows is that of their swing.
+    splats_bytes: u64,
+}
+
 /// Encodes a trained object.
-pub fn to_frame(path: &[PathPose], splats: &Splats) -> Vec<u8> {
-    frame::encode(OBJECT, &path, &frame::encode_splats(splats))
+pub fn to_frame(path: &[PathPose], splats: &Splats, swing: Option<&Swing>) -> Vec<u8> {
+    let mut bulk = frame::encode_splats(splats);
+    let header = Header { path: path.to_vec(), splats_bytes: bulk.len() as u64 };
+    bulk.extend(swing.map_or(Vec::new(), Swing::to_frame));
+    frame::encode(OBJECT, &header, &bulk)
 }
 
 /// Decodes a trained object of which all else is known.
 ///
 /// # Errors
-/// As [`frame::decode`], splats or a path that are wrong.
-pub fn from_frame(bytes: &[u8], about: &MovingObject) -> Result<(MovingObject, Splats), CodecError> {
-    let (path, splats): (Vec<PathPose>, _) = frame::decode(OBJECT, bytes)?;
+/// As [`frame::decode`], splats, a swing or a path that are wrong.
+pub fn from_frame(bytes: &[u8], about: &MovingObject) -> Result<(MovingObject, Splats, Option<Swing>), CodecError> {
+    let (Header { path, splats_bytes }, bulk): (Header, _) = frame::decode(OBJECT, bytes)?;
     let object = MovingObject { path, ..about.clone() };
     object.check()?;
-    Ok((object, frame::decode_splats(splats)?))
+    let (splats, swing) = (usize::try_from(splats_bytes).ok().and_then(|at| bulk.split_at_checked(at)))
+        .ok_or_else(|| CodecError::new("object is cut short"))?;
+    let splats = frame::decode_splats(splats)?;
+    let swing = (!swing.is_empty()).then(|| Swing::from_frame(swing, splats.len())).transpose()?;
+    Ok((object, splats, swing))
 }
 
 /// Whether a text can name an object: 1 to 64 letters, digits, `-` and `_`.
@@ -367,18 +382,26 @@ mod tests {
         let car = car();
         let mut splats = Splats::new(1);
         splats.push(&crate::Splat::round(glam::Vec3::ONE, -2.0, glam::Vec3::splat(0.4), 0.3));
-        let bytes = to_frame(&car.path[..2], &splats);
-        let (about, read) = from_frame(&bytes, &car).unwrap();
-        assert_eq!((&about.path[..], &about.id, read), (&car.path[..2], &car.id, splats.clone()));
-        for at in 0..bytes.len() {
-            let mut damaged = bytes.clone();
-            damaged[at] ^= 0x20;
-            assert!(from_frame(&damaged, &car).is_err(), "flip at {at} was not detected");
+        let swing = Swing { stride_metres: 1.4, amplitudes: vec![[0.1; crate::swing::NUMBERS]] };
+        for swing in [None, Some(&swing)] {
+            let bytes = to_frame(&car.path[..2], &splats, swing);
+            let (about, read, swings) = from_frame(&bytes, &car).unwrap();
+            assert_eq!((&about.path[..], &about.id, read), (&car.path[..2], &car.id, splats.clone()));
+            assert_eq!(swings.as_ref(), swing);
+            for at in 0..bytes.len() {
+                let mut damaged = bytes.clone();
+                damaged[at] ^= 0x20;
+                assert!(from_frame(&damaged, &car).is_err(), "flip at {at} was not detected");
+            }
         }
+        let two = Swing { amplitudes: vec![[0.1; crate::swing::NUMBERS]; 2], ..swing };
+        assert!(from_frame(&to_frame(&car.path, &splats, Some(&two)), &car).unwrap_err().0.contains("another number"));
+        let cut = frame::encode(OBJECT, &Header { path: car.path.clone(), splats_bytes: u64::MAX }, b"splats");
+        assert!(from_frame(&cut, &car).unwrap_err().0.contains("cut short"));
         let mut jumps = car.path.clone();
         jumps[1].world_from_object.translation.x = 1e4;
-        assert!(from_frame(&to_frame(&jumps, &splats), &car).unwrap_err().0.contains("jumps"));
-        assert!(from_frame(&to_frame(&[], &splats), &car).is_err());
+        assert!(from_frame(&to_frame(&jumps, &splats, None), &car).unwrap_err().0.contains("jumps"));
+        assert!(from_frame(&to_frame(&[], &splats, None), &car).is_err());
         assert!(from_frame(&frame::encode(OBJECT, &car.path, b"no splats"), &car).is_err());
     }
 

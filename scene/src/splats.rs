@@ -1,6 +1,8 @@
 //! Splats as structure of arrays: one `Vec<f32>` per scalar, so that SIMD, optimiser and codecs read memory
 //! sequentially.
 
+use std::borrow::Cow;
+
 use glam::Vec3;
 
 /// Indices of the columns in [`Splats`].
@@ -294,6 +296,12 @@ impl Splats {
     /// True when every number of row `i` is finite.
     pub fn is_finite(&self, i: usize) -> bool {
         self.columns.iter().all(|column| column[i].is_finite())
+    }
+}
+
+impl<'a> From<&'a Splats> for Cow<'a, Splats> {
+    fn from(splats: &'a Splats) -> Self {
+        Self::Borrowed(splats)
     }
 }
 

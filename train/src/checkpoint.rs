@@ -2,7 +2,7 @@
 
 use render::cpu::Isa;
 use scene::frame::{self, Kind};
-use scene::{CodecError, Splats};
+use scene::{CodecError, Splats, swing};
 use serde::{Deserialize, Serialize};
 
 use crate::coarse_to_fine::CoarseToFine;
@@ -12,6 +12,7 @@ use crate::optimiser::Adam;
 use crate::pose::PoseTraining;
 use crate::pose::path::PathTraining;
 use crate::pose::sensors::{NUMBERS, SensorTraining};
+use crate::swing::SwingTraining;
 
 /// A checkpoint. The header is [`Header`]. The bulk holds, little endian:
 /// - all columns of the splats, of the first and of the second Adam moments (f32);
@@ -20,8 +21,10 @@ use crate::pose::sensors::{NUMBERS, SensorTraining};
 /// - per trained pose: view, steps (u32), then displacement, first and second moment (six f32 each);
 /// - per refined sensor: steps (u32), then numbers, first and second moment (eight f32 each);
 /// - of a refined path: steps (u32), then mean squares and the motion at each time (six f32 each);
+/// - of a swing: amplitudes, first and second moments (twelve f32 for each splat), and, until the stride is chosen, the sums of each
+///   candidate and splat (six f32);
 /// - all attributes of the splats (u32).
-const CHECKPOINT: Kind = Kind(*b"ckpt", 8);
+const CHECKPOINT: Kind = Kind(*b"ckpt", 9);
 
 /// Everything that a training step depends on besides its job.
 #[derive(Debug, Clone)]
@@ -40,6 +43,8 @@ pub struct State {
     pub(crate) exposures: Option<ExposureTraining>,
     /// `Some` where poses are trained.
     pub(crate) poses: Option<PoseTraining>,
+    /// `Some` where splats swing.
+    pub(crate) swing: Option<SwingTraining>,
     /// Loss of the last step, for reports only. Not part of a checkpoint.
     pub(crate) loss: f64,
 }
@@ -63,8 +68,26 @@ struct Header {
     sensor_count: Option<u64>,
     /// Number of times of the object's path, where it is refined with the poses.
     time_count: Option<u64>,
+    /// Where splats swing.
+    swing: Option<SwingHeader>,
     /// Names of the splats' attributes.
     attributes: Vec<String>,
+}
+
+/// As in [`SwingTraining`].
+#[derive(Serialize, Deserialize)]
+struct SwingHeader {
+    power: Vec<f64>,
+    frequency: Option<f64>,
+    of_frequency: [f32; 2],
+    steps: u32,
+}
+
+impl SwingHeader {
+    /// 32-bit words of each splat, those of the values and those of the sums.
+    fn words(&self) -> [usize; 2] {
+        [3 * swing::NUMBERS, if self.frequency.is_some() { 0 } else { 6 * self.power.len() }]
+    }
 }
 
 /// 32-bit words of an exposure in a checkpoint.
@@ -107,6 +130,12 @@ impl State {
             pose_count: self.poses.as_ref().map(|poses| poses.views.len() as u64),
             sensor_count: self.sensors().map(|sensors| sensors.steps.len() as u64),
             time_count: self.path().map(|path| path.motions.len() as u64),
+            swing: self.swing.as_ref().map(|swing| SwingHeader {
+                power: swing.power.clone(),
+                frequency: swing.frequency,
+                of_frequency: swing.of_frequency,
+                steps: swing.steps,
+            }),
             attributes: self.splats.attribute_names(),
         };
         let columns = self.splats.columns().iter().chain(first).chain(second);
@@ -124,6 +153,10 @@ impl State {
         if let Some(PathTraining { steps, squares, motions }) = self.path() {
             bulk.extend(steps.to_le_bytes());
             bulk.extend(squares.iter().chain(motions.iter().flatten()).flat_map(|value| value.to_le_bytes()));
+        }
+        if let Some(SwingTraining { values, sums, .. }) = &self.swing {
+            write_rows(&mut bulk, &[], &[], values);
+            bulk.extend(sums.iter().flatten().flat_map(|value| value.to_le_bytes()));
         }
         let attributes = self.splats.attributes().iter().flat_map(|attribute| &attribute.values);
         bulk.extend(attributes.flat_map(|value| value.to_le_bytes()));
@@ -154,6 +187,9 @@ impl State {
             .time_count
             .map_or(Some(0), |count| count.checked_mul(TIME_WORDS as u64)?.checked_add(PATH_WORDS as u64));
         let words = words.and_then(|words| words.checked_add(timed?));
+        let swung = header.swing.as_ref().map_or([0; 2], SwingHeader::words).map(|words| words as u64);
+        let swung = swung.map(|words| words.checked_mul(header.count));
+        let words = swung.into_iter().fold(words, |words, more| words?.checked_add(more?));
         let attribute_words = (header.attributes.len() as u64).checked_mul(header.count);
         let words = words.and_then(|words| words.checked_add(attribute_words?));
         if words.and_then(|words| words.checked_mul(4)) != Some(bulk.len() as u64)
@@ -168,7 +204,10 @@ impl State {
         let (exposure_bytes, rest) = rest.split_at(4 * EXPOSURE_WORDS * exposed as usize);
         let (pose_bytes, rest) = rest.split_at(4 * POSE_WORDS * posed as usize);
         let (sensor_bytes, rest) = rest.split_at(4 * SENSOR_WORDS * sensed as usize);
-        let (path_bytes, attribute_bytes) = rest.split_at(4 * timed.ok_or_else(wrong)? as usize);
+        let (path_bytes, rest) = rest.split_at(4 * timed.ok_or_else(wrong)? as usize);
+        let [values_words, sums_words] = header.swing.as_ref().map_or([0; 2], SwingHeader::words);
+        let (values_bytes, rest) = rest.split_at(4 * count * values_words);
+        let (sums_bytes, attribute_bytes) = rest.split_at(4 * count * sums_words);
         let mut all = columns_bytes.chunks_exact(4 * count).map(floats);
         let splats = Splats::from_columns(all.by_ref().take(columns).collect()).ok_or_else(wrong)?;
         let splats = frame::with_attributes(splats, &header.attributes, attribute_bytes)?;
@@ -194,7 +233,14 @@ impl State {
             });
             PoseTraining { views, steps, values, sensors, path }
         };
+        let swing = header.swing.map(|SwingHeader { power, frequency, of_frequency, steps }| {
+            let values = read_parts(values_bytes, count);
+            let sums = floats(sums_bytes);
+            let sums = sums.chunks_exact(6).map(|row| row.try_into().expect("6 numbers")).collect();
+            SwingTraining::of(power, sums, frequency, of_frequency, steps, values)
+        });
         Ok(Self {
+            swing,
             step: header.step,
             skipped: header.skipped,
             start_count: usize::try_from(header.start_count).map_err(|_| wrong())?,
@@ -228,9 +274,13 @@ fn read_rows<const N: usize>(bytes: &[u8], count: usize) -> Rows<N> {
 /// Adam steps, and rows of values and moments, of so many.
 fn read_values<const N: usize>(bytes: &[u8], count: usize) -> (Vec<u32>, [Vec<[f32; N]>; 3]) {
     let (steps, rest) = bytes.split_at(4 * count);
-    let rows: Vec<[f32; N]> = floats(rest).chunks_exact(N).map(|row| row.try_into().expect("N numbers")).collect();
-    let part = |n: usize| rows[n * count..(n + 1) * count].to_vec();
-    (integers(steps), [part(0), part(1), part(2)])
+    (integers(steps), read_parts(rest, count))
+}
+
+/// Values, first and second moments of so many.
+fn read_parts<const N: usize>(bytes: &[u8], count: usize) -> [Vec<[f32; N]>; 3] {
+    let rows: Vec<[f32; N]> = floats(bytes).chunks_exact(N).map(|row| row.try_into().expect("N numbers")).collect();
+    [0, 1, 2].map(|n| rows[n * count..(n + 1) * count].to_vec())
 }
 
 /// Words of four bytes; `chunks_exact` gives no others.
@@ -285,6 +335,14 @@ mod tests {
                 }),
                 path: Some(PathTraining { steps: 3, squares: [0.5; 6], motions: vec![[5.0; 6], [0.25; 6]] }),
             });
+            let rows = |value: f32| (0..20).map(|i| [value * i as f32; swing::NUMBERS]).collect();
+            let swing = match exposures.is_some() {
+                true => {
+                    SwingTraining::of(vec![0.5; 3], Vec::new(), Some(0.7), [0.1, 0.2], 9, [1.0, 2.0, 3.0].map(rows))
+                }
+                false => SwingTraining::of(vec![0.5; 3], vec![[0.25; 6]; 60], None, [0.0; 2], 0, [0.0; 3].map(rows)),
+            };
+            let swing = Some(swing);
             let state = State {
                 step,
                 skipped,
@@ -295,6 +353,7 @@ mod tests {
                 densification,
                 exposures,
                 poses,
+                swing,
                 loss,
             };
             let bytes = state.to_frame();
@@ -302,23 +361,32 @@ mod tests {
             assert_eq!((read.step, read.skipped, read.start_count), (40, 1, 7));
             assert!(read.splats == state.splats && read.adam.parts() == state.adam.parts());
             assert_eq!((&read.exposures, &read.poses), (&state.exposures, &state.poses));
+            assert_eq!(read.swing, state.swing);
             assert_eq!(read.densification.error, state.densification.error);
             assert!(read.to_frame() == bytes);
             assert!(State::from_frame(&bytes[..bytes.len() - 4]).is_err());
             assert!(State::from_frame(&[]).is_err());
         }
         // A header that announces more than the bulk holds.
-        for (count, exposure_count, pose_count, sensor_count, time_count) in [
-            (u64::MAX / 3, None, None, None, None),
-            (1, Some(u64::MAX / 38), None, None, None),
-            (1, Some(1), None, None, None),
-            (1, None, Some(u64::MAX / 20), None, None),
-            (1, None, Some(1), None, None),
-            (1, None, None, Some(u64::MAX / 22), None),
-            (1, None, None, Some(1), None),
-            (1, None, None, None, Some(u64::MAX / 6)),
-            (1, None, None, None, Some(1)),
+        for (count, exposure_count, pose_count, sensor_count, time_count, frequencies) in [
+            (u64::MAX / 3, None, None, None, None, None),
+            (1, Some(u64::MAX / 38), None, None, None, None),
+            (1, Some(1), None, None, None, None),
+            (1, None, Some(u64::MAX / 20), None, None, None),
+            (1, None, Some(1), None, None, None),
+            (1, None, None, Some(u64::MAX / 22), None, None),
+            (1, None, None, Some(1), None, None),
+            (1, None, None, None, Some(u64::MAX / 6), None),
+            (1, None, None, None, Some(1), None),
+            (1, None, None, None, None, Some(0)),
+            (u64::MAX / 200, None, None, None, None, Some(9)),
         ] {
+            let swing = frequencies.map(|count| SwingHeader {
+                power: vec![0.0; count],
+                frequency: None,
+                of_frequency: [0.0; 2],
+                steps: 0,
+            });
             let header = Header {
                 step: 1,
                 skipped: 0,
@@ -332,6 +400,7 @@ mod tests {
                 pose_count,
                 sensor_count,
                 time_count,
+                swing,
                 attributes: Vec::new(),
             };
             assert!(State::from_frame(&frame::encode(CHECKPOINT, &header, &[0; 64])).is_err());

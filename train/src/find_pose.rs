@@ -62,6 +62,7 @@ impl<'a> PoseFinder<'a> {
             densification: DensificationStats::default(),
             exposures: None,
             poses: Some(PoseTraining::new(&given)),
+            swing: None,
             splats: splats.clone(),
             loss: f64::NAN,
         };
@@ -106,6 +107,7 @@ impl<'a> PoseFinder<'a> {
                         ..Options::default()
                     },
                     rates: None,
+                    swing: None,
                     depth_weight: 0.0,
                     silhouette_weight: 0.0,
                     picture_weight: 0.0,

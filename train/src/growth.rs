@@ -113,11 +113,21 @@ pub struct Refined {
     pub added: usize,
 }
 
+/// What a refinement makes.
+pub struct Grown {
+    /// The new splats.
+    pub splats: Splats,
+    /// The old row of each.
+    pub parents: Vec<u32>,
+    /// The old row of each whose Adam moments it keeps; `None` for both halves of a split.
+    pub rows: Vec<Option<u32>>,
+    /// Counts.
+    pub counts: Refined,
+}
+
 /// Densifies: removes splats that are transparent or lie where `keeps` is false, and splits the `target - owned` splats
 /// with the largest error, where `owned` are the kept splats for which `counts` is true. The other splats (the
 /// halo) do not count against the target and grow in proportion. The result is in Morton order, for memory locality.
-/// Returns the new splats, the old row of each whose Adam moments it keeps (`None` for both halves of a split), and the
-/// counts.
 pub fn refine(
     splats: &Splats,
     stats: &mut DensificationStats,
@@ -125,7 +135,7 @@ pub fn refine(
     target: usize,
     counts: &(dyn Fn(Vec3) -> bool + Sync),
     keeps: &(dyn Fn(Vec3) -> bool + Sync),
-) -> (Splats, Vec<Option<u32>>, Refined) {
+) -> Grown {
     let n = splats.len();
     stats.error.resize(n, 0.0);
     let mut refined = Refined::default();
@@ -157,6 +167,7 @@ pub fn refine(
     refined.added = order.len();
 
     let mut rows: Vec<Option<u32>> = kept.iter().map(|&i| Some(i)).collect();
+    let mut parents = kept.clone();
     let mut grown = splats.select(&kept);
     let mut new_row = vec![u32::MAX; n];
     for (at, &i) in kept.iter().enumerate() {
@@ -169,11 +180,13 @@ pub fn refine(
         rows[new_row[i as usize] as usize] = None;
         grown.push_like(new_row[i as usize] as usize, &other);
         rows.push(None);
+        parents.push(i);
     }
     stats.error.clear();
     let order = morton::order([0, 1, 2].map(|axis| grown.col(column::MEAN + axis)));
     let rows = order.iter().map(|&i| rows[i as usize]).collect();
-    (grown.select(&order), rows, refined)
+    let parents = order.iter().map(|&i| parents[i as usize]).collect();
+    Grown { splats: grown.select(&order), parents, rows, counts: refined }
 }
 
 /// Splits a splat into two halves along its longest axis.
@@ -216,7 +229,9 @@ mod tests {
     fn refinement_meets_its_target_and_splits_the_largest_errors() {
         let (splats, mut stats) = row_of(100);
         let growth = Growth::default();
-        let (grown, rows, refined) = refine(&splats, &mut stats, &growth, 110, &|_| true, &|_| true);
+        let Grown { splats: grown, rows, parents, counts: refined } =
+            refine(&splats, &mut stats, &growth, 110, &|_| true, &|_| true);
+        assert!((0..110).all(|i| (grown.mean(i).x - parents[i] as f32).abs() < 0.5));
         assert_eq!((grown.len(), rows.len(), refined.added), (110, 110, 10));
         assert!((0..110).filter(|&i| rows[i].is_none()).all(|i| grown.mean(i).x > 85.0));
     }
@@ -228,7 +243,8 @@ mod tests {
         splats.columns_mut()[column::OPACITY][4] = -9.0;
         // No view has shown the first one.
         assert_eq!(stats.error[0], 0.0);
-        let (grown, _, refined) = refine(&splats, &mut stats, &Growth::default(), 1, &|_| true, &|_| true);
+        let Grown { splats: grown, counts: refined, .. } =
+            refine(&splats, &mut stats, &Growth::default(), 1, &|_| true, &|_| true);
         assert_eq!((refined.broken, refined.removed, refined.added, grown.len()), (1, 1, 0, 8));
     }
 

@@ -148,6 +148,7 @@ pub(crate) mod tests {
             densification: DensificationStats::default(),
             exposures: None,
             poses: None,
+            swing: None,
             splats: splats.clone(),
             loss: f64::NAN,
         };
@@ -171,6 +172,7 @@ pub(crate) mod tests {
             depth_weight: 0.0,
             silhouette_weight: 0.0,
             picture_weight,
+            swing: None,
             exposure_rate: 0.0,
             pose_rates: None,
         };

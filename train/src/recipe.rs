@@ -85,6 +85,18 @@ pub struct Recipe {
     /// As `pose_decay`, of paths.
     #[serde(default)]
     pub path_decay: f32,
+    /// Shares of the steps before the stride of a person is listened for, and before limbs swing.
+    #[serde(default)]
+    pub swing_from: [f32; 2],
+    /// Learning rate of the amplitudes of a swing, relative to `mean`.
+    #[serde(default)]
+    pub swing: f32,
+    /// As `pose_decay`, of amplitudes.
+    #[serde(default)]
+    pub swing_decay: f32,
+    /// Learning rate of ln(stride), as `pose`.
+    #[serde(default)]
+    pub stride: f32,
 }
 
 impl Default for Recipe {
@@ -118,6 +130,10 @@ impl Default for Recipe {
             sensor: [0.4, 0.01],
             path: [0.3, 0.02],
             path_decay: 0.1,
+            swing_from: [0.1, 0.3],
+            swing: 3.0,
+            swing_decay: 0.5,
+            stride: 1.0,
         }
     }
 }

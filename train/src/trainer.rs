@@ -9,7 +9,7 @@ use std::sync::Arc;
 
 use render::Options;
 use render::cpu::Isa;
-use scene::{Camera, Exposures, Poses, Rect, Rigid, Splats};
+use scene::{Camera, Exposures, Poses, Rect, Rigid, Splats, Swing};
 
 use crate::checkpoint::State;
 use crate::coarse_to_fine::{self, CoarseToFine};
@@ -17,7 +17,7 @@ use crate::device::Backend;
 use crate::device::step::{MAX_VIEWS_PER_STEP, StatePart, Step, TrainDevice, ViewSample};
 use crate::error::TrainError;
 use crate::exposure::ExposureTraining;
-use crate::growth::{self, DensificationStats};
+use crate::growth::{self, DensificationStats, Grown};
 use crate::job::{Flow, Job};
 use crate::optimiser::{Adam, LearningRates};
 use crate::pose::path::PathRates;
@@ -26,6 +26,7 @@ use crate::random;
 use crate::recipe::Recipe;
 use crate::size_limit::SizeLimit;
 use crate::source::AHEAD;
+use crate::swing::{SwingStep, SwingTraining};
 use crate::view::TrainView;
 
 /// Smallest number of periods that the error of a job is measured over, see [`Trainer::period`]. A job of three epochs
@@ -95,6 +96,8 @@ pub struct Trained {
     /// Where the path of an object is refined: each time in seconds with the motion of the object then, in its own axes, that
     /// `world_from_object` is followed by. Ascending.
     pub motions: Vec<(f64, Rigid)>,
+    /// How the splats swing, where they do.
+    pub swing: Option<Swing>,
 }
 
 /// Trains a block. Calls `report` after every step.
@@ -134,10 +137,12 @@ pub fn train_from(
         }
     }
     trainer.device.download(&mut trainer.state, StatePart::Splats)?;
-    let Trainer { state: State { splats, exposures, poses, .. }, given, .. } = trainer;
+    let Trainer { state: State { splats, exposures, poses, swing, .. }, given, .. } = trainer;
     let exposures = exposures.map(|exposures| exposures.exposures());
     let motions = poses.as_ref().map_or(Vec::new(), |poses| poses.motions(&given));
-    Ok(Trained { splats, exposures, poses: poses.map(|poses| poses.poses(&given)), motions })
+    let walk = given.times.as_ref().and_then(|times| times.walk.as_ref());
+    let swing = swing.zip(walk).and_then(|(swing, walk)| swing.swing(walk));
+    Ok(Trained { splats, exposures, poses: poses.map(|poses| poses.poses(&given)), motions, swing })
 }
 
 /// A job with its state and device.
@@ -177,6 +182,7 @@ impl<'a> Trainer<'a> {
             densification: DensificationStats::default(),
             exposures: job.trains_exposures.then(|| ExposureTraining::new(views)),
             poses: refines.then(|| PoseTraining::new(&given)),
+            swing: job.path.and_then(|times| times.walk.as_ref()).map(|walk| SwingTraining::new(walk, initial.len())),
             splats: initial,
             loss: f64::NAN,
         });
@@ -237,7 +243,19 @@ impl<'a> Trainer<'a> {
             inverse_depth: depth_weight > 0.0,
         };
         let visits = (steps as f32 / views.len() as f32).max(1.0);
+        let [listen, moves] = recipe.swing_from;
+        let swing = match progress {
+            early if early < listen => None,
+            early if early < moves => Some(SwingStep::Listen),
+            _ => Some(SwingStep::Train {
+                rate: recipe.swing * geometric(recipe.mean, progress) * (count as f32).sqrt(),
+                decay: recipe.swing_decay / steps as f32,
+                stride_rate: recipe.stride / steps as f32,
+                beta2: recipe.beta2,
+            }),
+        };
         let inputs = Step {
+            swing,
             samples,
             options,
             rates: Some(learning_rates(recipe, progress, (count as f32).sqrt(), self.log_scale_bounds)),
@@ -358,13 +376,16 @@ impl<'a> Trainer<'a> {
             let target = growth.target(state.step, steps, state.start_count, budget);
             self.device.download(state, StatePart::Densification)?;
             let keeps = |place| keeps(place) && free_space.is_none_or(|free| !free.contains(place));
-            let (mut grown, rows, _) =
+            let Grown { splats: mut grown, parents, rows, .. } =
                 growth::refine(&state.splats, &mut state.densification, growth, target, counts, &keeps);
             if let Some(free) = free_space {
                 free.clip(&mut grown);
             }
             self.size_limit.clip(&mut grown);
             state.splats = grown;
+            if let Some(swing) = &mut state.swing {
+                swing.rearrange(&parents, &rows);
+            }
             self.device.rearrange(state, &rows)?;
         }
         Ok(())

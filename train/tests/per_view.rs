@@ -5,8 +5,8 @@ mod common;
 use common::*;
 use glam::{DQuat, DVec3};
 use scene::sensors::{Motion, Taken};
-use scene::{Camera, Exposure, Exposures, Pixels, Rigid, Splats};
-use train::{Backend, Flow, ObjectTimes, State, TrainView, metrics, random};
+use scene::{Camera, Exposure, Exposures, MovingObject, PathPose, Pixels, Rigid, Splats};
+use train::{Backend, Flow, ObjectTimes, State, TrainView, Walk, metrics, random};
 
 /// Multiplies each photo by its gain.
 fn exposed(photos: &Photos, gains: &[f32]) -> Photos {
@@ -275,26 +275,51 @@ fn the_path_of_an_object_is_refined_with_its_splats() {
 #[test]
 fn paths_do_not_depend_on_threads_or_interruptions() {
     let ground_truth = cloud(14, 120, 0.8);
-    let (photos, times) = (photos(&ground_truth), times());
-    let run = |threads: usize, from: Option<State>, until: u32| {
-        let mut left = None;
-        let mut report = |mut now: train::Progress| {
-            left = (now.step == until).then(|| now.state().unwrap().to_frame());
-            if left.is_some() { Flow::Stop } else { Flow::Continue }
+    let photos = photos(&ground_truth);
+    for walk in [None, Some(walk())] {
+        let mut times = times();
+        times.walk = walk;
+        let run = |threads: usize, from: Option<State>, until: u32| {
+            let mut left = None;
+            let mut report = |mut now: train::Progress| {
+                left = (now.step == until).then(|| now.state().unwrap().to_frame());
+                if left.is_some() { Flow::Stop } else { Flow::Continue }
+            };
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            let views = of_wrong_path(&views());
+            let setup =
+                Setup { path: Some(&times), steps: 120, views, ..Setup::new(perturbed(&ground_truth), &photos) };
+            (pool.install(|| setup.try_run_on(from, &|_| true, &mut report)).unwrap(), left)
         };
-        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-        let views = of_wrong_path(&views());
-        let setup = Setup { path: Some(&times), steps: 120, views, ..Setup::new(perturbed(&ground_truth), &photos) };
-        (pool.install(|| setup.try_run_on(from, &|_| true, &mut report)).unwrap(), left)
+        let uninterrupted = run(1, None, u32::MAX).0;
+        assert!(uninterrupted.motions.iter().all(|(_, motion)| *motion != Rigid::IDENTITY));
+        let swings = uninterrupted.swing.iter().flat_map(|swing| &swing.amplitudes).flatten();
+        assert_eq!(swings.filter(|value| **value != 0.0).count() > 0, times.walk.is_some());
+        assert!(uninterrupted == run(2, None, u32::MAX).0, "two threads give another result");
+        // While the stride is listened for, and while splats swing.
+        for until in [23, 67] {
+            let left = run(2, None, until).1.unwrap();
+            let resumed = run(1, Some(State::from_frame(&left).unwrap()), u32::MAX).0;
+            assert!(uninterrupted == resumed, "a run resumed from step {until} gives another result");
+        }
+    }
+}
+
+/// Of someone who walks 4 m while the views are taken.
+fn walk() -> Walk {
+    let pose = |seconds: f64| PathPose {
+        seconds,
+        world_from_object: Rigid { rotation: DQuat::IDENTITY, translation: DVec3::new(2.0 * seconds, 0.0, 0.0) },
     };
-    let uninterrupted = run(1, None, u32::MAX).0;
-    assert!(uninterrupted.motions.iter().all(|(_, motion)| *motion != Rigid::IDENTITY));
-    assert!(uninterrupted == run(2, None, u32::MAX).0, "two threads give another result");
-    let left = run(2, None, 67).1.unwrap();
-    assert!(
-        uninterrupted == run(1, Some(State::from_frame(&left).unwrap()), u32::MAX).0,
-        "a resumed run gives another result"
-    );
+    let person = MovingObject {
+        id: "a".into(),
+        class: "person".into(),
+        low: DVec3::NEG_ONE,
+        high: DVec3::ONE,
+        path: (0..5).map(|half| pose(0.5 * f64::from(half))).collect(),
+    };
+    // Views that are held out are known too.
+    Walk::of((0..24).map(|view| (view, 0.4 * f64::from(view % 12 / 2))), |_| true, &person).unwrap()
 }
 
 #[test]

@@ -256,8 +256,8 @@ impl PlanExecutor {
             let span = tracing::info_span!("train", object = task.object);
             let trained = self.pool.install(|| span.in_scope(|| training.train(results, memory, stopwatch, report)));
             shared.metrics.count_reads(reader.stats());
-            let (path, splats) = trained?;
-            Ok(objects::to_frame(&path, &splats))
+            let (path, splats, swing) = trained?;
+            Ok(objects::to_frame(&path, &splats, swing.as_ref()))
         })
     }
 

@@ -123,8 +123,8 @@ impl Inputs<'_> {
             let Some(PlannedTask::Object(of)) = self.plan.planned(of) else { return Ok(()) };
             let missing = || ExecuteError::work(format!("the capture has no object {}", of.object));
             let about = capture.objects.get(of.object as usize).ok_or_else(missing)?;
-            let (about, splats) = scene::objects::from_frame(&bytes, about).map_err(ExecuteError::work)?;
-            objects.push(ModelObject { about, splats });
+            let (about, splats, swing) = scene::objects::from_frame(&bytes, about).map_err(ExecuteError::work)?;
+            objects.push(ModelObject { about, splats, swing });
             Ok(())
         })?;
         Ok(objects)

@@ -6,10 +6,11 @@ use std::collections::BTreeMap;
 use blocks::{Cut, ObjectTask, Plan, object_camera};
 use dataset::windows::WindowReader;
 use glam::Vec3;
+use perceive::tracking::Kind;
 use proto::FailureKind;
-use scene::{BlockId, Camera, Capture, Exposures, MovingObject, PathPose, Poses, SparsePoints, Splats, View};
+use scene::{BlockId, Camera, Capture, Exposures, MovingObject, PathPose, Poses, SparsePoints, Splats, Swing, View};
 use train::growth::Growth;
-use train::{Backend, Job, ObjectTimes, Recipe, TrainError, TrainView, Trained, random};
+use train::{Backend, Job, ObjectTimes, Recipe, TrainError, TrainView, Trained, Walk, random};
 
 use crate::clock::Stopwatch;
 use crate::memory_budget::MemoryBudget;
@@ -24,6 +25,8 @@ const SHADOW_HEIGHT: f64 = 0.2;
 const INITIAL_SHARE: f64 = 0.5;
 /// Margin around a window, as a share of its size, within which frozen splats are kept in memory.
 const CONTEXT_MARGIN: f32 = 0.2;
+/// Limbs of a person who is less high on a photo are not told apart, pixels.
+const LEAST_PERSON_PIXELS: usize = 20;
 /// Steps between two reports.
 const REPORT_EVERY: u32 = 20;
 
@@ -43,7 +46,7 @@ pub(crate) struct ObjectTraining<'a> {
 }
 
 impl ObjectTraining<'_> {
-    /// The object's path, refined with its splats, and these, in its own axes. `results` are those of the blocks around its path.
+    /// The object's path, refined with its splats, these, in its own axes, and how they swing if it is a person. `results` are those of the blocks around its path.
     ///
     /// # Errors
     /// Photos that cannot be read, training that fails, memory above the budget, or a report that was answered with [`Flow::Stop`].
@@ -53,7 +56,7 @@ impl ObjectTraining<'_> {
         mut memory: Option<MemoryBudget>,
         stopwatch: &Stopwatch,
         report: &mut Reporter,
-    ) -> Result<(Vec<PathPose>, Splats), ExecuteError> {
+    ) -> Result<(Vec<PathPose>, Splats, Option<Swing>), ExecuteError> {
         let (plan, task, object) = (self.plan, self.task, self.object);
         let number = task.object as usize;
         let views = self.views(object)?;
@@ -70,7 +73,12 @@ impl ObjectTraining<'_> {
         let recipe = recipe.at_rate(self.order.rate_permille as f32 / FULL_RATE as f32);
         let sizes = size_bounds_metres(object);
         let taken = views.iter().filter_map(|view| Some((view.view, self.capture.views[view.view as usize].seconds?)));
-        let times = ObjectTimes::of(taken, (object.high - object.low).max_element());
+        let taken: Vec<(u32, f64)> = taken.collect();
+        let mut times = ObjectTimes::of(taken.iter().copied(), (object.high - object.low).max_element());
+        if Kind::of_class(&object.class) == Some(Kind::Person) {
+            let shown = silhouettes.showing(&views, LEAST_PERSON_PIXELS).map_err(unread)?;
+            times.walk = Walk::of(taken.into_iter(), |view| shown.contains(&view), object);
+        }
         let count = (INITIAL_SHARE * f64::from(task.budget)) as usize;
         let hull = visual_hull(&silhouettes, &views, count.max(1), seed);
         let (positions, colours) = hull.map_err(unread)?.into_iter().unzip();
@@ -118,7 +126,7 @@ impl ObjectTraining<'_> {
             is_stopped |= (flow == Flow::Stop || overrun.is_some()) && step < steps;
             if is_stopped { train::Flow::Stop } else { train::Flow::Continue }
         });
-        let Trained { mut splats, motions, .. } = trained.map_err(|error| failure(object, &error))?;
+        let Trained { mut splats, motions, swing, .. } = trained.map_err(|error| failure(object, &error))?;
         if let Some(resident) = overrun {
             let message = format!("object {}: the worker takes {} MiB, above its --memory", object.id, resident >> 20);
             return Err(ExecuteError::of(FailureKind::OutOfMemory, message));
@@ -129,7 +137,9 @@ impl ObjectTraining<'_> {
         if !plan.settings.antialiased {
             train::low_pass::to_full_resolution(&mut splats, &views);
         }
-        Ok((object.moved(&motions), splats.filter(|i| is_part(object, splats.mean(i)))))
+        let is_kept = |i: &u32| is_part(object, splats.mean(*i as usize));
+        let kept: Vec<u32> = (0..splats.len() as u32).filter(is_kept).collect();
+        Ok((object.moved(&motions), splats.select(&kept), swing.map(|swing| swing.select(&kept))))
     }
 
     /// The windows, with cameras in the object's axes.

@@ -4,6 +4,7 @@
 //! is there too. Pixels that the masks keep show the static scene, which is drawn as the context: there the object is not, but its
 //! shadow may be.
 
+use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use dataset::box_masks::covered;
@@ -66,6 +67,23 @@ impl Silhouettes<'_> {
         let mask = (0..area).map(|i| if is_static(i) || silhouette[i] == THERE { 255 } else { 0 }).collect();
         (marked.mask, marked.silhouette) = (Some(mask), Some(silhouette));
         marked
+    }
+
+    /// The views whose windows show the object in at least so many rows of pixels.
+    ///
+    /// # Errors
+    /// A window that cannot be read.
+    pub(crate) fn showing(&self, views: &[train::TrainView], rows: usize) -> Result<BTreeSet<u32>, String> {
+        let mut showing = BTreeSet::new();
+        for (view, next) in views.iter().zip(views.iter().skip(1).map(Some).chain([None])) {
+            next.iter().for_each(|next| self.prefetch(next.view, next.mip, next.rect));
+            let pixels = self.window(view.view, view.mip, view.rect)?;
+            let of_rows = pixels.silhouette.iter().flat_map(|of| of.chunks(pixels.width.max(1) as usize));
+            if of_rows.filter(|row| row.contains(&THERE)).count() >= rows {
+                showing.insert(view.view);
+            }
+        }
+        Ok(showing)
     }
 
     /// Whether a pixel shows the ground under and around the object.
@@ -262,5 +280,11 @@ mod tests {
         // Where nothing moves, there is no hull; where everything does, the box is full.
         assert_eq!([hull(&|_, _, _| false).len(), hull(&|_, _, _| true).len()], [400, 400]);
         assert_eq!(hull(&|_, x, _| x.abs() < 0.04), post);
+        // The post is 20 pixels high in every other photo, and hidden in the others.
+        let moving = |view: usize, x: f64, y: f64| view.is_multiple_of(2) && x.abs() < 0.04 && y.abs() < 0.0625;
+        let photos = Photos { capture: &capture, moving: &moving };
+        let silhouettes = Silhouettes { photos: &photos, capture: &capture, object: 0 };
+        assert_eq!(silhouettes.showing(&views, 20).unwrap().into_iter().collect::<Vec<u32>>(), [0, 2, 4, 6, 8, 10]);
+        assert!(silhouettes.showing(&views, 21).unwrap().is_empty());
     }
 }

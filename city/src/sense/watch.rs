@@ -1,7 +1,7 @@
 //! Fixed cameras around a place of a street: a key area (EDeRF, section 3.1).
 
 use glam::{DVec2, DVec3};
-use scene::Rigid;
+use scene::{Camera, Rigid};
 
 use super::rig::Polyline;
 use super::{SenseError, Shot, camera_towards, check_count, check_range, pinhole};
@@ -34,8 +34,12 @@ pub struct Watch {
     pub height: u32,
     /// Horizontal field of view, degrees.
     pub field_degrees: f64,
-    /// City time, seconds.
+    /// City time of the first photos, seconds.
     pub seconds: f64,
+    /// Photos of each camera.
+    pub frames: u32,
+    /// Photos a second of each camera.
+    pub frame_rate_hz: f64,
 }
 
 /// The pose on a street that is nearest to a place: on the road, x along it. `None` in a city without streets.
@@ -49,7 +53,7 @@ pub fn nearest_on_street(city: &City, at: DVec2) -> Option<Rigid> {
     Some(line.pose(way, 0.0))
 }
 
-/// A shot of each camera. There are fewer where no post in a direction sees the middle.
+/// The shots of each camera. There are fewer cameras where no post in a direction sees the middle.
 ///
 /// # Errors
 /// [`SenseError`] for settings out of range, more shots than [`super::MAX_READINGS`], or a city without streets.
@@ -57,7 +61,9 @@ pub fn watch(moment: &Moment, settings: &Watch) -> Result<Vec<Shot>, SenseError>
     let lens = pinhole(settings.width, settings.height, settings.field_degrees)?;
     let radius = check_range("the radius around the watched place", settings.radius_metres, 2.0, 200.0)?;
     let height = check_range("height_metres", settings.height_metres, 0.1, 200.0)?;
-    let cameras = check_count(f64::from(settings.cameras))?;
+    let rate = check_range("frame_rate_hz", settings.frame_rate_hz, 0.01, 1000.0)?;
+    let (cameras, frames) = (settings.cameras, settings.frames);
+    check_count(f64::from(cameras) * f64::from(frames))?;
     if !settings.at.is_finite() {
         return Err(SenseError::Setting("the watched place"));
     }
@@ -68,16 +74,20 @@ pub fn watch(moment: &Moment, settings: &Watch) -> Result<Vec<Shot>, SenseError>
         let direction = (place - above).as_vec3().normalize_or_zero();
         !moment.is_occluded(&Ray { t_max: place.distance(above) as f32, ..Ray::new(above.as_vec3(), direction) })
     };
-    let post = |i: usize| {
-        let angle = std::f64::consts::TAU * (i as f64 + 0.5) / cameras as f64;
+    let post = |i: u32| {
+        let angle = std::f64::consts::TAU * (f64::from(i) + 0.5) / f64::from(cameras);
         let out = middle.rotation * DVec3::new(angle.cos(), angle.sin(), 0.0);
         let place = |share: f64| middle.translation + share * radius * out + height * DVec3::Z;
         let place = SHARES.into_iter().map(place).find(|&place| is_free(place))?;
         let camera = camera_towards(lens, place, target - place, out);
-        let sensor = format!("watch-{i:03}");
-        Some(Shot::new(format!("{sensor}-00000"), &sensor, settings.seconds, camera))
+        Some((format!("watch-{i:03}"), camera))
     };
-    Ok((0..cameras).filter_map(post).collect())
+    let shot = |(sensor, camera): &(String, Camera), frame: u32| {
+        let seconds = settings.seconds + f64::from(frame) / rate;
+        Shot::new(format!("{sensor}-{frame:05}"), sensor, seconds, *camera)
+    };
+    let posts: Vec<(String, Camera)> = (0..cameras).filter_map(post).collect();
+    Ok((0..frames).flat_map(|frame| posts.iter().map(move |post| shot(post, frame))).collect())
 }
 
 #[cfg(test)]
@@ -98,6 +108,8 @@ mod tests {
             height: 240,
             field_degrees: 60.0,
             seconds: 0.0,
+            frames: 1,
+            frame_rate_hz: 10.0,
         };
         let shots = watch(&world.at(0.0), &settings).unwrap();
         assert_eq!(shots.len(), 6);

@@ -60,7 +60,8 @@ pub(crate) struct SynthArgs {
     /// streets, and the cameras take turns
     #[arg(long, value_name = "METRES", value_parser = metres)]
     pub(crate) spacing: Option<f64>,
-    /// Take all photos of one place of a street, the nearest to this one, by fixed cameras on posts around it, one each
+    /// Take all photos of one place of a street, the nearest to this one, by fixed cameras on posts around it, one
+    /// each, or a film with --film
     #[arg(
         long,
         value_name = "X,Y,RADIUS",
@@ -69,6 +70,9 @@ pub(crate) struct SynthArgs {
         conflicts_with_all = ["aerial", "fixed", "spacing", "rig", "lidar", "radar", "nuscenes", "kitti_raw", "waymo"]
     )]
     pub(crate) watch: Option<[f64; 3]>,
+    /// Film the watched place for this long, 0.1 to 60 seconds: each camera takes ten photos a second, and --views counts those of all
+    #[arg(long, value_name = "SECONDS", requires = "watch")]
+    pub(crate) film: Option<f64>,
     /// Park a car at the watched place that the city does not have without it: a scene that has changed
     #[arg(long, requires = "watch")]
     pub(crate) parked: bool,

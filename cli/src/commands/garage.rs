@@ -46,9 +46,9 @@ struct Placed<'a> {
 pub(crate) fn add(args: &GarageAddArgs, output: &Output) -> Result<(), Failure> {
     let mut garage = Garage::open(&args.garage)?;
     let model = model::read(&args.model)?;
-    let (vehicle, splats) = if let Some(id) = &args.object {
+    let (vehicle, splats, swing) = if let Some(id) = &args.object {
         let object = model.objects.iter().find(|object| object.about.id == *id);
-        let Some(ModelObject { about, splats }) = object else {
+        let Some(ModelObject { about, splats, swing }) = object else {
             let names: Vec<&str> = model.objects.iter().map(|object| object.about.id.as_str()).collect();
             let has = if names.is_empty() { "none".into() } else { names.join(", ") };
             let problem = format!("has no object '{id:.64}', it has {has}");
@@ -56,7 +56,11 @@ pub(crate) fn add(args: &GarageAddArgs, output: &Output) -> Result<(), Failure> 
         };
         let MovingObject { class, low, high, .. } = about.clone();
         let name = args.name.clone().unwrap_or_else(|| id.clone());
-        (Vehicle { name, class, low, high, antialiased: model.antialiased, splats: splats.len() }, splats.clone())
+        (
+            Vehicle { name, class, low, high, antialiased: model.antialiased, splats: splats.len() },
+            splats.clone(),
+            swing.clone(),
+        )
     } else {
         let (Some(area), Some(name)) = (args.area, args.name.clone()) else {
             return Err(BadInput::new("plat garage add", "has nothing to take", "give --object or --box").into());
@@ -64,9 +68,9 @@ pub(crate) fn add(args: &GarageAddArgs, output: &Output) -> Result<(), Failure> 
         let WorldBox { world_from_box, low, high } = standing_box(&area, model::ground_from_world(&args.model)?);
         let splats = cut_out(&model.splats, &world_from_box, low, high);
         let (class, antialiased) = (args.class.clone(), model.antialiased);
-        (Vehicle { name, class, low, high, antialiased, splats: splats.len() }, splats)
+        (Vehicle { name, class, low, high, antialiased, splats: splats.len() }, splats, None)
     };
-    garage.add(vehicle.clone(), &splats)?;
+    garage.add(vehicle.clone(), &splats, swing.as_ref())?;
     let text = format!("{}: a {} of {} splats\n{}", vehicle.name, vehicle.class, vehicle.splats, args.garage.display());
     output.result(&Added { command: "garage add", garage: &args.garage, vehicle }, &text)
 }
@@ -87,7 +91,7 @@ pub(crate) fn list(args: &GarageListArgs, output: &Output) -> Result<(), Failure
 
 pub(crate) fn place(args: &GaragePlaceArgs, output: &Output) -> Result<(), Failure> {
     let garage = Garage::open(&args.garage)?;
-    let (vehicle, splats) = garage.get(&args.vehicle)?;
+    let (vehicle, splats, swing) = garage.get(&args.vehicle)?;
     let path = match (&args.path, args.at) {
         (Some(file), _) => path_of(file, args.track.as_deref())?,
         (None, Some(stand)) => {
@@ -103,7 +107,7 @@ pub(crate) fn place(args: &GaragePlaceArgs, output: &Output) -> Result<(), Failu
     };
     let id = args.id.clone().unwrap_or_else(|| vehicle.name.clone());
     let (poses, ends) = (path.len(), [path.first(), path.last()].map(|pose| pose.map_or(0.0, |pose| pose.seconds)));
-    let object = ModelObject { about: vehicle.on(path, &id), splats };
+    let object = ModelObject { about: vehicle.on(path, &id), splats, swing };
     model::place(&args.model, object, vehicle.antialiased)?;
     let text = format!("{id} in {}, {poses} poses from {} to {} s", args.model.display(), ends[0], ends[1]);
     let placed = Placed {

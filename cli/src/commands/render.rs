@@ -86,13 +86,15 @@ pub(crate) fn run(args: &RenderArgs, output: &Output) -> Result<(), Failure> {
     let mut written = None;
     let progress = output.progress("rendering", moments.len() as u64);
     for (i, Moment { seconds, camera }) in moments.iter().enumerate() {
-        let frame = renderer.compose(&splats, &composition.at(*seconds), camera, &options)?;
+        let shown = composition.at(&renderer, *seconds)?;
+        let frame = renderer.compose(&splats, &shown, camera, &options)?;
         let mut picture = Picture::of(frame);
         if let Some(filter) = &mut filter {
             picture = filter.filtered(picture, camera);
         }
         if film.overlay {
-            let tint = renderer.compose(&tinted.0, &tinted.1.at(*seconds), camera, &flat)?;
+            let shown = tinted.1.at(&renderer, *seconds)?;
+            let tint = renderer.compose(&tinted.0, &shown, camera, &flat)?;
             add_tint(&mut picture, &tint.colour);
         }
         if let Some(per_second) = film.sequence {
@@ -170,7 +172,7 @@ fn write_view(stem: &Path, picture: &Picture, has_depth: bool) -> Result<(), Fai
 fn tints(splats: &Splats, objects: &[ModelObject]) -> (Splats, Vec<ModelObject>) {
     let of = |(i, object): (usize, &ModelObject)| {
         let splats = eval::painted(&object.splats, eval::label_colour(i as u32 + 1));
-        ModelObject { splats, about: object.about.clone() }
+        ModelObject { splats, ..object.clone() }
     };
     (eval::painted(splats, Vec3::ZERO), objects.iter().enumerate().map(of).collect())
 }

@@ -110,6 +110,12 @@ fn settings(args: &SynthArgs) -> Settings {
             Rig::Six => CarRig::Six,
             Rig::Front => CarRig::Front,
         },
-        watched: args.watch.map(|[x, y, radius]| Watched { x, y, radius, parked: args.parked }),
+        watched: args.watch.map(|[x, y, radius]| Watched {
+            x,
+            y,
+            radius,
+            parked: args.parked,
+            film_seconds: args.film,
+        }),
     }
 }

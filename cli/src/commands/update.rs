@@ -80,7 +80,7 @@ pub(crate) fn run(args: &UpdateArgs, output: &Output) -> Result<(), Failure> {
     });
     let vehicle = match (&mut garage, vehicle) {
         (Some(garage), Some((vehicle, splats))) => {
-            garage.add(vehicle.clone(), &splats)?;
+            garage.add(vehicle.clone(), &splats, None)?;
             Some(vehicle)
         }
         _ => None,

@@ -57,7 +57,7 @@ pub struct Settings {
     /// Cameras of a car.
     #[serde(skip_serializing_if = "CarRig::is_default")]
     pub rig: CarRig,
-    /// Takes all photos of one place by fixed cameras around it, one each.
+    /// Takes all photos of one place by fixed cameras around it.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub watched: Option<Watched>,
 }
@@ -77,6 +77,19 @@ pub struct Watched {
     pub radius: f64,
     /// Whether a car is parked there that other captures of the city do not have.
     pub parked: bool,
+    /// The cameras film it for this long, ten photos a second each, 0.1 to 60; `None`: one photo each.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub film_seconds: Option<f64>,
+}
+
+/// Photos a second of a camera that films a place.
+pub(super) const FILM_HZ: f64 = 10.0;
+
+impl Watched {
+    /// Photos of each camera.
+    pub(super) fn frames(self) -> u32 {
+        self.film_seconds.map_or(1, |seconds| (seconds * FILM_HZ).round().max(1.0) as u32)
+    }
 }
 
 /// Cameras of a car.
@@ -164,6 +177,12 @@ impl Settings {
             }
             s if s.watched.is_some_and(|place| !(2.0..=200.0).contains(&place.radius)) => {
                 refuse("the radius around the watched place", "choose 2 to 200 metres")
+            }
+            s if s.watched.and_then(|place| place.film_seconds).is_some_and(|long| !(0.1..=60.0).contains(&long)) => {
+                refuse("the duration of the film", "choose 0.1 to 60 seconds")
+            }
+            s if s.watched.is_some_and(|place| place.frames() > s.views) => {
+                refuse("the number of views of a film", "choose ten times its seconds for each camera")
             }
             s if s.around.len() > 1000 => refuse("the number of places to fill with voxels", "choose 1,000 at most"),
             s if s.faults.iter().any(|f| !f.is_valid()) => refuse("the strength of a fault", "choose 0 to 1"),

@@ -12,7 +12,7 @@ use city::trace::World;
 use city::{City, Waypoint};
 use scene::BadInput;
 
-use super::settings::{Driven, SUBJECT, Settings, Watched, unsupported};
+use super::settings::{Driven, FILM_HZ, SUBJECT, Settings, Watched, unsupported};
 
 /// End of the city's traffic, seconds. Times of an aerial block that takes longer are compressed, as if several aircraft flew.
 const TRAFFIC_SECONDS: f64 = 600.0;
@@ -239,15 +239,18 @@ fn fixed_shots(world: &World, settings: &Settings, wanted: usize) -> Result<Vec<
 
 /// Cameras around a place.
 fn watched_shots(world: &World, settings: &Settings, place: Watched) -> Result<Vec<Shot>, SenseError> {
+    let frames = place.frames();
     let cameras = Watch {
         at: glam::DVec2::new(place.x, place.y),
         radius_metres: place.radius,
-        cameras: settings.views,
+        cameras: settings.views / frames,
         height_metres: WATCH_HEIGHT_METRES,
         width: settings.width,
         height: settings.height,
         field_degrees: WATCH_FIELD_DEGREES,
         seconds: 0.0,
+        frames,
+        frame_rate_hz: FILM_HZ,
     };
     watch(&world.at(cameras.seconds), &cameras)
 }

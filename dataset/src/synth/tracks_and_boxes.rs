@@ -41,7 +41,7 @@ pub(super) fn write_tracks(out: &Path, city: &City, shots: &[Shot]) -> Result<()
             let Rigid { rotation: q, translation: t } = w.world_from_asset;
             json!([round(w.seconds, 1e3), metres(t), quaternion(q)])
         });
-        let (low, high) = bounds(city, actor.asset)?;
+        let (low, high) = bounds_at_all_times(city, actor)?;
         Some(json!({
             "instance": actor.instance,
             "class": actor.class,
@@ -126,6 +126,13 @@ impl<'a> Instances<'a> {
             "box2d": visible.bounds,
         }))
     }
+}
+
+/// Bounding box of an actor in its own axes: a pedestrian's in all phases of the gait.
+pub(super) fn bounds_at_all_times(city: &City, actor: &Actor) -> Option<(Vec3, Vec3)> {
+    let gait = actor.trajectory.as_ref().map_or(&[][..], |trajectory| &trajectory.gait);
+    let phases = gait.iter().chain([&actor.asset]).filter_map(|&asset| bounds(city, asset));
+    phases.reduce(|(low, high), (other_low, other_high)| (low.min(other_low), high.max(other_high)))
 }
 
 /// Bounding box of an asset in its own axes.

@@ -14,7 +14,7 @@ use image::{DynamicImage, ImageFormat, Luma, Rgb, RgbImage, Rgba, RgbaImage};
 use scene::frame;
 use scene::parquet::{Cells, Writer};
 use scene::transforms::{Frame, Intrinsics, Transforms};
-use scene::{CameraModel, Exposure, Exposures, Pixels, Splat, Splats};
+use scene::{CameraModel, Exposure, Exposures, Pixels, Splat, Splats, Swing};
 use scene::{npy, ply, rad, sog, splat_glb, spz, transforms};
 
 use crate::readers::*;
@@ -283,8 +283,12 @@ impl Corpus {
                 self.put(&file.name, file.bytes, &codec, Seal::None, PICTURES);
             }
             self.put("splat columns", frame::encode_splats(&splats), &splats_codec(), Seal::Frame, PLAIN);
-            let object = scene::objects::to_frame(&parked().path, &splats);
-            self.put("trained object", object, &object_codec(), Seal::Frame, PLAIN);
+            let swing = Swing { stride_metres: 1.4, amplitudes: vec![[0.1; scene::swing::NUMBERS]; splats.len()] };
+            for swing in [None, Some(&swing)] {
+                let object = scene::objects::to_frame(&parked().path, &splats, swing);
+                self.put("trained object", object, &object_codec(), Seal::Frame, PLAIN);
+            }
+            self.put("swing", swing.to_frame(), &swing_codec(splats.len()), Seal::Frame, PLAIN);
         }
         let exposures: Exposures = (0..40).map(|view| (3 * view, Exposure::IDENTITY)).collect();
         self.put("exposures", exposures.to_frame(), &exposures_codec(), Seal::Frame, PLAIN);

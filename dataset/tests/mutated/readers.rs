@@ -15,7 +15,7 @@ use image::{ImageFormat, RgbImage};
 use scene::frame::{self, Kind};
 use scene::parquet::Table;
 use scene::transforms::{Frame, Intrinsics, Transforms};
-use scene::{CameraModel, Capture, CodecError, Exposures, MovingObject, PathPose, Rect, Rigid};
+use scene::{CameraModel, Capture, CodecError, Exposures, MovingObject, PathPose, Rect, Rigid, Swing};
 use scene::{
     colmap, kitti_raw, kitti360, lidar, npy, nuscenes, objects, opensfm, ply, rad, radar, sog, splat_glb, spz,
     transforms, waymo,
@@ -300,8 +300,21 @@ pub(crate) fn object_codec() -> Read {
     codec(
         "frames",
         |bytes| objects::from_frame(bytes, &parked()),
-        |(object, splats)| object.check().is_ok() && splats.columns().iter().all(|c| c.len() == splats.len()),
+        |(object, splats, swing)| {
+            let is_whole = swing.as_ref().is_none_or(|swing| swing.amplitudes.len() == splats.len());
+            is_whole && object.check().is_ok() && splats.columns().iter().all(|c| c.len() == splats.len())
+        },
     )
+}
+
+/// How so many splats swing.
+pub(crate) fn swing_codec(splats: usize) -> Read {
+    Reader::new("frames", move |bytes| {
+        let Swing { amplitudes, .. } = Swing::from_frame(bytes, splats).map_err(|error| error.to_string())?;
+        let is_kept = amplitudes.len() == splats && amplitudes.iter().flatten().all(|value| value.is_finite());
+        assert!(is_kept, "accepted what it promises to refuse");
+        Ok(())
+    })
 }
 
 /// An object that stands still.

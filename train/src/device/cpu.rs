@@ -26,6 +26,8 @@ pub(crate) struct CpuDevice<'a> {
     picture_loss: Option<&'a dyn PictureLoss>,
     upstream: Upstream,
     exposed: Vec<f32>,
+    /// The splats where they are in the view that is drawn.
+    swung: Splats,
     weights: Vec<f32>,
     /// Summed gradients of a step with several samples.
     sum: Gradients,
@@ -48,6 +50,7 @@ impl<'a> CpuDevice<'a> {
             picture_loss,
             upstream: Upstream::default(),
             exposed: Vec::new(),
+            swung: Splats::new(0),
             weights: Vec::new(),
             sum: Gradients::default(),
         }
@@ -63,9 +66,11 @@ impl TrainDevice for CpuDevice<'_> {
             depth_weight,
             silhouette_weight,
             picture_weight,
+            swing,
             exposure_rate,
             pose_rates,
         } = step;
+        let walk = self.given.times.as_ref().and_then(|times| times.walk.as_ref());
         let several = samples.len() > 1;
         let before = several.then(|| state.densification.clone());
         let (mut loss, mut errors, mut visible_sum) = (0.0, Vec::new(), 0);
@@ -74,7 +79,15 @@ impl TrainDevice for CpuDevice<'_> {
             let &ViewSample { view, ref photo, ref camera, camera_from_context, exposure, .. } = sample;
             let camera = state.poses.as_ref().map_or(*camera, |poses| poses.apply(&self.given, view, camera));
             let context = self.context.map(|splats| Part { splats, camera_from_part: camera_from_context });
-            let frame = self.renderer.forward(&state.splats, context.as_slice(), &camera, &options);
+            let splats = match (&state.swing, walk) {
+                (Some(swing), Some(walk)) => {
+                    self.swung.clone_from(&state.splats);
+                    swing.apply(walk, &mut self.swung, view);
+                    &self.swung
+                }
+                _ => &state.splats,
+            };
+            let frame = self.renderer.forward(splats, context.as_slice(), &camera, &options);
             pixel_weights(frame, photo, self.context.is_some(), &mut self.weights);
             let exposure = state.exposures.as_ref().map_or(exposure, |exposures| exposures.of(view));
             let shown = exposure.as_ref().map_or(&frame.colour, |exposure| {
@@ -111,7 +124,10 @@ impl TrainDevice for CpuDevice<'_> {
             if let Some(exposure) = &exposure {
                 by_exposure.push((view, expose_backward(exposure, &frame.colour, &mut self.upstream.colour)));
             }
-            let gradients = self.renderer.backward(&state.splats, &self.upstream);
+            let gradients = self.renderer.backward(splats, &self.upstream);
+            if let (Some(of_splats), Some(walk), Some(step)) = (&mut state.swing, walk, swing) {
+                of_splats.add(walk, gradients, view, step);
+            }
             let [x, y, z, a, b, c] = gradients.pose;
             by_pose.push((view, [x, y, z, a, b, c, gradients.focal]));
             if rates.is_some() {
@@ -140,6 +156,9 @@ impl TrainDevice for CpuDevice<'_> {
             }
             false => self.renderer.gradients(),
         };
+        if let (Some(of_splats), Some(walk), Some(step)) = (&mut state.swing, walk, swing) {
+            of_splats.step(walk, &state.splats, gradients, step);
+        }
         state.adam.step(&mut state.splats, gradients, options.sh_degree, &rates);
         errors.into_iter().for_each(|error| state.coarse_to_fine.tally.add(error));
         Ok(())

@@ -13,6 +13,7 @@ use crate::checkpoint::State;
 use crate::error::TrainError;
 use crate::optimiser::LearningRates;
 use crate::pose::PoseRates;
+use crate::swing::SwingStep;
 
 /// Largest number of views in one optimiser step.
 pub const MAX_VIEWS_PER_STEP: u32 = 16;
@@ -31,6 +32,8 @@ pub(crate) struct Step {
     pub(crate) silhouette_weight: f32,
     /// Weight of the picture loss; 0 leaves it out.
     pub(crate) picture_weight: f32,
+    /// What is done with the swing, where splats swing.
+    pub(crate) swing: Option<SwingStep>,
     /// Learning rate of exposures, where they are trained.
     pub(crate) exposure_rate: f32,
     /// Rates of poses, where they are trained in this step.

@@ -19,6 +19,7 @@ use glam::{DMat3, DQuat, DVec3};
 use scene::Rigid;
 
 use super::adam::{joined, parts};
+use crate::swing::Walk;
 
 /// Standard deviation of the times that a photo moves with its own, seconds.
 const TOGETHER_SECONDS: f64 = 0.5;
@@ -38,6 +39,8 @@ pub struct ObjectTimes {
     of_views: BTreeMap<u32, usize>,
     /// A turn by one radian moves the object's ends by this much, metres.
     lever: f32,
+    /// Of a person, whose limbs swing.
+    pub walk: Option<Walk>,
 }
 
 impl ObjectTimes {
@@ -49,7 +52,7 @@ impl ObjectTimes {
         seconds.dedup();
         let place = |at: f64| seconds.partition_point(|other| *other < at);
         let of_views = views.iter().map(|(&view, &at)| (view, place(at))).collect();
-        Self { of_views, lever: (0.5 * length).max(0.1) as f32, seconds }
+        Self { of_views, lever: (0.5 * length).max(0.1) as f32, seconds, walk: None }
     }
 }
 

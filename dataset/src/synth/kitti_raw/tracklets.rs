@@ -10,7 +10,7 @@ use rayon::prelude::*;
 use scene::Rigid;
 
 use super::super::nuscenes::{Object, Sample, around};
-use super::super::tracks_and_boxes::bounds;
+use super::super::tracks_and_boxes::bounds_at_all_times;
 
 /// A frame of a drive.
 pub(super) struct Frame<'a> {
@@ -38,7 +38,7 @@ pub(super) fn text(world: &World, frames: &[Frame]) -> String {
         let (frame, seconds) = (sample.station.frame, sample.station.seconds);
         for object in objects {
             let actor = &city.actors[object.actor];
-            let Some((low, high)) = bounds(city, actor.asset) else { continue };
+            let Some((low, high)) = bounds_at_all_times(city, actor) else { continue };
             let middle = 0.5 * (low + high).as_dvec3();
             let pose = world_from_velodyne.inverse().compose(&motion::pose_at(actor, seconds));
             let place = pose.apply(DVec3::new(middle.x, middle.y, f64::from(low.z)));
@@ -63,7 +63,7 @@ pub(super) fn text(world: &World, frames: &[Frame]) -> String {
     );
     for (number, tracklet) in tracklets.iter().enumerate() {
         let actor = &city.actors[tracklet.actor];
-        let size = bounds(city, actor.asset).map_or(DVec3::ZERO, |(low, high)| (high - low).as_dvec3());
+        let size = bounds_at_all_times(city, actor).map_or(DVec3::ZERO, |(low, high)| (high - low).as_dvec3());
         // Boost describes a class where it occurs first.
         let attributes = |level: u32, version: u32, is_first: bool| match is_first {
             true => format!(" class_id=\"{level}\" tracking_level=\"0\" version=\"{version}\""),

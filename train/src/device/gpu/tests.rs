@@ -78,6 +78,7 @@ fn step(masked: bool, extras: bool, key: u64) -> Step {
         depth_weight: 0.0,
         silhouette_weight: 0.0,
         picture_weight: 0.0,
+        swing: None,
         exposure_rate: 0.0,
         pose_rates: None,
     }
@@ -109,6 +110,7 @@ fn new_state(splats: Splats) -> State {
         densification: DensificationStats::default(),
         exposures: None,
         poses: None,
+        swing: None,
         splats,
         loss: f64::NAN,
     }
