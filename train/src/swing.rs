@@ -6,6 +6,7 @@
 
 use std::collections::BTreeMap;
 use std::f64::consts::TAU;
+use std::ops::Range;
 
 use render::Gradients;
 use scene::swing::{HARMONICS, NUMBERS, TERMS, Way, displace, terms};
@@ -14,10 +15,13 @@ use scene::{MovingObject, Splats, Swing, column};
 /// Strides that are looked at, relative to the height of the person. Adults take 0.8 to 0.9 of their height at the speed that they
 /// choose (Murray, Drought and Kory 1964), less when they stroll, more when they hurry.
 const STRIDES: [f64; 2] = [0.5, 1.2];
-/// The stride where the way is too short to tell.
+/// The stride where the way is too short to tell, and the number of strides below which it is.
 const USUAL_STRIDE: f64 = 0.83;
-/// Ways of fewer usual strides are too short.
-const LEAST_STRIDES: f64 = 1.5;
+const LEAST_HEARD: f64 = 1.5;
+/// On a shorter way photos do not show all of a stride.
+const LEAST_STRIDES: f64 = 1.0;
+/// Heights of people, metres: what is called a person in a file may be anything.
+const HEIGHTS: Range<f64> = 0.3..3.0;
 /// A swing has twelve numbers for each splat, and a view shows two of three dimensions: fewer views do not fix them. Those farther apart
 /// tell strides badly apart (docs/decisions/0098).
 const LEAST_VIEWS: usize = 24;
@@ -39,7 +43,7 @@ pub struct Walk {
 
 impl Walk {
     /// Of views with their times in seconds; `None` where those that show the person well are too few, or too far apart on the way, to
-    /// say how limbs swing.
+    /// say how limbs swing, or show less than a stride.
     pub fn of(
         views: impl Iterator<Item = (u32, f64)>,
         is_shown: impl Fn(u32) -> bool,
@@ -51,14 +55,14 @@ impl Walk {
         let metres = all.iter().filter(|(view, _)| is_shown(**view)).map(|(&view, &metres)| (view, metres)).collect();
         let shown = Self { metres, height };
         let (count, strides) = (shown.metres.len(), shown.length() / (USUAL_STRIDE * height));
-        let is_known = count >= LEAST_VIEWS && count as f64 >= LEAST_VIEWS_PER_STRIDE * strides;
-        is_known.then_some(Self { metres: all, height })
+        let are_enough = count >= LEAST_VIEWS && count as f64 >= LEAST_VIEWS_PER_STRIDE * strides;
+        (are_enough && strides >= LEAST_STRIDES && HEIGHTS.contains(&height)).then_some(Self { metres: all, height })
     }
 
     /// The frequencies to look at, per metre; none where the way is too short.
     fn candidates(&self) -> Vec<f64> {
         let length = self.length();
-        if length < LEAST_STRIDES * USUAL_STRIDE * self.height {
+        if length < LEAST_HEARD * USUAL_STRIDE * self.height {
             return Vec::new();
         }
         let [high, low] = STRIDES.map(|share| 1.0 / (share * self.height));
@@ -193,6 +197,12 @@ impl SwingTraining {
         }
     }
 
+    /// Drops what was added in a step that is skipped.
+    pub(crate) fn forget(&mut self) {
+        self.gradients.fill([0.0; NUMBERS]);
+        self.frequency_gradient = 0.0;
+    }
+
     /// One Adam step from the gradients that were added, of the splats that the views of the step show.
     pub(crate) fn step(&mut self, walk: &Walk, splats: &Splats, shown: &Gradients, step: SwingStep) {
         let SwingStep::Train { rate, decay, stride_rate, beta2 } = step else { return };
@@ -209,6 +219,7 @@ impl SwingTraining {
             *v = beta2 * *v + (1.0 - beta2) * gradient * gradient;
             (*m / correction[0]) / ((*v / correction[1]).sqrt() + EPSILON)
         };
+        let longest = walk.height as f32;
         let scales = [0, 1, 2].map(|axis| splats.col(column::LOG_SCALE + axis));
         let [amplitudes, first, second] = &mut self.values;
         for i in 0..amplitudes.len() {
@@ -221,7 +232,8 @@ impl SwingTraining {
                 let step = rate * size * unit([&mut first[i][k], &mut second[i][k]], gradient);
                 let next = (1.0 - decay) * amplitudes[i][k] - step;
                 if next.is_finite() {
-                    amplitudes[i][k] = next;
+                    // No limb is longer than its person.
+                    amplitudes[i][k] = next.clamp(-longest, longest);
                 }
             }
         }
@@ -320,10 +332,15 @@ mod tests {
             path: (4..14).map(|half| pose(0.5 * f64::from(half))).collect(),
         };
         let taken = |view: u32| (view, 3.0 + 0.1 * f64::from(view));
-        // Too few, too few of all, and too few for their way.
+        // Too few, too few of all, too few for their way, and not a step; and what is no person.
         assert_eq!(Walk::of((0..20).map(taken), |_| true, &person), None);
         assert_eq!(Walk::of((0..30).map(taken), |view| view < 20, &person), None);
         assert_eq!(Walk::of((0..30).map(|view| (view, 0.4 * f64::from(view))), |_| true, &person), None);
+        assert_eq!(Walk::of((0..30).map(|view| (view, 3.0)), |_| true, &person), None);
+        for height in [0.01, 150.0] {
+            let other = MovingObject { high: person.high.with_z(height), ..person.clone() };
+            assert_eq!(Walk::of((0..3000).map(|view| (view, 3.0 + 1e-3 * f64::from(view))), |_| true, &other), None);
+        }
         Walk::of((0..30).map(taken), |view| view > 0, &person).unwrap()
     }
 

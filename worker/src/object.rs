@@ -46,7 +46,8 @@ pub(crate) struct ObjectTraining<'a> {
 }
 
 impl ObjectTraining<'_> {
-    /// The object's path, refined with its splats, these, in its own axes, and how they swing if it is a person. `results` are those of the blocks around its path.
+    /// The object's path, refined with its splats, these, in its own axes, and how they swing if it is a person who walks. `results` are
+    /// those of the blocks around its path.
     ///
     /// # Errors
     /// Photos that cannot be read, training that fails, memory above the budget, or a report that was answered with [`Flow::Stop`].

@@ -16,6 +16,7 @@ use crate::loss::PhotometricLoss;
 use crate::picture_loss::{PictureLoss, add_picture_loss};
 use crate::pose::GivenPoses;
 use crate::silhouette_loss::silhouette_loss;
+use crate::swing::SwingTraining;
 
 /// The renderer, the loss and their buffers.
 pub(crate) struct CpuDevice<'a> {
@@ -117,6 +118,7 @@ impl TrainDevice for CpuDevice<'_> {
             loss += value.total / samples.len() as f64;
             if !value.total.is_finite() {
                 (state.loss, state.skipped) = (loss, state.skipped + 1);
+                state.swing.iter_mut().for_each(SwingTraining::forget);
                 state.densification = before.unwrap_or_else(|| std::mem::take(&mut state.densification));
                 return Ok(());
             }
