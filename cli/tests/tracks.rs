@@ -11,7 +11,7 @@ use serde_json::Value;
 fn the_traffic_of_a_street_is_found_where_it_is() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
-    let drive = ["--views", "150", "--spacing", "2", "--aerial", "0", "--size", "320x180", "--lidar"];
+    let drive = ["--views", "150", "--spacing", "2", "--aerial", "0", "--size", "320x180", "--lidar", "--radar"];
     done(at, &[&["synth", "--area-km2", "0.02", "--traffic", "medium", "--out", "city"][..], &drive].concat());
 
     let track = ["objects", "track", "city", "--out", "found/tracks.json", "--against", "city/tracks.json"];
@@ -26,6 +26,19 @@ fn the_traffic_of_a_street_is_found_where_it_is() {
     assert_eq!(file["tracks"].as_array().unwrap().len() as u64, said["objects"].as_u64().unwrap());
     assert_eq!(file["seconds"].as_object().unwrap().len(), 150);
     assert!(fs::read_to_string(at.join("found/map.svg")).unwrap().matches("<polyline").count() >= 2);
+
+    // The radar alone finds some of them, near to where they are, and helps the lidar.
+    let by = |more: &[&str]| {
+        let track = ["objects", "track", "city", "--out", "radar.json", "--against", "city/tracks.json", "--radar"];
+        let said = done(at, &[&track[..], more].concat());
+        println!("{said}");
+        let of = |key: &str| said["against"]["vehicles"][key].as_f64().unwrap();
+        [of("objects") - of("misses"), of("median_metres"), of("mota")]
+    };
+    let [found, off, _] = by(&["--no-lidar"]);
+    assert!(found >= 5.0 && off <= 0.5, "{found} {off}");
+    let [_, off, mota] = by(&[]);
+    assert!(mota >= 0.8 && off <= 0.3, "{mota} {off}");
 
     // The same again, by one thread; and what is found is what a capture may have beside it.
     json_of(command(at, &["objects", "track", "city", "--out", "again.json"]).env("RAYON_NUM_THREADS", "1"));
@@ -44,6 +57,8 @@ fn the_traffic_of_a_street_is_found_where_it_is() {
         &[&none[..], &["--no-lidar"]].concat(),
         "has no sweeps of a lidar, and nobody looks at its photos; give --detector",
     );
+    fs::remove_dir_all(at.join("city/radar")).unwrap();
+    refused(at, &[&none[..], &["--radar"]].concat(), "has no sweeps of a radar; omit --radar");
     fs::write(at.join("bad.json"), "{\"tracks\": 3}").unwrap();
     refused(at, &[&none[..], &["--against", "bad.json"]].concat(), "bad.json");
     fs::remove_file(at.join("city/tracks.json")).unwrap();

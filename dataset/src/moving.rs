@@ -1,20 +1,23 @@
 //! Objects that move, from the sweeps of a capture's lidar, objects on its photos, and the times of both.
 //!
 //! Sweeps are read in the order of time, twice: once for the heights of the ground, and once for what moves, each beside those of other
-//! times from near places. A window of sweeps is in memory, so a capture may have any number of them. Without sweeps, objects on photos
+//! times from near places. A window of sweeps is in memory, so a capture may have any number of them. A radar adds what moves by its
+//! velocity. Without sweeps, objects on photos
 //! are where they touch the ground, which lies where the lowest points of the capture are.
 
 use std::collections::{BTreeSet, VecDeque};
 
 use glam::{DQuat, DVec3};
+use perceive::echoes::{Echo, add_echoes};
 use perceive::moving_points::{GroundHeights, JudgedScan, RangeImage, Scan};
 use perceive::seen_boxes::{SeenBox, add_boxes};
 use perceive::tracking::{Kind, Moment, Sighting, Track, tracks};
 use rayon::prelude::*;
 use scene::{BadInput, Camera, MovingObject, PathPose, Rigid, View, Zones};
 
-use crate::lidar::{Return, Sweep};
+use crate::lidar::{Return, Scan as _, Sweep};
 use crate::open::Source;
+use crate::radar::{MovingEcho, RoadStrip};
 
 /// Sweeps on each side of one, in the order of time, that may tell what moved in it, and how many of them do, spread evenly.
 const WINDOW: usize = 40;
@@ -42,6 +45,8 @@ pub struct Looking<'a> {
     pub views: &'a [View],
     /// Objects on the photos.
     pub zones: Option<&'a Zones>,
+    /// Whether its radar is used.
+    pub radar: bool,
     /// Turns up to z.
     pub ground_from_world: DQuat,
 }
@@ -50,6 +55,8 @@ pub struct Looking<'a> {
 struct Instant<'a> {
     seconds: f64,
     sweep: Option<&'a Sweep>,
+    /// What a radar saw.
+    radar: Vec<&'a RoadStrip>,
     /// Indices of photos.
     views: Vec<usize>,
 }
@@ -62,8 +69,11 @@ impl Looking<'_> {
     pub fn objects(&self, progress: &dyn Fn(usize, usize)) -> Result<Vec<MovingObject>, BadInput> {
         let bad = |problem: &str, advice: &str| BadInput::new(self.capture, problem, advice);
         let sweeps = &self.source.sweeps;
-        if sweeps.is_empty() && self.zones.is_none() {
-            let advice = "give --detector or --zones, or a capture with a lidar";
+        if self.radar && self.source.road.is_empty() {
+            return Err(bad("has no sweeps of a radar", "omit --radar"));
+        }
+        if sweeps.is_empty() && !self.radar && self.zones.is_none() {
+            let advice = "give --detector or --zones, or a capture with a lidar, or --radar with one that has a radar";
             return Err(bad("has no sweeps of a lidar, and nobody looks at its photos", advice));
         }
         let instants = self.instants();
@@ -125,7 +135,7 @@ impl Looking<'_> {
             times.sort_by(f64::total_cmp);
             if let Some(&seconds) = times.get(times.len() / 2) {
                 with_sweep.extend(own.iter().copied());
-                instants.push(Instant { seconds, sweep: Some(sweep), views: own });
+                instants.push(Instant { seconds, sweep: Some(sweep), radar: Vec::new(), views: own });
             }
         }
         if self.zones.is_some() {
@@ -138,10 +148,25 @@ impl Looking<'_> {
                 instants.push(Instant {
                     seconds: group[0].0,
                     sweep: None,
+                    radar: Vec::new(),
                     views: group.iter().map(|(_, at)| *at).collect(),
                 });
             }
         }
+        instants.sort_by(|a, b| a.seconds.total_cmp(&b.seconds));
+        let mut of_radar = Vec::new();
+        for strip in self.source.road.iter().filter(|strip| self.radar && !strip.moving().is_empty()) {
+            let mut times: Vec<f64> =
+                strip.views().iter().filter_map(|&view| views.get(view as usize)?.seconds).collect();
+            times.sort_by(f64::total_cmp);
+            let Some(&seconds) = times.get(times.len() / 2) else { continue };
+            let near = instants.partition_point(|instant| instant.seconds < seconds - SAME_SECONDS);
+            match instants.get_mut(near).filter(|instant| instant.seconds <= seconds + SAME_SECONDS) {
+                Some(instant) => instant.radar.push(strip),
+                None => of_radar.push(Instant { seconds, sweep: None, radar: vec![strip], views: Vec::new() }),
+            }
+        }
+        instants.extend(of_radar);
         instants.sort_by(|a, b| a.seconds.total_cmp(&b.seconds));
         instants
     }
@@ -190,6 +215,10 @@ impl Looking<'_> {
     ) -> Vec<Sighting> {
         let judged = scan.map(|(scan, _)| JudgedScan::new(scan, &chosen(scan, others), ground));
         let mut seen = judged.as_ref().map(|judged| judged.sightings(ground)).unwrap_or_default();
+        for strip in &instant.radar {
+            let echoes: Vec<Echo> = strip.moving().iter().map(|of| self.echo(strip.origin(), of)).collect();
+            add_echoes(&mut seen, &echoes, ground);
+        }
         if let Some(zones) = self.zones {
             let photos: Vec<(Camera, Vec<SeenBox>)> = instant
                 .views
@@ -201,6 +230,12 @@ impl Looking<'_> {
             add_boxes(&mut seen, &photos, judged.as_ref(), ground);
         }
         seen
+    }
+
+    /// A detection in ground axes.
+    fn echo(&self, sensor: DVec3, of: &MovingEcho) -> Echo {
+        let place = self.ground_from_world * (sensor + of.range * of.towards);
+        Echo { place, sensor: self.ground_from_world * sensor, speed: of.speed }
     }
 
     /// A camera in ground axes.

@@ -3,6 +3,7 @@
 
 pub(crate) mod road;
 
+pub(crate) use self::road::MovingEcho;
 pub use self::road::RoadStrip;
 
 use std::fs::File;

@@ -14,6 +14,7 @@ pub mod boxes;
 pub mod card;
 mod coco;
 mod detector;
+pub mod echoes;
 pub mod gradient;
 mod heads;
 mod masked;

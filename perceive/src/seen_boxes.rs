@@ -13,6 +13,10 @@ use crate::tracking::{Kind, Place, Sighting};
 const LEAST_OVERLAP: f32 = 0.25;
 /// A person is seen by the lidar already if a cluster is this near, metres.
 const CLUSTER_METRES: f64 = 1.0;
+/// Where a box and echoes of a radar may differ besides by what the box is unsure, metres: echoes are of the near side. Height of what
+/// the radar sees above the ground, metres.
+const RADAR_METRES: f64 = 2.5;
+const RADAR_HEIGHT: f64 = 0.7;
 /// Fewer points that moved do not say where it is.
 const LEAST_POINTS: usize = 2;
 /// Its points lie within this many metres of their median distance.
@@ -61,7 +65,12 @@ pub fn add_boxes(
                 shown.kind = shown.kind.max(Some(of.kind));
                 continue;
             }
-            let Some(new) = sighting(camera, of, scan, ground) else { continue };
+            let new = sighting(camera, of, scan, ground);
+            if let Some(echoes) = of_radar(camera, of, &mut seen[..clusters], new.as_ref()) {
+                echoes.kind = echoes.kind.max(Some(of.kind));
+                continue;
+            }
+            let Some(new) = new else { continue };
             let is_near = |cluster: &&mut Sighting| cluster.middle().distance(new.middle()) <= CLUSTER_METRES;
             if let Some(cluster) = seen[..clusters].iter_mut().find(is_near) {
                 cluster.kind = cluster.kind.max(Some(of.kind));
@@ -80,6 +89,24 @@ pub fn add_boxes(
             }
         }
     }
+}
+
+/// What a radar saw in a box's direction, nearest to where the box says that the object is, or to the camera where it does not.
+fn of_radar<'a>(
+    camera: &Camera,
+    of: &SeenBox,
+    seen: &'a mut [Sighting],
+    on_photo: Option<&Sighting>,
+) -> Option<&'a mut Sighting> {
+    let from = on_photo.map_or(camera.centre().truncate(), Sighting::middle);
+    let is_there = |echoes: &Sighting| {
+        let near = on_photo.map_or(f64::INFINITY, |photo| RADAR_METRES + 2.0 * photo.place.variance().sqrt());
+        echoes.place.radial.is_some()
+            && is_inside(camera, of, echoes.middle().extend(echoes.ground + RADAR_HEIGHT))
+            && echoes.middle().distance(from) <= near
+    };
+    let there = seen.iter_mut().filter(|echoes| is_there(echoes));
+    there.min_by(|a, b| a.middle().distance(from).total_cmp(&b.middle().distance(from)))
 }
 
 fn is_same(a: &Sighting, b: &Sighting) -> bool {

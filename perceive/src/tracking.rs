@@ -20,8 +20,8 @@ use std::ops::Range;
 use glam::{DVec2, DVec3};
 
 use self::assignment::assigned;
-pub(crate) use self::filter::Place;
 use self::filter::{Belief, Motion, smoothed};
+pub(crate) use self::filter::{Place, Radial};
 pub use self::kinds::Kind;
 pub use self::score::{Frame, Placed, Score, TrueObject, score};
 pub use self::sighting::Sighting;
@@ -36,6 +36,8 @@ const START_SECONDS: f64 = 0.65;
 const MAX_SPEED: f64 = 40.0;
 /// Two sightings may be farther apart than that speed allows by this much, metres: other parts of an object are seen.
 const SLACK_METRES: f64 = 0.5;
+/// Their way along a ray of a radar may differ from what its velocity says by this much, metres.
+const RADIAL_SLACK_METRES: f64 = 1.5;
 /// A track is an object if it was seen this often, at this share of the times, and went this far, metres.
 const LEAST_SEEN: usize = 4;
 const LEAST_SHARE: f64 = 0.3;
@@ -177,7 +179,12 @@ fn followed(moments: &[Moment]) -> Vec<Followed> {
             let may_move = [&sightings[free[of]], before].iter().all(|of| of.moves || of.kind.is_some());
             let fastest = kinds.iter().flatten().map(|kind| kind.max_speed()).fold(MAX_SPEED, f64::min);
             let is_near = seconds > 0.0 && apart <= fastest * seconds + SLACK_METRES;
-            if may_move && is_near && may_be_same(kinds[0], kinds[1]) { apart } else { f64::INFINITY }
+            let is_as_fast = [&sightings[free[of]], before].iter().all(|seen| {
+                let way = sightings[free[of]].place.middle - before.place.middle;
+                let off = |radial: Radial| (way.dot(radial.away) - radial.speed * seconds).abs();
+                seen.place.radial.is_none_or(|radial| off(radial) <= RADIAL_SLACK_METRES)
+            });
+            if may_move && is_near && is_as_fast && may_be_same(kinds[0], kinds[1]) { apart } else { f64::INFINITY }
         });
         let mut is_used = vec![false; left.len()];
         let mut rest = Vec::new();

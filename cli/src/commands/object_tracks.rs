@@ -37,7 +37,7 @@ struct Tracked<'a> {
 
 pub(crate) fn run(args: &TrackArgs, output: &Output) -> Result<(), Failure> {
     let truth = args.against.as_deref().map(|path| read(path, objects::read)).transpose()?;
-    let options = OpenOptions { lidar: !args.no_lidar, ..OpenOptions::default() };
+    let options = OpenOptions { lidar: !args.no_lidar, radar: args.radar, ..OpenOptions::default() };
     let mut source = open_with(&args.capture, &options, output)?;
     // Masks hide what is looked for.
     source.unmask();
@@ -53,7 +53,8 @@ pub(crate) fn run(args: &TrackArgs, output: &Output) -> Result<(), Failure> {
         views = capture.views;
     }
     let name = args.capture.display().to_string();
-    let looking = Looking { capture: &name, source: &source, views: &views, zones: zones.as_ref(), ground_from_world };
+    let (zones, radar) = (zones.as_ref(), args.radar);
+    let looking = Looking { capture: &name, source: &source, views: &views, zones, radar, ground_from_world };
     let progress = output.progress("tracks", looking.steps() as u64);
     let found = looking.objects(&|done, _| progress.at(done as u64, ""))?;
     drop(progress);

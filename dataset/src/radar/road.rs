@@ -58,8 +58,19 @@ pub struct RoadStrip {
     views: Vec<u32>,
     /// Places on the road, world metres, and whether they are initial points.
     places: Vec<(DVec3, bool)>,
-    /// Directions in the world in which something moved, and its range.
-    moving: Vec<(DVec3, f64)>,
+    /// What moved.
+    moving: Vec<MovingEcho>,
+}
+
+/// A detection of something that moved.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct MovingEcho {
+    /// Its direction in the world, of unit length.
+    pub(crate) towards: DVec3,
+    /// Metres.
+    pub(crate) range: f64,
+    /// Its velocity over ground in that direction, metres per second.
+    pub(crate) speed: f64,
 }
 
 /// The detections of each sweep.
@@ -94,10 +105,13 @@ pub(crate) fn strips(sweeps: Vec<RadarSweep>, points: &SparsePoints) -> Result<V
         let pose = &sweep.world_from_sensor;
         let own = pose.rotation.inverse() * sweep.velocity;
         let towards = |of: &Detection| DVec3::new(of.azimuth.cos(), of.azimuth.sin(), 0.0);
+        let speed = |of: &Detection| of.velocity + own.dot(towards(of));
         let (still, moves): (Vec<&Detection>, Vec<&Detection>) =
-            found.iter().partition(|of| (of.velocity + own.dot(towards(of))).abs() < STANDING_SPEED);
+            found.iter().partition(|of| speed(of).abs() < STANDING_SPEED);
         standing.push(still.iter().map(|of| (pose.apply(of.range * towards(of)), of.range)).collect());
-        moving.push(moves.iter().map(|of| (pose.rotation * towards(of), of.range)).collect::<Vec<_>>());
+        let moved =
+            |of: &&Detection| MovingEcho { towards: pose.rotation * towards(of), range: of.range, speed: speed(of) };
+        moving.push(moves.iter().map(moved).collect::<Vec<_>>());
     }
     let obstacles = Obstacles::new(&standing, &sweeps);
     let triangulated: HashSet<I64Vec3> = points.positions.iter().map(|place| cube(*place)).collect();
@@ -119,6 +133,11 @@ impl RoadStrip {
         self.origin
     }
 
+    /// What moved at the time of the sweep.
+    pub(crate) fn moving(&self) -> &[MovingEcho] {
+        &self.moving
+    }
+
     /// Whether there is any road.
     pub(crate) fn is_empty(&self) -> bool {
         self.places.is_empty()
@@ -133,9 +152,8 @@ impl RoadStrip {
     pub(crate) fn hides(&self, place: DVec3) -> bool {
         let from = place - self.origin;
         let range = from.length();
-        let is_behind = |(direction, moving): &(DVec3, f64)| {
-            range > moving - MARGIN_METRES && from.dot(*direction) > range * SHADOW_RADIANS.cos()
-        };
+        let is_behind =
+            |of: &MovingEcho| range > of.range - MARGIN_METRES && from.dot(of.towards) > range * SHADOW_RADIANS.cos();
         self.moving.iter().any(is_behind)
     }
 }

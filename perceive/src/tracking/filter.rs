@@ -24,6 +24,17 @@ const MAX_TURN: f64 = 1.5;
 /// 1σ of heading (radians), speed (m/s) and turn rate (rad/s) of an object that was seen twice.
 const FIRST: [f64; 3] = [0.5, 3.0, 0.3];
 
+/// How fast an object went away from a sensor that saw it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Radial {
+    /// Direction from the sensor, of unit length.
+    pub(crate) away: DVec2,
+    /// Over ground, metres per second; negative towards the sensor.
+    pub(crate) speed: f64,
+    /// 1σ of that.
+    pub(crate) sigma: f64,
+}
+
 /// Where an object was seen.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Place {
@@ -31,12 +42,14 @@ pub(crate) struct Place {
     pub(crate) middle: DVec2,
     /// Variances and covariance: xx, xy, yy, m².
     pub(crate) covariance: [f64; 3],
+    /// Its velocity, if the sensor measures that.
+    pub(crate) radial: Option<Radial>,
 }
 
 impl Place {
     /// As sure in all directions: 1σ in metres.
     pub(crate) fn around(middle: DVec2, sigma: f64) -> Self {
-        Self { middle, covariance: [sigma * sigma, 0.0, sigma * sigma] }
+        Self { middle, covariance: [sigma * sigma, 0.0, sigma * sigma], radial: None }
     }
 
     /// 1σ along a direction of unit length, and across it, metres.
@@ -47,7 +60,7 @@ impl Place {
             (a - b) * ahead.x * ahead.y,
             a * ahead.y * ahead.y + b * ahead.x * ahead.x,
         ];
-        Self { middle, covariance }
+        Self { middle, covariance, radial: None }
     }
 
     /// The sum of the variances along both axes, m².
@@ -135,7 +148,22 @@ impl Belief {
 
     /// Squared distance of a place, in units of the standard deviation; infinite if that is unknown.
     pub(crate) fn distance(&self, place: &Place) -> f64 {
-        self.innovation(place).map_or(f64::INFINITY, |(off, inverse)| (off.transpose() * inverse * off)[0])
+        let along = self.innovation(place).map_or(f64::INFINITY, |(off, inverse)| (off.transpose() * inverse * off)[0]);
+        let radial = place.radial.map_or(0.0, |radial| {
+            let (off, _, variance) = self.radial(&radial);
+            off * off / variance
+        });
+        along + radial
+    }
+
+    /// The difference of a radial velocity from the believed one, its derivative by the state times the covariance, and the variance of
+    /// that difference.
+    fn radial(&self, seen: &Radial) -> (f64, State, f64) {
+        let (sin, cos) = self.mean[2].sin_cos();
+        let (along, across) = (seen.away.x * cos + seen.away.y * sin, seen.away.y * cos - seen.away.x * sin);
+        let derivative = State::new(0.0, 0.0, self.mean[3] * across, along, 0.0);
+        let shared = self.covariance * derivative;
+        (seen.speed - self.mean[3] * along, shared, derivative.dot(&shared) + seen.sigma * seen.sigma)
     }
 
     /// After it was seen at a place.
@@ -145,7 +173,16 @@ impl Belief {
         let mut mean = self.mean + gain * off;
         mean[4] = mean[4].clamp(-MAX_TURN, MAX_TURN);
         let covariance = self.covariance - gain * self.covariance.fixed_rows::<2>(0);
-        Self { mean, covariance: 0.5 * (covariance + covariance.transpose()) }
+        let placed = Self { mean, covariance: 0.5 * (covariance + covariance.transpose()) };
+        place.radial.map_or(placed.clone(), |radial| placed.going(&radial))
+    }
+
+    /// After its radial velocity was measured.
+    fn going(&self, seen: &Radial) -> Self {
+        let (off, shared, variance) = self.radial(seen);
+        let mut mean = self.mean + shared * (off / variance);
+        mean[4] = mean[4].clamp(-MAX_TURN, MAX_TURN);
+        Self { mean, covariance: self.covariance - shared * shared.transpose() / variance }
     }
 }
 
@@ -259,6 +296,31 @@ mod tests {
         let smooth = smooth.iter().zip(&seen).filter(|(_, seen)| seen.1.is_some());
         let after = mean(smooth.map(|(motion, (at, _))| motion.middle.distance(on_circle(*at))).collect());
         assert!(after < 0.7 * mean(raw.collect()), "smoothing takes noise away");
+    }
+
+    #[test]
+    fn a_radial_velocity_makes_speed_and_heading_surer() {
+        // Seen twice at nearly the same place: nothing is known of the velocity but what the radar says.
+        let at = |x: f64| Place::along(DVec2::new(x, 0.0), DVec2::X, [0.8, 0.4]);
+        let towards = |x: f64| Place { radial: Some(Radial { away: DVec2::X, speed: -9.0, sigma: 0.3 }), ..at(x) };
+        let belief = Belief::between(&at(20.0), &at(19.4), 0.1).predicted(0.1);
+        let blind = belief.updated(&at(19.4));
+        let radar = belief.updated(&towards(19.4));
+        let off = |of: &Belief| (of.velocity() - DVec2::new(-9.0, 0.0)).length();
+        assert!(off(&radar) < 1.0 && off(&radar) < 0.5 * off(&blind), "{} {}", off(&radar), off(&blind));
+        // What goes the other way at the same place is another object.
+        let away = Place { radial: Some(Radial { away: DVec2::X, speed: 9.0, sigma: 0.3 }), ..at(18.5) };
+        assert!(radar.predicted(0.1).distance(&towards(18.5)) < 12.0 && radar.predicted(0.1).distance(&away) > 12.0);
+        // The derivative agrees with finite differences.
+        let belief = Belief { mean: State::new(3.0, -2.0, 0.7, 8.0, 0.2), covariance: Covariance::identity() };
+        let seen = Radial { away: DVec2::from_angle(2.1), speed: 1.5, sigma: 0.3 };
+        let (off, shared, _) = belief.radial(&seen);
+        for k in 0..5 {
+            let mut moved = belief.clone();
+            moved.mean[k] += 1e-5;
+            let numeric = (off - moved.radial(&seen).0) / 1e-5;
+            assert!((numeric - shared[k]).abs() < 1e-3, "{k}: {numeric} {}", shared[k]);
+        }
     }
 
     #[test]

@@ -108,7 +108,8 @@ pub(crate) fn place(sighting: &Sighting, heading: f64, size: DVec3) -> Place {
         }
     };
     let ((x, x_sigma), (y, y_sigma)) = (along(0), along(1));
-    Place::along(x * ahead + y * ahead.perp(), ahead, [x_sigma, y_sigma])
+    let laid = Place::along(x * ahead + y * ahead.perp(), ahead, [x_sigma, y_sigma]);
+    Place { radial: sighting.place.radial, ..laid }
 }
 
 #[cfg(test)]
@@ -129,7 +130,7 @@ mod tests {
                 }
             }
         }
-        let place = Place { middle, covariance: [0.5, 0.0, 0.5] };
+        let place = Place { middle, covariance: [0.5, 0.0, 0.5], radial: None };
         Sighting { place, points, sensor: DVec2::ZERO, ground: 0.0, moves: true, kind: None }
     }
 
