@@ -335,7 +335,7 @@ mod tests {
         // Too few, too few of all, too few for their way, and not a step; and what is no person.
         assert_eq!(Walk::of((0..20).map(taken), |_| true, &person), None);
         assert_eq!(Walk::of((0..30).map(taken), |view| view < 20, &person), None);
-        assert_eq!(Walk::of((0..30).map(|view| (view, 0.4 * f64::from(view))), |_| true, &person), None);
+        assert_eq!(Walk::of((0..24).map(|view| (view, 0.4 * f64::from(view))), |_| true, &person), None);
         assert_eq!(Walk::of((0..30).map(|view| (view, 3.0)), |_| true, &person), None);
         for height in [0.01, 150.0] {
             let other = MovingObject { high: person.high.with_z(height), ..person.clone() };
