@@ -35,8 +35,7 @@ use std::borrow::Cow;
 use std::path::{Path, PathBuf};
 
 use blocks::{Ground, Split};
-use scene::swing::Way;
-use scene::{BadInput, Capture, Exposures, GeoOrigin, MovingObject, Poses, Rigid, Splats, Swing, ply, spz};
+use scene::{BadInput, Capture, Exposures, GeoOrigin, MovingObject, Poses, Rigid, Splats, Swing, Way, ply, spz};
 
 pub use error::ModelError;
 pub use export::Exported;

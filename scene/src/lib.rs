@@ -38,6 +38,7 @@ pub mod splats;
 pub mod spz;
 pub mod swing;
 pub mod transforms;
+pub mod way;
 pub mod waymo;
 pub mod zones;
 
@@ -52,4 +53,5 @@ pub use poses::Poses;
 pub use similarity::Similarity;
 pub use splats::{Attribute, BLOCK_ATTRIBUTE, SH_C0, Splat, Splats, column};
 pub use swing::Swing;
+pub use way::Way;
 pub use zones::{MaskBuilder, Zone, ZoneMask, Zones};

@@ -9,8 +9,8 @@ use std::f64::consts::TAU;
 use std::ops::Range;
 
 use render::Gradients;
-use scene::swing::{HARMONICS, NUMBERS, TERMS, Way, displace, terms};
-use scene::{MovingObject, Splats, Swing, column};
+use scene::swing::{HARMONICS, NUMBERS, TERMS, displace, terms};
+use scene::{MovingObject, Splats, Swing, Way, column};
 
 /// Strides that are looked at, relative to the height of the person. Adults take 0.8 to 0.9 of their height at the speed that they
 /// choose (Murray, Drought and Kory 1964), less when they stroll, more when they hurry.
