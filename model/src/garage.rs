@@ -231,11 +231,18 @@ mod tests {
         assert!(garage.vehicles().is_empty() && garage.get("a").is_err());
         let mut splats = Splats::new(0);
         splats.push(&Splat::round(Vec3::ZERO, -2.0, Vec3::splat(0.5), 0.7));
+        // A vehicle that swings, whose addition was cut short: one of its name does not swing by it.
+        std::fs::create_dir_all(&at).unwrap();
+        let swing = Swing { stride_metres: 1.4, amplitudes: vec![[0.1; scene::swing::NUMBERS]] };
+        save_swing(&at, "van", Some(&swing)).unwrap();
         for name in ["van", "car"] {
             garage.add(car(name), &splats, None).unwrap();
         }
+        assert_eq!(garage.get("van").unwrap().2, None);
+        garage.add(car("walker"), &splats, Some(&swing)).unwrap();
+        assert_eq!(garage.get("walker").unwrap().2, Some(swing));
         let names = |garage: &Garage| garage.vehicles().iter().map(|of| of.name.clone()).collect::<Vec<_>>();
-        assert_eq!(names(&garage), ["car", "van"]);
+        assert_eq!(names(&garage), ["car", "van", "walker"]);
         let garage = Garage::open(&at).unwrap();
         assert_eq!((names(&garage), garage.get("car").unwrap().0.splats), (names(&garage), 1));
         assert!(garage.get("van").unwrap().1 == splats);

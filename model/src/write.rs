@@ -185,9 +185,15 @@ pub(crate) fn save_objects(out: &Path, objects: &[ModelObject], antialiased: boo
     Ok(())
 }
 
-/// Writes how the splats of an object swing, if they do.
+/// Writes how the splats of an object swing, if they do; if not, removes what a run that was cut short left of another object of its name.
 pub(crate) fn save_swing(folder: &Path, id: &str, swing: Option<&Swing>) -> Result<(), ModelError> {
-    swing.map_or(Ok(()), |swing| Ok(save(&folder.join(swing_file(id)), &swing.to_frame())?))
+    let path = folder.join(swing_file(id));
+    match swing {
+        Some(swing) => save(&path, &swing.to_frame())?,
+        None if path.exists() => fs::remove_file(&path).map_err(cannot("replaced", &path))?,
+        None => {}
+    }
+    Ok(())
 }
 
 /// What was found of each sensor, as people read it.
