@@ -27,9 +27,9 @@ fn the_traffic_of_a_street_is_found_where_it_is() {
     assert_eq!(file["seconds"].as_object().unwrap().len(), 150);
     assert!(fs::read_to_string(at.join("found/map.svg")).unwrap().matches("<polyline").count() >= 2);
 
-    // The radar alone finds some of them, near to where they are, and helps the lidar.
+    // The radar alone finds some of them, near to where they are, and the lidar does without it.
     let by = |more: &[&str]| {
-        let track = ["objects", "track", "city", "--out", "radar.json", "--against", "city/tracks.json", "--radar"];
+        let track = ["objects", "track", "city", "--out", "one.json", "--against", "city/tracks.json"];
         let said = done(at, &[&track[..], more].concat());
         println!("{said}");
         let of = |key: &str| said["against"]["vehicles"][key].as_f64().unwrap();
@@ -37,7 +37,7 @@ fn the_traffic_of_a_street_is_found_where_it_is() {
     };
     let [found, off, _] = by(&["--no-lidar"]);
     assert!(found >= 2.0 && off <= 1.5, "{found} {off}");
-    let [_, off, mota] = by(&[]);
+    let [_, off, mota] = by(&["--no-radar"]);
     assert!(mota >= 0.8 && off <= 0.3, "{mota} {off}");
 
     // The same again, by one thread; and what is found is what a capture may have beside it.
@@ -52,13 +52,8 @@ fn the_traffic_of_a_street_is_found_where_it_is() {
     assert!(said["objects"].as_u64().unwrap() >= 1 && said["sweeps"] == 0, "{said}");
 
     let none = ["objects", "track", "city", "--out", "none.json"];
-    refused(
-        at,
-        &[&none[..], &["--no-lidar"]].concat(),
-        "has no sweeps of a lidar, and nobody looks at its photos; give --detector",
-    );
-    fs::remove_dir_all(at.join("city/radar")).unwrap();
-    refused(at, &[&none[..], &["--radar"]].concat(), "has no sweeps of a radar; omit --radar");
+    let blind = [&none[..], &["--no-lidar", "--no-radar"]].concat();
+    refused(at, &blind, "has no sweeps that are used, and nobody looks at its photos; give --detector");
     fs::write(at.join("bad.json"), "{\"tracks\": 3}").unwrap();
     refused(at, &[&none[..], &["--against", "bad.json"]].concat(), "bad.json");
     fs::remove_file(at.join("city/tracks.json")).unwrap();

@@ -2,8 +2,8 @@
 //!
 //! Sweeps are read in the order of time, twice: once for the heights of the ground, and once for what moves, each beside those of other
 //! times from near places. A window of sweeps is in memory, so a capture may have any number of them. A radar adds what moves by its
-//! velocity. Without sweeps, objects on photos
-//! are where they touch the ground, which lies where the lowest points of the capture are.
+//! velocity. Without sweeps of a lidar, objects on photos are where they touch the ground, which lies where the lowest points of the
+//! capture are.
 
 use std::collections::{BTreeSet, VecDeque};
 
@@ -11,7 +11,7 @@ use glam::{DQuat, DVec3};
 use perceive::echoes::{Echo, add_echoes};
 use perceive::moving_points::{GroundHeights, JudgedScan, RangeImage, Scan};
 use perceive::seen_boxes::{SeenBox, add_boxes};
-use perceive::tracking::{Kind, Moment, Sighting, Track, tracks};
+use perceive::tracking::{Kind, Moment, Sighting, Track, Watch, tracks};
 use rayon::prelude::*;
 use scene::{BadInput, Camera, MovingObject, PathPose, Rigid, View, Zones};
 
@@ -45,8 +45,6 @@ pub struct Looking<'a> {
     pub views: &'a [View],
     /// Objects on the photos.
     pub zones: Option<&'a Zones>,
-    /// Whether its radar is used.
-    pub radar: bool,
     /// Turns up to z.
     pub ground_from_world: DQuat,
 }
@@ -65,16 +63,13 @@ impl Looking<'_> {
     /// The objects that move, with their paths in the capture's world. `progress` is called with (steps done, steps in total).
     ///
     /// # Errors
-    /// A capture with neither sweeps nor zones, one that does not tell when they were taken, or a sweep that cannot be read.
+    /// A capture with neither sweeps nor zones, or one that does not tell when they were taken, or a sweep that cannot be read.
     pub fn objects(&self, progress: &dyn Fn(usize, usize)) -> Result<Vec<MovingObject>, BadInput> {
         let bad = |problem: &str, advice: &str| BadInput::new(self.capture, problem, advice);
         let sweeps = &self.source.sweeps;
-        if self.radar && self.source.road.is_empty() {
-            return Err(bad("has no sweeps of a radar", "omit --radar"));
-        }
-        if sweeps.is_empty() && !self.radar && self.zones.is_none() {
-            let advice = "give --detector or --zones, or a capture with a lidar, or --radar with one that has a radar";
-            return Err(bad("has no sweeps of a lidar, and nobody looks at its photos", advice));
+        if sweeps.is_empty() && self.source.road.is_empty() && self.zones.is_none() {
+            let advice = "give --detector or --zones, or a capture with a lidar or a radar";
+            return Err(bad("has no sweeps that are used, and nobody looks at its photos", advice));
         }
         let instants = self.instants();
         if instants.is_empty() {
@@ -102,11 +97,13 @@ impl Looking<'_> {
             };
             let found: Vec<_> = (from..to).into_par_iter().map(seen).collect();
             for (instant, sightings) in instants[from..to].iter().zip(found) {
+                let watches: Vec<Watch> = instant.radar.iter().map(|strip| self.watch(strip)).collect();
                 match moments.last_mut() {
                     Some(moment) if instant.seconds - moment.seconds <= SAME_SECONDS => {
-                        moment.sightings.extend(sightings)
+                        moment.sightings.extend(sightings);
+                        moment.watches.extend(watches);
                     }
-                    _ => moments.push(Moment { seconds: instant.seconds, sightings }),
+                    _ => moments.push(Moment { seconds: instant.seconds, sightings, watches }),
                 }
             }
             let keep_from = to.saturating_sub(WINDOW).max(first);
@@ -155,7 +152,7 @@ impl Looking<'_> {
         }
         instants.sort_by(|a, b| a.seconds.total_cmp(&b.seconds));
         let mut of_radar = Vec::new();
-        for strip in self.source.road.iter().filter(|strip| self.radar && !strip.moving().is_empty()) {
+        for strip in &self.source.road {
             let mut times: Vec<f64> =
                 strip.views().iter().filter_map(|&view| views.get(view as usize)?.seconds).collect();
             times.sort_by(f64::total_cmp);
@@ -163,6 +160,7 @@ impl Looking<'_> {
             let near = instants.partition_point(|instant| instant.seconds < seconds - SAME_SECONDS);
             match instants.get_mut(near).filter(|instant| instant.seconds <= seconds + SAME_SECONDS) {
                 Some(instant) => instant.radar.push(strip),
+                None if strip.moving().is_empty() => {}
                 None => of_radar.push(Instant { seconds, sweep: None, radar: vec![strip], views: Vec::new() }),
             }
         }
@@ -230,6 +228,13 @@ impl Looking<'_> {
             add_boxes(&mut seen, &photos, judged.as_ref(), ground);
         }
         seen
+    }
+
+    /// What a radar watched, in ground axes.
+    fn watch(&self, strip: &RoadStrip) -> Watch {
+        let ahead = (self.ground_from_world * strip.ahead()).truncate().normalize_or_zero();
+        let sensor = (self.ground_from_world * strip.origin()).truncate();
+        Watch { sensor, ahead, half_angle: strip.half_angle() }
     }
 
     /// A detection in ground axes.

@@ -58,7 +58,9 @@ pub fn add_boxes(
     let clusters = seen.len();
     for (camera, boxes) in photos {
         for of in *boxes {
-            let shown = seen[..clusters].iter_mut().map(|sighting| (overlap(camera, of, sighting), sighting));
+            let may_be = |sighting: &&mut Sighting| sighting.may_be(of.kind);
+            let shown =
+                seen[..clusters].iter_mut().filter(may_be).map(|sighting| (overlap(camera, of, sighting), sighting));
             if let Some((_, shown)) =
                 shown.filter(|(share, _)| *share >= LEAST_OVERLAP).max_by(|a, b| a.0.total_cmp(&b.0))
             {
@@ -67,12 +69,14 @@ pub fn add_boxes(
             }
             let new = sighting(camera, of, scan, ground);
             if let Some(echoes) = of_radar(camera, of, &mut seen[..clusters], new.as_ref()) {
-                echoes.kind = echoes.kind.max(Some(of.kind));
+                // Someone who walks past parked cars is in their boxes too.
+                let is_other = echoes.kind.is_some_and(|kind| kind.is_narrow() != of.kind.is_narrow());
+                echoes.kind = if is_other { echoes.kind.min(Some(of.kind)) } else { echoes.kind.max(Some(of.kind)) };
                 continue;
             }
             let Some(new) = new else { continue };
             let is_near = |cluster: &&mut Sighting| cluster.middle().distance(new.middle()) <= CLUSTER_METRES;
-            if let Some(cluster) = seen[..clusters].iter_mut().find(is_near) {
+            if let Some(cluster) = seen[..clusters].iter_mut().filter(may_be).find(is_near) {
                 cluster.kind = cluster.kind.max(Some(of.kind));
                 continue;
             }
@@ -102,6 +106,7 @@ fn of_radar<'a>(
     let is_there = |echoes: &Sighting| {
         let near = on_photo.map_or(f64::INFINITY, |photo| RADAR_METRES + 2.0 * photo.place.variance().sqrt());
         echoes.place.radial.is_some()
+            && echoes.may_be(of.kind)
             && is_inside(camera, of, echoes.middle().extend(echoes.ground + RADAR_HEIGHT))
             && echoes.middle().distance(from) <= near
     };
@@ -215,6 +220,7 @@ mod tests {
 
     use super::*;
     use crate::moving_points::{RangeImage, Scan};
+    use crate::tracking::Radial;
 
     /// 1.6 m above the ground, looking along x.
     fn camera() -> Camera {
@@ -258,6 +264,29 @@ mod tests {
         let mut twice = Vec::new();
         add_boxes(&mut twice, &[(camera(), &[person]), (camera(), &[person])], None, &ground);
         assert_eq!(twice.len(), 1);
+    }
+
+    #[test]
+    fn who_walks_past_a_parked_car_is_no_car() {
+        let ground = flat();
+        let (parked, person) = ([2.6, 1.6], [0.6, 1.7]);
+        let boxes = [
+            box_at(DVec2::new(12.0, 3.0), Kind::Person, person),
+            box_at(DVec2::new(12.5, 3.2), Kind::Car, parked),
+            box_at(DVec2::new(12.5, 3.2), Kind::Truck, parked),
+        ];
+        let kind = |speed: f64, boxes: &[SeenBox]| {
+            let (middle, away) = (DVec2::new(12.2, 3.0), DVec2::X);
+            let radial = Some(Radial { away, speed, sigma: 0.3 });
+            let place = Place { radial, ..Place::along(middle, away, [0.8, 0.4]) };
+            let mut seen =
+                vec![Sighting { place, points: Vec::new(), sensor: DVec2::ZERO, ground: 0.0, moves: true, kind: None }];
+            add_boxes(&mut seen, &[(camera(), boxes)], None, &ground);
+            seen[0].kind
+        };
+        let reversed: Vec<SeenBox> = boxes.iter().rev().copied().collect();
+        assert_eq!([kind(-1.2, &boxes), kind(-1.2, &reversed)], [Some(Kind::Person); 2]);
+        assert_eq!(kind(-8.0, &boxes), Some(Kind::Truck), "nobody walks as fast");
     }
 
     #[test]

@@ -46,9 +46,9 @@ pub(crate) struct TrackArgs {
     /// Leave out the lidar: objects on photos are where they touch the ground
     #[arg(long)]
     pub(crate) no_lidar: bool,
-    /// Also use the radar: what moves by its velocity, and how fast tracks go
+    /// Leave out the radar: what moves by its velocity, how fast tracks go, and what photos show that does not move
     #[arg(long)]
-    pub(crate) radar: bool,
+    pub(crate) no_radar: bool,
     /// Also measure the paths against the true ones in this tracks.json
     #[arg(long, value_name = "FILE")]
     pub(crate) against: Option<PathBuf>,

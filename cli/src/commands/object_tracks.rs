@@ -31,13 +31,14 @@ struct Tracked<'a> {
     /// Poses of all objects.
     poses: usize,
     sweeps: usize,
+    radar_sweeps: usize,
     #[serde(skip_serializing_if = "Option::is_none")]
     against: Option<TrackFigures>,
 }
 
 pub(crate) fn run(args: &TrackArgs, output: &Output) -> Result<(), Failure> {
     let truth = args.against.as_deref().map(|path| read(path, objects::read)).transpose()?;
-    let options = OpenOptions { lidar: !args.no_lidar, radar: args.radar, ..OpenOptions::default() };
+    let options = OpenOptions { lidar: !args.no_lidar, radar: !args.no_radar, ..OpenOptions::default() };
     let mut source = open_with(&args.capture, &options, output)?;
     // Masks hide what is looked for.
     source.unmask();
@@ -53,8 +54,8 @@ pub(crate) fn run(args: &TrackArgs, output: &Output) -> Result<(), Failure> {
         views = capture.views;
     }
     let name = args.capture.display().to_string();
-    let (zones, radar) = (zones.as_ref(), args.radar);
-    let looking = Looking { capture: &name, source: &source, views: &views, zones, radar, ground_from_world };
+    let zones = zones.as_ref();
+    let looking = Looking { capture: &name, source: &source, views: &views, zones, ground_from_world };
     let progress = output.progress("tracks", looking.steps() as u64);
     let found = looking.objects(&|done, _| progress.at(done as u64, ""))?;
     drop(progress);
@@ -72,6 +73,7 @@ pub(crate) fn run(args: &TrackArgs, output: &Output) -> Result<(), Failure> {
         classes,
         poses: found.iter().map(|object| object.path.len()).sum(),
         sweeps: source.sweeps.len(),
+        radar_sweeps: source.road.len(),
         against,
     };
     let text = summary(&said, &found);
@@ -86,11 +88,19 @@ pub(crate) fn run(args: &TrackArgs, output: &Output) -> Result<(), Failure> {
     output.result(&said, &text)
 }
 
+fn swept(said: &Tracked) -> String {
+    match (said.sweeps, said.radar_sweeps) {
+        (0, 0) => "photos alone".to_owned(),
+        (0, radar) => format!("{radar} sweeps of a radar"),
+        (lidar, 0) => format!("{lidar} sweeps of a lidar"),
+        (lidar, radar) => format!("{lidar} sweeps of a lidar and {radar} of a radar"),
+    }
+}
+
 fn summary(said: &Tracked, found: &[MovingObject]) -> String {
     let classes: Vec<String> = said.classes.iter().map(|(class, count)| format!("{count} {class}")).collect();
     let classes = if found.is_empty() { String::new() } else { format!(" ({})", classes.join(", ")) };
-    let mut text =
-        format!("{} objects that move{classes} in {} sweeps, {} poses", said.objects, said.sweeps, said.poses);
+    let mut text = format!("{} objects that move{classes} in {}, {} poses", said.objects, swept(said), said.poses);
     if let Some(TrackFigures { times, all, vehicles }) = &said.against {
         for (what, of) in [("all", all), ("vehicles", vehicles)] {
             let number = |value: Option<f64>| value.map_or("-".to_owned(), |value| format!("{value:.2}"));

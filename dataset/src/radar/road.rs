@@ -60,6 +60,9 @@ pub struct RoadStrip {
     places: Vec<(DVec3, bool)>,
     /// What moved.
     moving: Vec<MovingEcho>,
+    /// The middle of the sector that was watched, in the world, of unit length, and how far it reaches to each side, radians.
+    ahead: DVec3,
+    half_angle: f64,
 }
 
 /// A detection of something that moved.
@@ -118,11 +121,16 @@ pub(crate) fn strips(sweeps: Vec<RadarSweep>, points: &SparsePoints) -> Result<V
     let road = |pair: &[RadarSweep]| road(&pair[0], &pair[1], &obstacles, &triangulated);
     let places: Vec<_> = sweeps.par_windows(2).map(road).collect();
     let places = places.into_iter().chain([Vec::new()]);
+    let azimuths = || read.iter().flatten().map(|of| of.azimuth);
+    // What all sweeps together reach on both sides.
+    let half_angle = azimuths().fold(0.0, f64::max).min(-azimuths().fold(0.0, f64::min));
     let strip = |((sweep, places), moving): ((RadarSweep, Vec<(DVec3, bool)>), _)| RoadStrip {
         origin: sweep.world_from_sensor.translation,
         views: sweep.views,
         places,
         moving,
+        ahead: sweep.world_from_sensor.rotation * DVec3::X,
+        half_angle,
     };
     Ok(sweeps.into_iter().zip(places).zip(moving).map(strip).collect())
 }
@@ -136,6 +144,16 @@ impl RoadStrip {
     /// What moved at the time of the sweep.
     pub(crate) fn moving(&self) -> &[MovingEcho] {
         &self.moving
+    }
+
+    /// The middle direction of the sector that was watched, in the world, of unit length.
+    pub(crate) fn ahead(&self) -> DVec3 {
+        self.ahead
+    }
+
+    /// How far that sector reaches to each side, radians.
+    pub(crate) fn half_angle(&self) -> f64 {
+        self.half_angle
     }
 
     /// Whether there is any road.

@@ -93,8 +93,8 @@ impl Belief {
         Self { mean, covariance }
     }
 
-    #[cfg(test)]
-    fn middle(&self) -> DVec2 {
+    /// Ground metres.
+    pub(crate) fn middle(&self) -> DVec2 {
         DVec2::new(self.mean[0], self.mean[1])
     }
 
@@ -154,6 +154,14 @@ impl Belief {
             off * off / variance
         });
         along + radial
+    }
+
+    /// How unlikely an object of this belief is to be seen at a place: twice the negative logarithm of its density, but for what is the same
+    /// for all places. Unlike the distance, it does not favour beliefs of which little is known.
+    pub(crate) fn surprise(&self, place: &Place) -> f64 {
+        let spread = self.innovation(place).map_or(f64::INFINITY, |(_, inverse)| -inverse.determinant().ln());
+        let radial = place.radial.map_or(0.0, |radial| self.radial(&radial).2.ln());
+        self.distance(place) + spread + radial
     }
 
     /// The difference of a radial velocity from the believed one, its derivative by the state times the covariance, and the variance of

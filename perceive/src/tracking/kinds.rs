@@ -77,6 +77,11 @@ impl Kind {
     }
 }
 
+/// Whether two sightings may be of one object: a van may be taken for a lorry, but not for a person.
+pub(crate) fn may_be_same(a: Option<Kind>, b: Option<Kind>) -> bool {
+    a.zip(b).is_none_or(|(a, b)| a.is_narrow() == b.is_narrow())
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

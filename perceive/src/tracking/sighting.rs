@@ -22,6 +22,11 @@ pub struct Sighting {
 }
 
 impl Sighting {
+    /// Whether it goes no faster than such objects do.
+    pub(crate) fn may_be(&self, kind: Kind) -> bool {
+        self.place.radial.is_none_or(|radial| radial.speed.abs() <= kind.max_speed())
+    }
+
     /// The middle of what was seen, metres.
     pub fn middle(&self) -> DVec2 {
         self.place.middle
