@@ -369,6 +369,19 @@ mod tests {
     }
 
     #[test]
+    fn the_sector_is_what_sweeps_reach_on_both_sides() {
+        let folder = tempfile::tempdir().unwrap();
+        let both = |from: DVec3| {
+            let at = |azimuth: f64| row(from, from + DVec3::new(azimuth.cos(), azimuth.sin(), 0.0) * 9.0, 0.0);
+            at(0.5) + &at(-0.3)
+        };
+        let found = strips(drive(folder.path(), both), &SparsePoints::default()).unwrap();
+        assert!(found.iter().all(|strip| strip.ahead() == DVec3::X && (strip.half_angle() - 0.3).abs() < 1e-9));
+        let none = strips(drive(folder.path(), |_| String::new()), &SparsePoints::default()).unwrap();
+        assert!(none.iter().all(|strip| strip.half_angle() == 0.0), "nothing is known of it");
+    }
+
+    #[test]
     fn a_gap_in_a_drive_has_no_road() {
         let folder = tempfile::tempdir().unwrap();
         let mut sweeps = drive(folder.path(), |_| String::new());
