@@ -1,8 +1,10 @@
 //! Poses of an object on the road from a path of its positions (EDeRF, section 3.3).
 //!
-//! Heading and pitch follow from where it goes. Height, roll and a better pitch follow from contact: lines through the four lower
+//! Heading and pitch follow from where it goes, pitch over a longer way. Height, roll and a better pitch follow from contact: lines through the four lower
 //! corners of its box meet the road in the splats of the static scene, and the box's lower side is laid on what they meet. Times that
 //! are missing are filled by Lagrange's polynomial through the positions next to them.
+
+use std::ops::Range;
 
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use render::surface::Surface;
@@ -13,6 +15,15 @@ const REACH_METRES: f64 = 1.0;
 /// Heading follows the velocity over a displacement of at least this length, metres, found within this many seconds on either side.
 const DISPLACEMENT_METRES: f64 = 3.0;
 const DISPLACEMENT_SECONDS: f64 = 2.0;
+/// From this many positions on it may turn in that time: the velocity is that of a parabola through them.
+const LEAST_TURNING: usize = 4;
+/// Pitch follows the heights of the positions over a way of the second length, metres, within this many seconds on either side: roads do
+/// not bend as soon as cars turn, and heights are measured worse than places. Over less than the first length it is not known.
+const PITCH_METRES: Range<f64> = 5.0..15.0;
+const PITCH_SECONDS: f64 = 5.0;
+/// A road under the corners whose slope differs from that pitch by more than this, or that tilts to a side by more, is none, radians.
+const OFF_PITCH: f64 = 0.12;
+const MAX_ROLL: f64 = 0.2;
 /// It stands still where it moves by less than this in that time, metres.
 const LEAST_METRES: f64 = 0.5;
 /// An object that seems to turn by more than this between two times has changed gear, radians.
@@ -63,7 +74,7 @@ pub fn road_poses(positions: &Positions, road: &Surface) -> RoadPoses {
     });
     let courses = courses(&places, first);
     let mut on_road = 0;
-    let pose = |(&(seconds, place), &(heading, pitch)): (&(f64, DVec3), &(f64, f64))| {
+    let pose = |(&(seconds, place), &(heading, pitch)): (&(f64, DVec3), &(f64, Option<f64>))| {
         let (rotation, translation, lies) = laid_down(place, heading, pitch, positions, road);
         on_road += usize::from(lies);
         let world_from_object = Rigid {
@@ -109,25 +120,25 @@ fn lagrange(through: &[(f64, DVec3)], at: f64) -> DVec3 {
     through.iter().enumerate().map(|(i, (_, place))| *place * basis(i)).sum()
 }
 
-/// Heading and pitch at each position, radians: those of the velocity around it, or of the nearest one that moves.
-fn courses(places: &[(f64, DVec3)], first: Option<f64>) -> Vec<(f64, f64)> {
+/// Heading and pitch at each position, radians: heading is that of the velocity around it, or of the nearest one that moves.
+fn courses(places: &[(f64, DVec3)], first: Option<f64>) -> Vec<(f64, Option<f64>)> {
     let around = |i: usize| {
         let (mut from, mut to) = (i, i);
         loop {
             let apart = (places[to].1 - places[from].1).truncate().length();
             if apart >= DISPLACEMENT_METRES {
-                return Some(direction(velocity(&places[from..=to])));
+                return Some(heading(turning(&places[from..=to], places[i].0)));
             }
             let is_near = |j: usize| (places[j].0 - places[i].0).abs() <= DISPLACEMENT_SECONDS;
             let earlier = from.checked_sub(1).filter(|&j| is_near(j));
             let later = Some(to + 1).filter(|&j| j < places.len() && is_near(j));
             if earlier.is_none() && later.is_none() {
-                return (apart >= LEAST_METRES).then(|| direction(velocity(&places[from..=to])));
+                return (apart >= LEAST_METRES).then(|| heading(velocity(&places[from..=to])));
             }
             (from, to) = (earlier.unwrap_or(from), later.unwrap_or(to));
         }
     };
-    let known: Vec<Option<(f64, f64)>> = (0..places.len()).map(around).collect();
+    let known: Vec<Option<f64>> = (0..places.len()).map(around).collect();
     let nearest = |i: usize| {
         let distance = |j: &usize| (places[*j].0 - places[i].0).abs();
         let with = (0..known.len()).filter(|&j| known[j].is_some());
@@ -136,9 +147,10 @@ fn courses(places: &[(f64, DVec3)], first: Option<f64>) -> Vec<(f64, f64)> {
     let mut before = first;
     let mut courses = Vec::new();
     for (i, found) in known.iter().enumerate() {
-        let (mut heading, mut pitch) = found.or_else(|| nearest(i)).unwrap_or((first.unwrap_or(0.0), 0.0));
+        let mut heading = found.or_else(|| nearest(i)).or(first).unwrap_or(0.0);
+        let mut pitch = pitch(places, i);
         if before.is_some_and(|before| turn(before, heading).abs() > REVERSED) {
-            (heading, pitch) = (turn(0.0, heading + std::f64::consts::PI), -pitch);
+            (heading, pitch) = (turn(0.0, heading + std::f64::consts::PI), pitch.map(|pitch| -pitch));
         }
         before = Some(heading);
         courses.push((heading, pitch));
@@ -155,9 +167,50 @@ fn velocity(places: &[(f64, DVec3)]) -> DVec3 {
     places.iter().map(|(seconds, place)| (seconds - middle) * (*place - centre)).sum()
 }
 
-/// Heading and pitch, radians.
-fn direction(along: DVec3) -> (f64, f64) {
-    (along.y.atan2(along.x), along.z.atan2(along.truncate().length()))
+/// The velocity at a time of the parabola that fits positions best: over a turn they are not as a line has it, least of all where a path
+/// begins and ends.
+fn turning(places: &[(f64, DVec3)], at: f64) -> DVec3 {
+    let (mut matrix, mut right) = (DMat3::ZERO, DMat3::ZERO);
+    for (seconds, place) in places {
+        let off = seconds - at;
+        let row = DVec3::new(1.0, off, off * off);
+        matrix += DMat3::from_cols(row * row.x, row * row.y, row * row.z);
+        let off = *place - places[0].1;
+        right += DMat3::from_cols(row * off.x, row * off.y, row * off.z);
+    }
+    let found = (matrix.inverse() * right).transpose().y_axis;
+    if places.len() >= LEAST_TURNING && found.is_finite() { found } else { velocity(places) }
+}
+
+fn heading(along: DVec3) -> f64 {
+    along.y.atan2(along.x)
+}
+
+/// The slope of the way around a position, radians; `None` if it is too short.
+fn pitch(places: &[(f64, DVec3)], i: usize) -> Option<f64> {
+    let metres = |pair: &[(f64, DVec3)]| pair[0].1.truncate().distance(pair[1].1.truncate());
+    let is_near = |j: usize| (places[j].0 - places[i].0).abs() <= PITCH_SECONDS;
+    let (mut from, mut to, mut way) = (i, i, 0.0);
+    while way < PITCH_METRES.end {
+        let earlier = from.checked_sub(1).filter(|&j| is_near(j));
+        let later = Some(to + 1).filter(|&j| j < places.len() && is_near(j));
+        if earlier.is_none() && later.is_none() {
+            break;
+        }
+        (from, to) = (earlier.unwrap_or(from), later.unwrap_or(to));
+        way = places[from..=to].windows(2).map(metres).sum();
+    }
+    // Heights by the way that was gone, as positions by time.
+    let mut gone = 0.0;
+    let mut heights = vec![(0.0, DVec3::Z * places[from].1.z)];
+    for pair in places[from..=to].windows(2) {
+        gone += metres(pair);
+        heights.push((gone, DVec3::Z * pair[1].1.z));
+    }
+    let count = heights.len() as f64;
+    let middle = heights.iter().map(|(gone, _)| gone).sum::<f64>() / count;
+    let spread = heights.iter().map(|(gone, _)| (gone - middle).powi(2)).sum::<f64>();
+    (way >= PITCH_METRES.start).then(|| (velocity(&heights).z / spread).atan())
 }
 
 /// From one heading to another, -π to π.
@@ -166,10 +219,10 @@ fn turn(from: f64, to: f64) -> f64 {
 }
 
 /// Rotation and origin of the object at a position, on the road, in ground axes; and whether three corners of it found one.
-fn laid_down(place: DVec3, heading: f64, pitch: f64, of: &Positions, road: &Surface) -> (DQuat, DVec3, bool) {
+fn laid_down(place: DVec3, heading: f64, pitch: Option<f64>, of: &Positions, road: &Surface) -> (DQuat, DVec3, bool) {
     let ahead = DVec2::from_angle(heading);
     // Slopes of the lower side ahead and to the left, and its height under the origin.
-    let (mut along, mut across) = (pitch.clamp(-MAX_TILT, MAX_TILT).tan(), 0.0);
+    let (mut along, mut across) = (pitch.unwrap_or(0.0).clamp(-MAX_TILT, MAX_TILT).tan(), 0.0);
     let (mut rotation, mut height, mut lies) = (tilted(ahead, along, across), place.z, false);
     for _ in 0..ROUNDS {
         let corners = [(of.low.x, of.low.y), (of.low.x, of.high.y), (of.high.x, of.low.y), (of.high.x, of.high.y)];
@@ -182,7 +235,10 @@ fn laid_down(place: DVec3, heading: f64, pitch: f64, of: &Positions, road: &Surf
             Some((DVec3::new(off.dot(ahead), off.dot(ahead.perp()), found), found - corner.z))
         });
         let met = without_the_odd_one(met.collect());
-        let plane = plane(&met).filter(|(_, x, y)| x.atan().abs() < MAX_TILT && y.atan().abs() < MAX_TILT);
+        let plane = plane(&met).filter(|(_, x, y)| {
+            let is_as_steep = pitch.is_none_or(|pitch| (x.atan() - pitch).abs() < OFF_PITCH);
+            is_as_steep && x.atan().abs() < MAX_TILT && y.atan().abs() < MAX_ROLL
+        });
         lies = plane.is_some();
         match plane {
             Some((base, x, y)) => {
@@ -283,6 +339,40 @@ mod tests {
                 let height = translation.z - (f64::from(slope) * translation.x + f64::from(crossfall) * translation.y);
                 let off = angle(rotation, truth);
                 assert!(off < if noise > 0.0 { 6.0 } else { 1.0 } && height.abs() < 0.05, "{off} degrees, {height} m");
+            }
+        }
+    }
+
+    #[test]
+    fn a_car_heads_where_it_turns_and_climbs_as_its_way_does() {
+        // A quarter of a circle of 6 m between straight ways, uphill; heights are off by up to half a metre, and no road is known.
+        let nowhere = Surface::new(&Splats::new(0), DQuat::IDENTITY, |_| true);
+        let (radius, slope) = (6.0, 0.08);
+        let arc = radius * std::f64::consts::FRAC_PI_2;
+        let at = |gone: f64| match gone - 20.0 {
+            on if on < 0.0 => (DVec2::new(on, 0.0), 0.0),
+            on if on < arc => {
+                let turned = on / radius;
+                (radius * DVec2::new(turned.sin(), 1.0 - turned.cos()), turned)
+            }
+            on => (DVec2::new(radius, radius + on - arc), std::f64::consts::FRAC_PI_2),
+        };
+        let of = |i: u32| 1.2 * f64::from(i);
+        let off = |i: u32, k: u32| f64::from(uniform(5, u64::from(3 * i + k))) - 0.5;
+        let place = |i: u32| {
+            let noise = 0.1 * DVec2::new(off(i, 0), off(i, 1));
+            (0.4 * f64::from(i), (at(of(i)).0 + noise).extend(slope * of(i) + off(i, 2)))
+        };
+        // Also from the middle of the turn on.
+        for from in [0, 19] {
+            let places: Vec<(f64, DVec3)> = (from..40).filter(|i| i % 7 != 3).map(place).collect();
+            let of_path = Positions { places: &places, low: LOW, high: HIGH, first: None };
+            for pose in road_poses(&of_path, &nowhere).path {
+                let ahead = pose.world_from_object.rotation * DVec3::X;
+                let (_, heading) = at(3.0 * pose.seconds);
+                let off = turn(heading, ahead.y.atan2(ahead.x)).to_degrees();
+                let pitch = (ahead.z.asin() - slope.atan()).to_degrees();
+                assert!(off.abs() < 12.0 && pitch.abs() < 5.0, "{from}, {}: {off} {pitch}", pose.seconds);
             }
         }
     }
