@@ -123,7 +123,7 @@ pub(crate) fn strips(sweeps: Vec<RadarSweep>, points: &SparsePoints) -> Result<V
     let places = places.into_iter().chain([Vec::new()]);
     let azimuths = || read.iter().flatten().map(|of| of.azimuth);
     // What all sweeps together reach on both sides.
-    let half_angle = azimuths().fold(0.0, f64::max).min(-azimuths().fold(0.0, f64::min));
+    let half_angle = azimuths().fold(0.0, f64::max).min(-azimuths().fold(0.0, f64::min)).min(std::f64::consts::PI);
     let strip = |((sweep, places), moving): ((RadarSweep, Vec<(DVec3, bool)>), _)| RoadStrip {
         origin: sweep.world_from_sensor.translation,
         views: sweep.views,
