@@ -1,8 +1,8 @@
 //! Poses of an object on the road from a path of its positions (EDeRF, section 3.3).
 //!
-//! Heading and pitch follow from where it goes, pitch over a longer way. Height, roll and a better pitch follow from contact: lines through the four lower
-//! corners of its box meet the road in the splats of the static scene, and the box's lower side is laid on what they meet. Times that
-//! are missing are filled by Lagrange's polynomial through the positions next to them.
+//! Heading and pitch follow from where it goes, pitch over a longer way. Height, roll and a better pitch follow from contact: lines
+//! through the four lower corners of its box meet the road in the splats of the static scene, and the box's lower side is laid on what
+//! they meet. Times that are missing are filled by Lagrange's polynomial through the positions next to them.
 
 use std::ops::Range;
 
@@ -145,17 +145,17 @@ fn courses(places: &[(f64, DVec3)], first: Option<f64>) -> Vec<(f64, Option<f64>
         with.min_by(|a, b| distance(a).total_cmp(&distance(b))).and_then(|j| known[j])
     };
     let mut before = first;
-    let mut courses = Vec::new();
+    let mut headings = Vec::new();
     for (i, found) in known.iter().enumerate() {
         let mut heading = found.or_else(|| nearest(i)).or(first).unwrap_or(0.0);
-        let mut pitch = pitch(places, i);
         if before.is_some_and(|before| turn(before, heading).abs() > REVERSED) {
-            (heading, pitch) = (turn(0.0, heading + std::f64::consts::PI), pitch.map(|pitch| -pitch));
+            heading = turn(0.0, heading + std::f64::consts::PI);
         }
         before = Some(heading);
-        courses.push((heading, pitch));
+        headings.push(heading);
     }
-    courses
+    let ways = ways(places, &headings);
+    headings.into_iter().enumerate().map(|(i, heading)| (heading, pitch(places, &ways, i))).collect()
 }
 
 /// The velocity that fits positions best: of errors of single positions, as those of satellites, less remains than in the displacement
@@ -186,31 +186,40 @@ fn heading(along: DVec3) -> f64 {
     along.y.atan2(along.x)
 }
 
+/// How far each position lies along the way, metres: steps along the heading, so that errors of many positions do not make it longer.
+fn ways(places: &[(f64, DVec3)], headings: &[f64]) -> Vec<f64> {
+    let steps = places
+        .windows(2)
+        .zip(headings)
+        .map(|(pair, &heading)| (pair[1].1 - pair[0].1).truncate().dot(DVec2::from_angle(heading)));
+    let mut way = 0.0;
+    std::iter::once(0.0)
+        .chain(steps.map(|step| {
+            way += step;
+            way
+        }))
+        .collect()
+}
+
 /// The slope of the way around a position, radians; `None` if it is too short.
-fn pitch(places: &[(f64, DVec3)], i: usize) -> Option<f64> {
-    let metres = |pair: &[(f64, DVec3)]| pair[0].1.truncate().distance(pair[1].1.truncate());
+fn pitch(places: &[(f64, DVec3)], ways: &[f64], i: usize) -> Option<f64> {
     let is_near = |j: usize| (places[j].0 - places[i].0).abs() <= PITCH_SECONDS;
-    let (mut from, mut to, mut way) = (i, i, 0.0);
-    while way < PITCH_METRES.end {
+    let (mut from, mut to) = (i, i);
+    while (ways[to] - ways[from]).abs() < PITCH_METRES.end {
         let earlier = from.checked_sub(1).filter(|&j| is_near(j));
         let later = Some(to + 1).filter(|&j| j < places.len() && is_near(j));
         if earlier.is_none() && later.is_none() {
             break;
         }
         (from, to) = (earlier.unwrap_or(from), later.unwrap_or(to));
-        way = places[from..=to].windows(2).map(metres).sum();
     }
-    // Heights by the way that was gone, as positions by time.
-    let mut gone = 0.0;
-    let mut heights = vec![(0.0, DVec3::Z * places[from].1.z)];
-    for pair in places[from..=to].windows(2) {
-        gone += metres(pair);
-        heights.push((gone, DVec3::Z * pair[1].1.z));
-    }
-    let count = heights.len() as f64;
-    let middle = heights.iter().map(|(gone, _)| gone).sum::<f64>() / count;
-    let spread = heights.iter().map(|(gone, _)| (gone - middle).powi(2)).sum::<f64>();
-    (way >= PITCH_METRES.start).then(|| (velocity(&heights).z / spread).atan())
+    let (ways, places) = (&ways[from..=to], &places[from..=to]);
+    let count = ways.len() as f64;
+    let middle = ways.iter().sum::<f64>() / count;
+    let height = places.iter().map(|(_, place)| place.z).sum::<f64>() / count;
+    let along: f64 = ways.iter().map(|way| (way - middle).powi(2)).sum();
+    let rise: f64 = ways.iter().zip(places).map(|(way, (_, place))| (way - middle) * (place.z - height)).sum();
+    ((ways[ways.len() - 1] - ways[0]).abs() >= PITCH_METRES.start).then(|| (rise / along).atan())
 }
 
 /// From one heading to another, -π to π.
@@ -374,6 +383,26 @@ mod tests {
                 let pitch = (ahead.z.asin() - slope.atan()).to_degrees();
                 assert!(off.abs() < 12.0 && pitch.abs() < 5.0, "{from}, {}: {off} {pitch}", pose.seconds);
             }
+        }
+    }
+
+    #[test]
+    fn many_positions_a_second_do_not_make_a_hill_flatter() {
+        // Fifty a second, each 0.1 m off: their steps together are several times the way. It waits from 4 to 8 s.
+        let nowhere = Surface::new(&Splats::new(0), DQuat::IDENTITY, |_| true);
+        let slope: f64 = 0.1;
+        let off = |i: u32, k: u32| f64::from(uniform(6, u64::from(3 * i + k))) - 0.5;
+        let place = |i: u32| {
+            let seconds = 0.02 * f64::from(i);
+            let gone = 5.0 * (seconds.min(4.0) + (seconds - 8.0).max(0.0));
+            let noise = 0.2 * DVec3::new(off(i, 0), off(i, 1), off(i, 2));
+            (seconds, DVec3::new(gone, 0.0, slope * gone) + noise)
+        };
+        let places: Vec<(f64, DVec3)> = (0..600).map(place).collect();
+        let of_path = Positions { places: &places, low: LOW, high: HIGH, first: None };
+        for pose in road_poses(&of_path, &nowhere).path {
+            let pitch = (pose.world_from_object.rotation * DVec3::X).z.asin() - slope.atan();
+            assert!(pitch.to_degrees().abs() < 2.0, "{}: {}", pose.seconds, pitch.to_degrees());
         }
     }
 
