@@ -7,6 +7,8 @@ use super::track::Moment;
 
 /// Squared distance up to which a sighting may belong to a prediction, in units of its standard deviation: 99.7 % of them do.
 pub(crate) const GATE: f64 = 12.0;
+/// What was seen less often is no object.
+pub(crate) const LEAST_SEEN: usize = 4;
 /// A track ends when it was not seen for this long, seconds.
 const UNSEEN_SECONDS: f64 = 1.5;
 /// What begins a track was seen twice within this time, seconds, not faster than this, metres per second.

@@ -3,12 +3,10 @@
 use glam::DVec2;
 
 use super::filter::smoothed;
-use super::follow::{Followed, GATE};
+use super::follow::{Followed, GATE, LEAST_SEEN};
 use super::kinds::may_be_same;
 use super::track::{Moment, Track, TrackPose};
 
-/// A track is joined if it was seen this often.
-const LEAST_SEEN: usize = 4;
 /// It is continued by one that begins up to this much later, seconds.
 const HIDDEN_SECONDS: f64 = 5.0;
 /// A track continues another if their velocities differ by less than this, metres per second, and if the way between them is that of

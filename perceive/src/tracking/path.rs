@@ -5,14 +5,13 @@ use std::collections::BTreeMap;
 use glam::DVec2;
 
 use super::filter::{Motion, Place, smoothed};
-use super::follow::Followed;
+use super::follow::{Followed, LEAST_SEEN};
 use super::kinds::Kind;
 use super::shape;
 use super::sighting::Sighting;
 use super::track::{Moment, Track, TrackPose};
 
-/// An object was seen this often, and at this share of the times.
-const LEAST_SEEN: usize = 4;
+/// An object was seen at this share of the times.
 const LEAST_SHARE: f64 = 0.3;
 /// At least this share of the sightings of an object say that it moves, and it went this far, metres.
 const MOVING_SHARE: f64 = 0.3;
