@@ -46,7 +46,7 @@ pub(crate) struct TrackArgs {
     /// Leave out the lidar: objects on photos are where they touch the ground
     #[arg(long)]
     pub(crate) no_lidar: bool,
-    /// Leave out the radar: what moves by its velocity, how fast tracks go, and what photos show that does not move
+    /// Leave out the radar, whose velocities tell what moves, how fast, and which vehicles on photos do not
     #[arg(long)]
     pub(crate) no_radar: bool,
     /// Also measure the paths against the true ones in this tracks.json
