@@ -63,7 +63,7 @@ impl Looking<'_> {
     /// The objects that move, with their paths in the capture's world. `progress` is called with (steps done, steps in total).
     ///
     /// # Errors
-    /// A capture with neither sweeps nor zones, or one that does not tell when they were taken, or a sweep that cannot be read.
+    /// A capture with neither sweeps nor zones, one that does not tell when they were taken, or a sweep that cannot be read.
     pub fn objects(&self, progress: &dyn Fn(usize, usize)) -> Result<Vec<MovingObject>, BadInput> {
         let bad = |problem: &str, advice: &str| BadInput::new(self.capture, problem, advice);
         let sweeps = &self.source.sweeps;
