@@ -2,7 +2,8 @@
 # Lines of bench/results/tracks: the paths of traffic that plat objects track finds in generated streets, against the true ones: from a lidar,
 # a radar, YOLOX-nano on the photos, and two and three of them. Rules and constants were chosen by the streets medium, fog and heavy; by other
 # only how near boxes lie to a path (1.0 instead of 0.9 standard deviations). Takes the folder of the captures and detectors. RESULTS is the
-# folder of the lines. Makes the streets in out/tracks if they are not there. Three quarters of an hour, the streets mostly.
+# folder of the lines. Makes the streets in out/tracks if they are not there, which is most of half an hour; with streets and detections there
+# it takes two minutes.
 set -euo pipefail
 repository=$(realpath "$(dirname "${BASH_SOURCE[0]}")/..")
 data=$(realpath --relative-to="$repository" "${1:?the folder of the detectors}")
